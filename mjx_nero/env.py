@@ -1,0 +1,245 @@
+"""The manipulation environment: single, pure ``reset`` and ``step``, compatible with ``brax.envs.base.Env``."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs.base import Env, State
+from jaxtyping import Array, Float
+
+from mjx_nero import scene, terms
+from mjx_nero.mdp import actions
+from mjx_nero.mdp.rewards import at_goal, held
+from mjx_nero.physics import Physics, resolve_impl
+from mjx_nero.robots import RobotCfg
+from mjx_nero.scene import SceneCfg, SimCfg
+from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.types import Carry, Key, Sim, UserError
+from mjx_nero.view import Viewer
+
+_MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionCfg:
+    """One action a arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes).
+
+    ``clip`` bounds every action to +-clip before use; 0 leaves them alone.
+    """
+
+    scale: float = 0.5
+    clip: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class SuccessCfg:
+    """The object within ``threshold`` [m] of the commanded point for the last ``hold_s`` seconds of the episode."""
+
+    threshold: float = 0.02
+    hold_s: float = 0.5
+    minimal_height: float = 0.025  # with grasp_radius: what counts as a grasp in the metrics [m]
+    grasp_radius: float = 0.04
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvCfg:
+    """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name."""
+
+    robot: RobotCfg
+    command: CommandTerm
+    observations: Mapping[str, Mapping[str, ObservationTerm]]
+    rewards: Mapping[str, RewardTerm]
+    terminations: Mapping[str, DoneTerm]
+    events: Mapping[str, Term]
+    curriculum: Mapping[str, Term]
+    scene: SceneCfg = SceneCfg()
+    sim: SimCfg = SimCfg()
+    action: ActionCfg = ActionCfg()
+    success: SuccessCfg = SuccessCfg()
+    episode_length_s: float = 5.0
+    object_start: tuple[float, float, float] = (0.2, 0.0, 0.015)  # before the reset events [m]
+    corruption: bool = True  # observation noise: on to train, off to play
+    start_count: int = 0  # where the curriculum's count of control steps begins
+
+    def __post_init__(self):
+        unknown = set(self.curriculum) - set(self.rewards)
+        if unknown:
+            raise UserError(f"curriculum names {', '.join(unknown)}: not one of the rewards {', '.join(self.rewards)}")
+
+
+class ManipulationEnv(Env):
+    """A robot, a table, a cube and a commanded point, with the MDP of an ``EnvCfg``.
+
+    ``reset`` and ``step`` work on one environment and are pure: ``jax.vmap`` them for thousands, ``jax.jit`` them for speed.
+    ``state.pipeline_state`` is the physics state (``types.Sim``), ``state.obs`` a dict of groups, ``state.info['carry']`` the
+    rest of the episode's memory. ``info['truncation']`` is 1 where ``done`` is a time-out.
+
+    Args:
+        cfg: the task.
+        impl: ``auto``, ``jax`` or ``warp``.
+        num_envs: how many will be stepped together (Warp sizes its buffers by it; MJX-JAX ignores it).
+
+    Raises:
+        UserError: ``impl`` is unknown or not possible on this machine.
+    """
+
+    def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
+        self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), num_envs
+        self.dt = cfg.sim.dt * cfg.sim.decimation
+        self.episode_length = round(cfg.episode_length_s / self.dt)
+        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
+        self.physics_model = model
+        self._viewer = Viewer(model, cfg.robot, self.episode_length)
+        ids = self._viewer.qpos_ids
+        self._qpos0 = np.array(model.qpos0, np.float32)
+        self._qpos0[ids] = cfg.robot.home
+        self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
+        speeds = [cfg.robot.arm.speed] * len(cfg.robot.arm.joints) + [cfg.robot.gripper.speed] * len(cfg.robot.gripper.joints)
+        self._max_ctrl_step = np.array(speeds, np.float32) * self.dt
+        self._hold_steps = round(cfg.success.hold_s / self.dt)
+        self._resample_steps = round(cfg.command.resample_s / self.dt)
+
+    @functools.cached_property
+    def physics(self) -> Physics:
+        """The MJX backend; made when first stepped, so that other backends never pay for it."""
+        with jax.ensure_compile_time_eval():  # the first step may well be under a trace
+            return Physics(self.physics_model, self.cfg.sim, self.impl, self.num_envs)
+
+    @functools.cached_property
+    def mj_model(self) -> mujoco.MjModel:
+        """The whole scene with visual shapes, lights and cameras, compiled for MuJoCo (to render or to inspect)."""
+        return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
+
+    @property
+    def action_size(self) -> int:
+        """One a arm joint and one for the gripper."""
+        return len(self.cfg.robot.arm.joints) + 1
+
+    @functools.cached_property
+    def observation_size(self) -> dict[str, tuple[int, ...]]:  # type: ignore[override]
+        """Shape of each observation group."""
+        state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+        return {name: value.shape for name, value in state.obs.items()}
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics backend, as Brax asks for it."""
+        return f"mjx-{self.impl}"
+
+    def reset(self, rng: Key) -> State:
+        """A fresh episode: joints at home, object and command drawn anew.
+
+        Args:
+            rng: random key of this environment.
+        """
+        rng, k_event, k_command, k_obs = jax.random.split(rng, 4)
+        joints, cube = jnp.asarray(self.cfg.robot.home), jnp.asarray(self.cfg.object_start)
+        for key, event in zip(jax.random.split(k_event, max(1, len(self.cfg.events))), self.cfg.events.values(), strict=False):
+            joints, cube = event.func(key, joints, cube, **event.params)
+        joints = jnp.clip(joints, *self._range)
+        at = self._viewer.object_qpos
+        qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints).at[at : at + 3].set(cube)
+        sim = Sim(
+            qpos=qpos,
+            qvel=jnp.zeros(self.physics_model.nv),
+            ctrl=joints,
+            warmstart=jnp.zeros(self.physics_model.nv),
+            time=jnp.zeros(()),
+        )
+        zero = jnp.zeros(self.action_size)
+        command = self.cfg.command.func(k_command, **self.cfg.command.params)
+        carry = Carry(
+            rng=rng,
+            step=jnp.zeros((), jnp.int32),
+            action=zero,
+            command=command,
+            hold=jnp.zeros((), jnp.int32),
+            grasp_time=jnp.array(jnp.inf),
+        )
+        obs = terms.observe(self.cfg.observations, self._viewer(sim, carry, zero), k_obs, self.cfg.corruption)
+        names = [f"reward/{name}" for name in self.cfg.rewards]
+        names += ["success", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
+        info = {
+            "carry": carry,
+            "count": jnp.array(self.cfg.start_count, jnp.int32),
+            "truncation": jnp.zeros(()),
+            "steps": jnp.zeros(()),
+        }
+        return State(sim, obs, jnp.zeros(()), jnp.zeros(()), {n: jnp.zeros(()) for n in names}, info)
+
+    def step(self, state: State, action: Float[Array, " na"]) -> State:
+        """One control step.
+
+        Args:
+            state: from ``reset`` or ``step``.
+            action: [action_size], unbounded.
+        """
+        ctrl = self.targets(state, action)
+        sim, overflow = self.physics.step(state.pipeline_state, ctrl)
+        return self.finish(state, action, sim, overflow)
+
+    def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
+        """The drives' position targets for ``action``: within the joint ranges and the drives' speed limits [rad, m]."""
+        action, robot = self._clip(action), self.cfg.robot
+        arm = actions.joint_targets(action[:-1], scale=self.cfg.action.scale, offset=jnp.asarray(robot.arm.home))
+        gripper = actions.binary_gripper(
+            action[-1], open=jnp.asarray(robot.gripper.open), close=jnp.asarray(robot.gripper.close)
+        )
+        target = jnp.clip(jnp.concatenate([arm, gripper]), *self._range)
+        return actions.rate_limit(target, state.pipeline_state.ctrl, step=jnp.asarray(self._max_ctrl_step))
+
+    def finish(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
+        """The second half of ``step``: rewards, terminations, metrics and observations of the physics state ``sim``."""
+        cfg, carry = self.cfg, state.info["carry"]
+        action = self._clip(action)
+        # A diverged environment stays at its last good state and ends; nothing of the bad one gets any further.
+        bad = ~(jnp.all(jnp.abs(sim.qpos) < jnp.inf) & jnp.all(jnp.abs(sim.qvel) < _MAX_SPEED) & jnp.all(jnp.isfinite(action)))
+        sim = jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.pipeline_state, sim)
+        action = jnp.where(bad, carry.action, action)
+
+        rng, k_command, k_obs = jax.random.split(carry.rng, 3)
+        step = carry.step + 1
+        count = state.info["count"] + 1
+        view = self._viewer(sim, carry.replace(step=step), action)
+        reward_terms = terms.rewards(cfg.rewards, cfg.curriculum, view, count, self.dt)
+        reward_terms = {name: jnp.where(bad, 0.0, value) for name, value in reward_terms.items()}
+        terminated, truncated = terms.terminations(cfg.terminations, view)
+        terminated, truncated = terminated | bad, truncated & ~bad
+        done = (terminated | truncated).astype(jnp.float32)
+
+        hold = jnp.where(at_goal(view, threshold=cfg.success.threshold), carry.hold + 1, 0)
+        grasp = held(view, minimal_height=cfg.success.minimal_height, grasp_radius=cfg.success.grasp_radius)
+        grasp_time = jnp.minimum(carry.grasp_time, jnp.where(grasp, step * self.dt, jnp.inf))
+        grasped = jnp.isfinite(grasp_time)
+        # Episode results appear at the last step and are 0 before it: a sum over the episode gives them.
+        ends = {
+            "success": truncated & (hold >= self._hold_steps),
+            "final_distance": jnp.linalg.norm(view.goal_pos_w - view.object_pos_w),
+            "grasped": grasped,
+            "grasp_time": jnp.where(grasped, grasp_time, 0.0),
+            "dropped": terminated & ~bad,
+        }
+        metrics = {f"reward/{name}": value for name, value in reward_terms.items()}
+        metrics |= {name: value * done for name, value in ends.items()}
+        metrics |= {"nan": bad.astype(jnp.float32), "overflow": overflow}
+
+        resample = step % self._resample_steps == 0
+        command = jnp.where(resample, cfg.command.func(k_command, **cfg.command.params), carry.command)
+        carry = carry.replace(rng=rng, step=step, action=action, command=command, hold=hold, grasp_time=grasp_time)
+        obs = terms.observe(cfg.observations, self._viewer(sim, carry, action), k_obs, cfg.corruption)
+        info = {"carry": carry, "count": count, "truncation": truncated.astype(jnp.float32), "steps": step.astype(jnp.float32)}
+        return state.replace(
+            pipeline_state=sim,
+            obs=obs,
+            reward=sum(reward_terms.values()),
+            done=done,
+            metrics={**state.metrics, **metrics},
+            info={**state.info, **info},
+        )
+
+    def _clip(self, action: Float[Array, " na"]) -> Float[Array, " na"]:
+        return jnp.clip(action, -self.cfg.action.clip, self.cfg.action.clip) if self.cfg.action.clip else action

@@ -1,0 +1,1 @@
+"""The terms of which tasks are built: pure functions of a ``View``."""

@@ -1,0 +1,69 @@
+"""Reward terms: (View, *, params) -> scalar. Unsigned and unscaled: sign and weight stand in the task's config."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero.types import View
+
+
+def _goal_distance(view: View) -> Float[Array, ""]:
+    return jnp.linalg.norm(view.goal_pos_w - view.object_pos_w)
+
+
+def _ee_distance(view: View) -> Float[Array, ""]:
+    return jnp.linalg.norm(view.object_pos_w - view.ee_pos_w)
+
+
+def held(view: View, *, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
+    """The object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
+
+    A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point.
+    """
+    return (view.object_pos_w[2] > minimal_height) & (_ee_distance(view) < grasp_radius)
+
+
+def at_goal(view: View, *, threshold: float) -> Bool[Array, ""]:
+    """The object's centre is within ``threshold`` [m] of the commanded point."""
+    return _goal_distance(view) < threshold
+
+
+def object_ee_distance(view: View, *, std: float) -> Float[Array, ""]:
+    """1 - tanh(d / std), d the distance from the grasp point to the object [m]. Isaac Lab's lift task."""
+    return 1.0 - jnp.tanh(_ee_distance(view) / std)
+
+
+def object_is_lifted(view: View, *, minimal_height: float) -> Float[Array, ""]:
+    """1 while the object's centre is above ``minimal_height`` [m]. Isaac Lab's lift task."""
+    return (view.object_pos_w[2] > minimal_height).astype(jnp.float32)
+
+
+def object_goal_distance(view: View, *, std: float, minimal_height: float) -> Float[Array, ""]:
+    """1 - tanh(distance to the commanded point / std), while lifted. Isaac Lab's lift task."""
+    return object_is_lifted(view, minimal_height=minimal_height) * (1.0 - jnp.tanh(_goal_distance(view) / std))
+
+
+def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+    """1 while the object is held (see ``held``)."""
+    return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius).astype(jnp.float32)
+
+
+def held_goal_distance(view: View, *, std: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+    """1 - tanh(distance to the commanded point / std), while held."""
+    gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
+    return gate * (1.0 - jnp.tanh(_goal_distance(view) / std))
+
+
+def held_at_goal(view: View, *, threshold: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+    """1 while the object is held within ``threshold`` [m] of the commanded point."""
+    gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
+    return (gate & at_goal(view, threshold=threshold)).astype(jnp.float32)
+
+
+def action_rate_l2(view: View) -> Float[Array, ""]:
+    """Squared change of the action since the last step."""
+    return jnp.sum(jnp.square(view.action - view.last_action))
+
+
+def joint_vel_l2(view: View) -> Float[Array, ""]:
+    """Squared joint speeds, all joints of the robot [rad^2/s^2, m^2/s^2]."""
+    return jnp.sum(jnp.square(view.joint_vel))

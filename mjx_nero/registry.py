@@ -1,0 +1,67 @@
+"""Environments by name."""
+
+import difflib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from mjx_nero import config
+from mjx_nero.env import EnvCfg, ManipulationEnv
+from mjx_nero.robots import NERO
+from mjx_nero.tasks import lift
+from mjx_nero.types import UserError
+
+# name -> preset -> factory of a fresh config
+_ENVS: dict[str, dict[str, Callable[[], EnvCfg]]] = {
+    "nero_lift": {name: (lambda make=make: make(NERO)) for name, make in lift.PRESETS.items()},  # type: ignore[misc]
+}
+
+
+def list_envs() -> tuple[str, ...]:
+    """Names that ``make`` takes."""
+    return tuple(_ENVS)
+
+
+def list_presets(env: str) -> tuple[str, ...]:
+    """Presets of an environment, the default first."""
+    return tuple(_pick(_ENVS, env, "env"))
+
+
+def env_cfg(env: str, preset: str = "default", **overrides: Any) -> EnvCfg:
+    """The config of an environment.
+
+    Args:
+        env: one of ``list_envs()``.
+        preset: one of ``list_presets(env)``.
+        overrides: fields by dotted name, as in ``**{"rewards.reaching_object.weight": 2.0}``.
+
+    Raises:
+        UserError: unknown name, preset or field, or a value of the wrong type.
+    """
+    return config.override(_pick(_pick(_ENVS, env, "env"), preset, f"preset of {env}")(), overrides)
+
+
+def make(env: str, preset: str = "default", impl: str = "auto", num_envs: int = 1, **overrides: Any) -> ManipulationEnv:
+    """Makes an environment.
+
+    Args:
+        env: one of ``list_envs()``.
+        preset: one of ``list_presets(env)``.
+        impl: physics, ``auto``, ``jax`` or ``warp``.
+        num_envs: how many copies will be stepped together (sizes Warp's buffers).
+        overrides: config fields by dotted name.
+
+    Raises:
+        UserError: unknown name, preset, impl or field, or a value of the wrong type.
+    """
+    return ManipulationEnv(env_cfg(env, preset, **overrides), impl=impl, num_envs=num_envs)
+
+
+def _pick(table: dict, name: str, what: str) -> Any:
+    if name not in table:
+        raise UserError(f"unknown {what} {name!r}{_hint(name, table)}: choose one of {', '.join(table)}")
+    return table[name]
+
+
+def _hint(name: str, valid: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(valid), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""

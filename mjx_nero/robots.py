@@ -1,0 +1,99 @@
+"""Robots: what the model files leave open (mounting, drives, home pose, gripper), as frozen values."""
+
+import dataclasses
+import pathlib
+
+# In a checkout the assets lie beside the package, in a wheel inside it.
+_HERE = pathlib.Path(__file__).resolve().parent
+ASSETS = next(d for d in (_HERE / "assets", _HERE.parent / "assets") if d.is_dir())
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveCfg:
+    """PD position drives of a group of joints; tuples run along ``joints``.
+
+    Attributes:
+        joints: names in the model.
+        stiffness: [N m/rad] or [N/m].
+        damping: [N m s/rad] or [N s/m].
+        effort: limit of the drive's force [N m] or [N].
+        speed: limit of how fast the position target moves [rad/s] or [m/s].
+        home: joint positions at reset and at action zero [rad] or [m].
+    """
+
+    joints: tuple[str, ...]
+    stiffness: tuple[float, ...]
+    damping: tuple[float, ...]
+    effort: float
+    speed: float
+    home: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class GripperCfg(DriveCfg):
+    """A gripper: drives with an open and a closed target."""
+
+    open: tuple[float, ...] = ()
+    close: tuple[float, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotCfg:
+    """A robot of the package.
+
+    Attributes:
+        name: folder under ``assets``, holding ``<name>.xml``.
+        base_pos: where the robot stands in the world [m].
+        base_quat: how its base link is turned there, wxyz. Commands and observations use the unturned frame.
+        ee_site: site at the grasp point.
+    """
+
+    name: str
+    arm: DriveCfg
+    gripper: GripperCfg
+    ee_site: str = "ee"
+    base_link: str = "base_link"
+    base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    @property
+    def xml(self) -> pathlib.Path:
+        """Path of the model file."""
+        return ASSETS / self.name / f"{self.name}.xml"
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joint names, arm first: the order of ``View.joint_pos``, of the actuators and of ``ctrl``."""
+        return self.arm.joints + self.gripper.joints
+
+    @property
+    def home(self) -> tuple[float, ...]:
+        """Home position of all joints [rad, m]."""
+        return self.arm.home + self.gripper.home
+
+
+# Drives and home pose: the Isaac Lab recipe for the Nero lift. Its soft limit factor (0.9) is read by no term of the
+# task and would exclude the recipe's own home (joint4 = 2.0), so targets are limited by the joint ranges alone.
+NERO = RobotCfg(
+    name="nero",
+    # Half a turn: positive joint4 folds the forearm towards -x of the base, and the work lies at +x (assets/nero/README.md).
+    base_quat=(0.0, 0.0, 0.0, 1.0),
+    arm=DriveCfg(
+        joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "joint7"),
+        stiffness=(200.0, 170.0, 120.0, 80.0, 50.0, 20.0, 10.0),
+        damping=(100.0, 60.0, 70.0, 24.0, 20.0, 10.0, 5.0),
+        effort=25.0,
+        speed=1.5,
+        home=(0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0),
+    ),
+    gripper=GripperCfg(
+        joints=("gripper_joint1", "gripper_joint2"),
+        stiffness=(800.0, 800.0),
+        damping=(20.0, 20.0),
+        effort=22.0,
+        speed=1.5,
+        home=(0.05, -0.05),
+        open=(0.05, -0.05),
+        close=(0.0, -0.001),
+    ),
+)

@@ -1,0 +1,155 @@
+"""Evaluation: whole episodes with a policy, on MJX or in MuJoCo's C library."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+
+from mjx_nero.env import ManipulationEnv
+from mjx_nero.physics import NativePhysics
+from mjx_nero.types import Key
+
+# (observation groups, key) -> actions, all batched
+Act = Callable[[dict[str, jax.Array], Key], jax.Array]
+Step = Callable[[State, jax.Array], State]
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """One entry an episode.
+
+    Attributes:
+        metrics: name -> [n], each the sum over the episode's steps (see ``ManipulationEnv.finish``).
+        returns: [n].
+        lengths: [n] control steps.
+        qpos: [steps, k, nq] of the first k environments, where asked for.
+        goals: [steps, k, 3], the goals in the world frame [m].
+    """
+
+    metrics: dict[str, np.ndarray]
+    returns: np.ndarray
+    lengths: np.ndarray
+    qpos: np.ndarray
+    goals: np.ndarray
+
+    def summary(self) -> dict:
+        """Figures for people and for JSON: distances in m, times in s."""
+        m, n = self.metrics, len(self.returns)
+        grasped = m["grasped"] > 0
+        low, high = wilson(float(m["success"].sum()), n)
+        return {
+            "success_rate": float(m["success"].mean()),
+            "success_rate_95": [low, high],
+            "final_distance_mean": float(m["final_distance"].mean()),
+            "final_distance_median": float(np.median(m["final_distance"])),
+            "grasp_rate": float(grasped.mean()),
+            "time_to_grasp_mean": float(m["grasp_time"][grasped].mean()) if grasped.any() else None,
+            "dropped_rate": float(m["dropped"].mean()),
+            "return_mean": float(self.returns.mean()),
+            "return_by_term": {k.removeprefix("reward/"): float(v.mean()) for k, v in m.items() if k.startswith("reward/")},
+            "episode_length_mean": float(self.lengths.mean()),
+            "nan_count": int(m["nan"].sum()),
+            "overflow_count": int(m["overflow"].sum()),
+        }
+
+
+def wilson(successes: float, n: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's 95% interval of a proportion (Wilson 1927)."""
+    p, zz = successes / n, z * z / n
+    middle, half = (p + zz / 2) / (1 + zz), z * math.sqrt(p * (1 - p) / n + zz / (4 * n)) / (1 + zz)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def _accumulate(state: State, after: State, totals: dict, active: jax.Array) -> tuple[State, dict, jax.Array]:
+    """Adds a step's metrics to the episodes still running; the others stay where they ended."""
+    step = {**after.metrics, "return": after.reward, "length": jnp.ones_like(after.reward)}
+    totals = {name: totals[name] + step[name] * active for name in totals}
+
+    def keep(old, new):
+        return jnp.where(active.reshape(active.shape + (1,) * (new.ndim - 1)) > 0, new, old)
+
+    return jax.tree.map(keep, state, after), totals, active * (1 - after.done)
+
+
+def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
+    state = jax.vmap(env.reset)(keys)
+    zeros = jnp.zeros(keys.shape[0])
+    return state, {name: zeros for name in (*state.metrics, "return", "length")}, jnp.ones_like(zeros)
+
+
+def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, jax.Array]:
+    goals = state.info["carry"].command[:record] + jnp.asarray(env.cfg.robot.base_pos)
+    return state.pipeline_state.qpos[:record], goals
+
+
+def episodes_fn(env: ManipulationEnv, act: Callable, record: int = 0) -> Callable:
+    """The pure function behind ``run_mjx``, to jit once and call often.
+
+    Args:
+        act: ``(params, observations, key) -> actions``.
+        record: number of environments whose qpos and goal to keep.
+
+    Returns:
+        ``(params, keys [n], key) -> (totals: name -> [n], (qpos, goals))``.
+    """
+
+    def run(params, keys: Key, key: Key):
+        def step(carry, key):
+            state, totals, active = carry
+            after = jax.vmap(env.step)(state, act(params, state.obs, key))
+            carry = _accumulate(state, after, totals, active)
+            return carry, _frames(env, carry[0], record)
+
+        (_, totals, _), frames = jax.lax.scan(step, _start(env, keys), jax.random.split(key, env.episode_length))
+        return totals, frames
+
+    return run
+
+
+def run_mjx(env: ManipulationEnv, act: Act, episodes: int, seed: int, record: int = 0) -> Episodes:
+    """Plays ``episodes`` at once on MJX, one compiled program."""
+    run = jax.jit(episodes_fn(env, lambda _, obs, key: act(obs, key), record))
+    keys, key = _keys(seed, episodes)
+    return _collect(*run(None, keys, key))
+
+
+def run_native(env: ManipulationEnv, act: Act, episodes: int, seed: int, record: int = 0) -> Episodes:
+    """Plays the same episodes with MuJoCo's C library; only the MDP's terms are compiled, which takes seconds."""
+    physics = NativePhysics(env.physics_model, env.cfg.sim)
+    keys, key = _keys(seed, episodes)
+    targets = jax.jit(lambda state, action: jax.vmap(env.targets)(state, action))
+
+    @jax.jit
+    def finish(state, action, sim, totals, active):
+        after = jax.vmap(functools.partial(env.finish, overflow=jnp.zeros(())))(state, action, sim)
+        return _accumulate(state, after, totals, active)
+
+    state, totals, active = jax.jit(functools.partial(_start, env))(keys)
+    act = jax.jit(act)
+    frames = []
+    for k in jax.random.split(key, env.episode_length):
+        action = act(state.obs, k)
+        sim = physics.step(state.pipeline_state, targets(state, action))
+        state, totals, active = finish(state, action, sim, totals, active)
+        if record:
+            frames.append(jax.tree.map(np.asarray, _frames(env, state, record)))
+    empty = (np.zeros((0, 0, env.physics_model.nq)), np.zeros((0, 0, 3)))
+    return _collect(totals, tuple(np.stack(x) for x in zip(*frames, strict=True)) if frames else empty)
+
+
+def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
+    # Training folds nothing into its seed, so no evaluation ever repeats a training episode's draws.
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), 0xE7A1)
+    k_reset, key = jax.random.split(key)
+    return jax.random.split(k_reset, episodes), key
+
+
+def _collect(totals: dict, frames: tuple) -> Episodes:
+    totals = {name: np.asarray(value) for name, value in totals.items()}
+    returns, lengths = totals.pop("return"), totals.pop("length")
+    return Episodes(totals, returns, lengths, np.asarray(frames[0]), np.asarray(frames[1]))

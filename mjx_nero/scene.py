@@ -1,0 +1,132 @@
+"""Scene: a robot at a table with one cube and a goal marker, as a compiled MuJoCo model."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from mjx_nero.robots import RobotCfg
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneCfg:
+    """Table and cube. Lengths in m, mass in kg.
+
+    The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
+    termination that counts a cube beyond them as fallen.
+    """
+
+    table_center: tuple[float, float] = (0.35, 0.0)
+    table_size: tuple[float, float] = (1.1, 1.4)
+    cube_edge: float = 0.03
+    cube_mass: float = 0.03
+    cube_friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
+
+
+@dataclasses.dataclass(frozen=True)
+class SimCfg:
+    """Physics options, and the buffers that MJX-Warp needs (overflows are counted, see ``Physics``)."""
+
+    dt: float = 0.01  # physics step [s]
+    decimation: int = 2  # physics steps a control step
+    iterations: int = 10
+    ls_iterations: int = 20
+    impratio: float = 10.0
+    elliptic: bool = True
+    contacts_per_env: int = 24  # Warp: contact slots, times the number of environments
+    constraints_per_env: int = 128  # Warp: constraint rows of one environment
+
+
+def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -> mujoco.MjModel:
+    """Compiles robot, table, cube and goal marker.
+
+    Args:
+        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
+            ctrl, less work a step.
+    """
+    spec = mujoco.MjSpec.from_file(str(robot.xml))
+    base = spec.body(robot.base_link)
+    base.pos, base.quat = robot.base_pos, robot.base_quat
+    spec.modelname = f"{robot.name}_lift"
+    option = spec.option
+    option.timestep = sim.dt
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.iterations, option.ls_iterations = sim.iterations, sim.ls_iterations
+    option.impratio = sim.impratio
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if sim.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+    # Contact bits: the table meets bit 1, the cube bit 2; robot geoms have no type, so never meet one another.
+    world = spec.worldbody
+    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0, group=3)
+    for drive in (robot.arm, robot.gripper):
+        _add_drives(spec, drive)
+
+    cube = world.add_body(name="cube", pos=[0.35, 0, scene.cube_edge / 2])
+    cube.add_freejoint(name="cube")
+    half = [scene.cube_edge / 2] * 3
+    cube.add_geom(
+        name="cube",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=half,
+        mass=scene.cube_mass,
+        friction=scene.cube_friction,
+        contype=2,
+        conaffinity=1,
+        rgba=[0.85, 0.3, 0.2, 1],
+    )
+    goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
+    if visuals:
+        _add_visuals(spec, scene, goal)
+    else:
+        spec.discard_visual()
+    return spec.compile()
+
+
+def _add_drives(spec: mujoco.MjSpec, drive) -> None:
+    for name, kp, kd in zip(drive.joints, drive.stiffness, drive.damping, strict=True):
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=kp, kv=kd)
+        actuator.forcelimited, actuator.forcerange = True, [-drive.effort, drive.effort]
+        actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
+
+
+def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal) -> None:
+    hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
+    goal.add_geom(name="goal", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
+    world = spec.worldbody
+    x, y = scene.table_center
+    size = [scene.table_size[0] / 2, scene.table_size[1] / 2, 0.02]
+    world.add_geom(
+        name="table_top", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=[x, y, -0.0205], rgba=[0.72, 0.6, 0.47, 1], **hidden
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.62, 0.68, 0.74],
+        width=64,
+        height=64,
+    )
+    world.add_light(pos=[0.8, -0.8, 1.6], dir=[-0.4, 0.6, -1.2], diffuse=[0.7, 0.7, 0.7], castshadow=True)
+    world.add_light(pos=[0.4, 1.0, 1.4], dir=[0, -0.7, -1.0], diffuse=[0.3, 0.3, 0.3], castshadow=False)
+    for name, pos, target in (
+        ("front", (1.15, -0.75, 0.75), (0.2, 0.0, 0.22)),
+        ("side", (0.3, -1.25, 0.45), (0.2, 0.0, 0.25)),
+    ):
+        world.add_camera(name=name, pos=pos, quat=_look_at(pos, target), fovy=42)
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.visual.quality.shadowsize = 4096
+    spec.stat.center, spec.stat.extent = [0.25, 0, 0.25], 1.0
+
+
+def _look_at(pos, target) -> np.ndarray:
+    """Orientation (wxyz) of a camera at ``pos`` that looks at ``target`` with world z up."""
+    back = np.subtract(pos, target) / np.linalg.norm(np.subtract(pos, target))
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).flatten())
+    return quat

@@ -1,0 +1,1 @@
+"""Tasks: frozen configs, one module a kind of task."""
