@@ -5,12 +5,14 @@ import io
 import os
 from importlib import metadata
 
-# XLA's CPU fusion of JAX before 0.11 recomputes an unrolled kinematic tree without end: one batched step takes seconds instead
-# of milliseconds. Later versions don't, and the newest abort on the flag, so it is set for the old ones alone, and before
-# the first JAX computation.
-_flags = os.environ.get("XLA_FLAGS", "")
-if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11) and "xla_cpu_use_fusion_emitters" not in _flags:
-    os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
+# Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one batched
+# step takes seconds instead of milliseconds), and its concurrent scheduler can deadlock where physics and networks share a
+# loop. Later versions have neither, and the newest abort on the first flag, so both are set for the old ones alone, before the
+# first JAX computation.
+if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
+    for _flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
+        if _flag not in os.environ.get("XLA_FLAGS", ""):
+            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{_flag}=false".strip()
 
 with contextlib.redirect_stdout(io.StringIO()):  # without Warp, which only GPUs need, MJX prints that it is missing
     import mujoco.mjx  # noqa: F401

@@ -32,9 +32,9 @@ class PpoCfg:
     num_timesteps: int = 0
     unroll_length: int = 24  # control steps of every environment an iteration
     num_epochs: int = 5
-    num_minibatches: int = 4
+    num_minibatches: int = 8
     learning_rate: float = 3e-4
-    desired_kl: float = 0.01  # adapts the learning rate; 0 keeps it fixed
+    desired_kl: float = 0.02  # adapts the learning rate; 0 keeps it fixed
     min_learning_rate: float = 1e-5
     max_learning_rate: float = 1e-2
     discounting: float = 0.98
@@ -54,7 +54,7 @@ class PpoCfg:
 
 
 # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
-ISAAC = PpoCfg(learning_rate=1e-4, entropy_cost=0.006)
+ISAAC = PpoCfg(num_minibatches=4, learning_rate=1e-4, desired_kl=0.01, entropy_cost=0.006)
 
 
 @struct.dataclass

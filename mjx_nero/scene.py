@@ -53,6 +53,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.iterations, option.ls_iterations = sim.iterations, sim.ls_iterations
     option.impratio = sim.impratio
+    # Box against box then goes by MJX-Warp's closed form instead of its general convex routine: faster, and quicker to compile.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if sim.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
 
     # Contact bits: the table meets bit 1, the cube bit 2; robot geoms have no type, so never meet one another.
