@@ -1,8 +1,10 @@
 """GPU-vectorised JAX library of robot-arm lift tasks."""
 
 import contextlib
+import ctypes
 import io
 import os
+import sys
 from importlib import metadata
 
 # Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one batched
@@ -13,6 +15,14 @@ if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
     for _flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
         if _flag not in os.environ.get("XLA_FLAGS", ""):
             os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{_flag}=false".strip()
+
+# MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
+if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
+    for _gl, _library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8"), ("osmesa", "libOSMesa.so.6")):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(_library)
+            os.environ["MUJOCO_GL"] = _gl
+            break
 
 with contextlib.redirect_stdout(io.StringIO()):  # without Warp, which only GPUs need, MJX prints that it is missing
     import mujoco.mjx  # noqa: F401

@@ -26,7 +26,7 @@ def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
     Raises:
         UserError: the folder cannot be written.
     """
-    arrays = dict(zip(_names(tree), [np.ascontiguousarray(x) for x in jax.tree.leaves(tree)], strict=True))
+    arrays = dict(zip(_names(tree), [np.asarray(x, order="C") for x in jax.tree.leaves(tree)], strict=True))
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -63,7 +63,6 @@ class EnvCfg:
     episode_length_s: float = 5.0
     object_start: tuple[float, float, float] = (0.2, 0.0, 0.015)  # before the reset events [m]
     corruption: bool = True  # observation noise: on to train, off to play
-    start_count: int = 0  # where the curriculum's count of control steps begins
 
     def __post_init__(self):
         unknown = set(self.curriculum) - set(self.rewards)
@@ -165,7 +164,7 @@ class ManipulationEnv(Env):
         names += ["success", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
         info = {
             "carry": carry,
-            "count": jnp.array(self.cfg.start_count, jnp.int32),
+            "count": jnp.zeros((), jnp.int32),
             "truncation": jnp.zeros(()),
             "steps": jnp.zeros(()),
         }

@@ -53,8 +53,16 @@ class PpoCfg:
             raise UserError(f"ppo.num_envs ({self.num_envs}) must be a multiple of ppo.num_minibatches ({self.num_minibatches})")
 
 
-# The Isaac Lab recipe's runner settings (RSL-RL), word for word.
-ISAAC = PpoCfg(num_minibatches=4, learning_rate=1e-4, desired_kl=0.01, entropy_cost=0.006)
+PRESETS = {
+    "default": PpoCfg(),
+    # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
+    "isaac": PpoCfg(num_minibatches=4, learning_rate=1e-4, desired_kl=0.01, entropy_cost=0.006),
+}
+
+
+def preset(name: str) -> PpoCfg:
+    """The hyperparameters that go with an environment's preset."""
+    return PRESETS.get(name, PRESETS["default"])
 
 
 @struct.dataclass

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +15,8 @@ from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import NativePhysics
 from mjx_nero.types import Key
 
-# (observation groups, key) -> actions, all batched
-Act = Callable[[dict[str, jax.Array], Key], jax.Array]
-Step = Callable[[State, jax.Array], State]
+# (parameters, observation groups [n, ...], key) -> actions [n, ...]
+Act = Callable[[Any, dict[str, jax.Array], Key], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +58,9 @@ class Episodes:
         }
 
 
+Runner = Callable[[Any, int], Episodes]  # (parameters of the policy, seed) -> finished episodes
+
+
 def wilson(successes: float, n: int, z: float = 1.96) -> tuple[float, float]:
     """Wilson's 95% interval of a proportion (Wilson 1927)."""
     p, zz = successes / n, z * z / n
@@ -87,17 +90,14 @@ def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array,
     return state.pipeline_state.qpos[:record], goals
 
 
-def episodes_fn(env: ManipulationEnv, act: Callable, record: int = 0) -> Callable:
-    """The pure function behind ``run_mjx``, to jit once and call often.
+def mjx_runner(env: ManipulationEnv, act: Act, episodes: int, record: int = 0) -> Runner:
+    """Plays ``episodes`` at once on MJX: one compiled program, reused from call to call.
 
     Args:
-        act: ``(params, observations, key) -> actions``.
-        record: number of environments whose qpos and goal to keep.
-
-    Returns:
-        ``(params, keys [n], key) -> (totals: name -> [n], (qpos, goals))``.
+        record: how many of the episodes to keep qpos and goals of.
     """
 
+    @jax.jit
     def run(params, keys: Key, key: Key):
         def step(carry, key):
             state, totals, active = carry
@@ -108,38 +108,37 @@ def episodes_fn(env: ManipulationEnv, act: Callable, record: int = 0) -> Callabl
         (_, totals, _), frames = jax.lax.scan(step, _start(env, keys), jax.random.split(key, env.episode_length))
         return totals, frames
 
-    return run
+    return lambda params, seed: _collect(*run(params, *_keys(seed, episodes)))
 
 
-def run_mjx(env: ManipulationEnv, act: Act, episodes: int, seed: int, record: int = 0) -> Episodes:
-    """Plays ``episodes`` at once on MJX, one compiled program."""
-    run = jax.jit(episodes_fn(env, lambda _, obs, key: act(obs, key), record))
-    keys, key = _keys(seed, episodes)
-    return _collect(*run(None, keys, key))
-
-
-def run_native(env: ManipulationEnv, act: Act, episodes: int, seed: int, record: int = 0) -> Episodes:
+def native_runner(env: ManipulationEnv, act: Act, episodes: int, record: int = 0) -> Runner:
     """Plays the same episodes with MuJoCo's C library; only the MDP's terms are compiled, which takes seconds."""
     physics = NativePhysics(env.physics_model, env.cfg.sim)
-    keys, key = _keys(seed, episodes)
-    targets = jax.jit(lambda state, action: jax.vmap(env.targets)(state, action))
+    start = jax.jit(functools.partial(_start, env))
+
+    @jax.jit
+    def decide(params, state, key):
+        action = act(params, state.obs, key)
+        return action, jax.vmap(env.targets)(state, action)
 
     @jax.jit
     def finish(state, action, sim, totals, active):
         after = jax.vmap(functools.partial(env.finish, overflow=jnp.zeros(())))(state, action, sim)
         return _accumulate(state, after, totals, active)
 
-    state, totals, active = jax.jit(functools.partial(_start, env))(keys)
-    act = jax.jit(act)
-    frames = []
-    for k in jax.random.split(key, env.episode_length):
-        action = act(state.obs, k)
-        sim = physics.step(state.pipeline_state, targets(state, action))
-        state, totals, active = finish(state, action, sim, totals, active)
-        if record:
+    def run(params, seed: int) -> Episodes:
+        keys, key = _keys(seed, episodes)
+        state, totals, active = start(keys)
+        frames = []
+        for k in jax.random.split(key, env.episode_length):
+            action, ctrl = decide(params, state, k)
+            sim = physics.step(state.pipeline_state, ctrl)
+            state, totals, active = finish(state, action, sim, totals, active)
             frames.append(jax.tree.map(np.asarray, _frames(env, state, record)))
-    empty = (np.zeros((0, 0, env.physics_model.nq)), np.zeros((0, 0, 3)))
-    return _collect(totals, tuple(np.stack(x) for x in zip(*frames, strict=True)) if frames else empty)
+        qpos, goals = (np.stack(x) for x in zip(*frames, strict=True))
+        return _collect(totals, (qpos, goals))
+
+    return run
 
 
 def _keys(seed: int, episodes: int) -> tuple[Key, Key]:

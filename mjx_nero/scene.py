@@ -16,8 +16,8 @@ class SceneCfg:
     termination that counts a cube beyond them as fallen.
     """
 
-    table_center: tuple[float, float] = (0.35, 0.0)
-    table_size: tuple[float, float] = (1.1, 1.4)
+    table_center: tuple[float, float] = (0.3, 0.0)
+    table_size: tuple[float, float] = (1.0, 1.2)
     cube_edge: float = 0.03
     cube_mass: float = 0.03
     cube_friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
@@ -113,14 +113,14 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal) -> None:
     world.add_light(pos=[0.8, -0.8, 1.6], dir=[-0.4, 0.6, -1.2], diffuse=[0.7, 0.7, 0.7], castshadow=True)
     world.add_light(pos=[0.4, 1.0, 1.4], dir=[0, -0.7, -1.0], diffuse=[0.3, 0.3, 0.3], castshadow=False)
     for name, pos, target in (
-        ("front", (1.15, -0.75, 0.75), (0.2, 0.0, 0.22)),
-        ("side", (0.3, -1.25, 0.45), (0.2, 0.0, 0.25)),
+        ("front", (0.95, -0.72, 0.52), (0.17, 0.0, 0.2)),
+        ("side", (0.25, -1.1, 0.4), (0.18, 0.0, 0.24)),
     ):
         world.add_camera(name=name, pos=pos, quat=_look_at(pos, target), fovy=42)
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    spec.visual.quality.shadowsize = 4096
+    spec.visual.quality.shadowsize = 2048
     spec.stat.center, spec.stat.extent = [0.25, 0, 0.25], 1.0
 
 

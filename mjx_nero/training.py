@@ -1,0 +1,404 @@
+"""A training run: machine defaults, run folder, progress, checkpoints, curve and video."""
+
+import contextlib
+import dataclasses
+import json
+import pathlib
+import shlex
+import signal
+import sys
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mjx_nero import checkpoint, config, policy, registry, render, rollout, wrappers
+from mjx_nero.env import ManipulationEnv
+from mjx_nero.ppo import Learner, PpoCfg, TrainState
+from mjx_nero.types import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class RunCfg:
+    """One run of train.py."""
+
+    env_name: str
+    preset: str
+    env: Any  # EnvCfg
+    ppo: PpoCfg
+    impl: str = "auto"
+    seed: int = 0
+    out: pathlib.Path | None = None
+    restore: pathlib.Path | None = None
+    eval_every: int = 0  # env steps; 0: twenty times a run
+    checkpoint_every: int = 0  # env steps; 0: five times a run
+    eval_episodes: int = 256
+    max_minutes: float = 0.0  # of training, compilation apart; 0: no limit
+    video: bool = True
+
+
+def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
+    """Fills in what the machine decides: number of environments, env steps, time limit. With a line that says so."""
+    ppo = run.ppo
+    if jax.default_backend() != "cpu":
+        ppo = dataclasses.replace(ppo, num_envs=ppo.num_envs or 4096, num_timesteps=ppo.num_timesteps or 60_000_000)
+        return dataclasses.replace(run, ppo=ppo), ""
+    short = not ppo.num_timesteps
+    ppo = dataclasses.replace(ppo, num_envs=ppo.num_envs or 256, num_timesteps=ppo.num_timesteps or 2_000_000)
+    run = dataclasses.replace(run, ppo=ppo, eval_episodes=min(run.eval_episodes, 64))
+    if not short:
+        return run, ""
+    run = dataclasses.replace(run, max_minutes=run.max_minutes or 4.0)
+    note = (
+        f"no GPU: {ppo.num_envs} environments for {run.max_minutes:g} minutes, enough for first signs of learning; "
+        "a GPU trains 4,096 environments for 60 M steps, to success, in about a minute"
+    )
+    return run, note
+
+
+class RunFolder:
+    """Where a run writes. Refuses a folder that holds another run, unless that run goes on.
+
+    Raises:
+        UserError: the folder holds a run, or cannot be written.
+    """
+
+    def __init__(self, path: pathlib.Path, resume: bool):
+        self.path, self.rows = path, []
+        if (path / "config.json").exists() and not resume:
+            raise UserError(f"{path} already holds a run: pass another --out, or --restore {path} to go on with it")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            probe = path / ".probe"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise UserError(f"cannot write to {path}: {error.strerror or error}; pass another --out") from None
+        self._metrics = path / "metrics.jsonl"
+        self._tensorboard = None
+
+    def begin(self, run: RunCfg, start: int) -> None:
+        """Writes the resolved config; keeps the metrics of a resumed run up to env step ``start``."""
+        from tensorboardX import SummaryWriter
+
+        resolved = {**config.to_dict(run), "versions": versions()}
+        (self.path / "config.json").write_text(json.dumps(resolved, indent=2, default=str) + "\n")
+        if self._metrics.exists():
+            rows = [json.loads(line) for line in self._metrics.read_text().splitlines() if line]
+            self.rows = [row for row in rows if row["steps"] <= start]
+        self._metrics.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
+        self._tensorboard = SummaryWriter(str(self.path / "tensorboard"), purge_step=start or None)
+
+    def log(self, row: dict[str, float]) -> None:
+        """Appends one row of metrics."""
+        self.rows.append(row)
+        with self._metrics.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            self._tensorboard.add_scalar(name, value, int(row["steps"]))
+
+    def close(self) -> None:
+        """Flushes the logs and draws the learning curve."""
+        if self._tensorboard is not None:
+            self._tensorboard.close()
+        if self.rows:
+            plot_curve(self.rows, self.path / "curve.png")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides a result, and the device."""
+    import importlib.metadata as metadata
+
+    names = ("mjx-nero", "mujoco", "mujoco-mjx", "jax", "brax", "flax", "optax", "warp-lang")
+    found = {}
+    for name in names:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return {**found, "python": sys.version.split()[0], "device": jax.devices()[0].device_kind}
+
+
+def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
+    """Trains a policy and leaves everything about it in the run folder; returns the summary that it prints.
+
+    Args:
+        command: how the user called us, for the hint how to go on.
+
+    Raises:
+        UserError: anything that the user can mend: impl, folder, checkpoint, sizes.
+    """
+    console = Console(stderr=True)
+    run, note = fit_machine(run)
+    if note:
+        console.print(note, highlight=False)
+    ppo = run.ppo
+    source = _checkpoint_path(run.restore) if run.restore else None
+    resume_folder = run.restore if run.restore and run.restore.is_dir() else None
+    stamp = time.strftime("%Y%m%d_%H%M%S")
+    path = run.out or resume_folder or pathlib.Path("runs") / f"{run.env_name}_{stamp}"
+    env = ManipulationEnv(run.env, impl=run.impl, num_envs=ppo.num_envs)
+    learner = Learner(wrappers.for_training(env), ppo)
+    folder = RunFolder(path, resume=resume_folder is not None and path.resolve() == resume_folder.resolve())
+    meta = policy.describe(env, run.env_name, run.preset, ppo.network)
+
+    started = time.perf_counter()
+    with console.status("compiling (a minute or two the first time) ..."):
+        state = _initial_state(learner, run.seed, source)
+        iterations = -(-ppo.num_timesteps // learner.steps_per_iteration)
+        chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
+        advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
+        evaluate = _evaluator(run, learner)
+        first = evaluate(state)
+        # Loads what the backend compiles at its first call (Warp's kernels), on a copy.
+        jax.block_until_ready(jax.jit(learner.env.step)(state.env_state, np.zeros((ppo.num_envs, env.action_size), np.float32)))
+    compile_s = time.perf_counter() - started
+    console.print(f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments", highlight=False)
+
+    done = int(state.iteration)
+    folder.begin(run, done * learner.steps_per_iteration)
+    loop = _Loop(run, learner, folder, evaluate, advance, chunk, iterations, meta, console)
+    try:
+        state, stopped = loop.run(state, first)
+    finally:
+        folder.close()
+    steps = int(state.iteration) * learner.steps_per_iteration
+    if stopped == "interrupted":
+        console.print(f"stopped at {steps:,} steps, all saved; go on with: {command} --restore {path}", highlight=False, soft_wrap=True)
+    checkpoint.save(path / "policy.safetensors", (state.normalizer, state.params), {**meta, "env_steps": steps})
+    summary = {
+        "env": run.env_name,
+        "preset": run.preset,
+        "seed": run.seed,
+        "impl": env.impl,
+        "num_envs": ppo.num_envs,
+        "env_steps": steps,
+        "compile_s": round(compile_s, 1),
+        "train_s": round(loop.wall, 1),
+        "steps_per_s": round(loop.steps_per_s),
+        "seconds_to_95": loop.seconds_to_95,
+        "steps_to_95": loop.steps_to_95,
+        "nan_count": loop.nan_count,
+        "overflow_count": loop.overflow_count,
+        "stopped": stopped,
+        "evaluation": loop.last_eval,
+        "device": jax.devices()[0].device_kind,
+    }
+    (path / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    if run.video and stopped != "interrupted":
+        _video(env, run, state, learner, path / "video.mp4", console)
+    return {**summary, "folder": str(path)}
+
+
+class _Loop:
+    """The training loop between compilation and the final files."""
+
+    def __init__(self, run, learner, folder, evaluate, advance, chunk, iterations, meta, console):
+        self.r, self.learner, self.folder, self.evaluate, self.advance = run, learner, folder, evaluate, advance
+        self.chunk, self.iterations, self.meta, self.console = chunk, iterations, meta, console
+        total = iterations * learner.steps_per_iteration
+        self.eval_every = run.eval_every or max(1, total // 20)
+        self.save_every = run.checkpoint_every or max(1, total // 5)
+        self.wall = self.steps_per_s = 0.0
+        self.seconds_to_95 = self.steps_to_95 = None
+        self.nan_count = self.overflow_count = 0
+        self.last_eval: dict[str, Any] = {}
+
+    def run(self, state: TrainState, first: dict[str, Any]) -> tuple[TrainState, str]:
+        """Trains until the steps or minutes are used up or Ctrl-C; says which."""
+        per = self.learner.steps_per_iteration
+        steps = start = int(state.iteration) * per
+        self.last_eval = first
+        self._log(steps, {}, first)
+        wait = {"eval": steps + self.eval_every, "save": steps + self.save_every}
+        begun = time.perf_counter()
+        with self._progress() as (bar, task), _stop_on_ctrl_c(self.console) as stop:
+            while steps < self.iterations * per:
+                t = time.perf_counter()
+                state, metrics = self.advance(state)
+                metrics = {name: float(value) for name, value in metrics.items()}  # waits for the device
+                self.steps_per_s = self.chunk * per / (time.perf_counter() - t)
+                steps += self.chunk * per
+                self.wall = time.perf_counter() - begun
+                row = self._training_row(metrics)
+                out_of_time = 0 < self.r.max_minutes * 60 <= self.wall
+                last = steps >= self.iterations * per or out_of_time or stop.is_set
+                evaluation = {}
+                if steps >= wait["eval"] or last:
+                    self.last_eval = evaluation = self.evaluate(state)
+                    wait["eval"] += self.eval_every
+                    self.wall = time.perf_counter() - begun
+                    if self.seconds_to_95 is None and evaluation["success_rate"] >= 0.95:
+                        self.seconds_to_95, self.steps_to_95 = round(self.wall, 1), steps
+                self._log(steps, row, evaluation)
+                if steps >= wait["save"] or last:
+                    wait["save"] += self.save_every
+                    name = f"{steps:012d}.safetensors"
+                    checkpoint.save(self.folder.path / "checkpoints" / name, state, {**self.meta, "kind": "checkpoint"})
+                bar.update(task, completed=steps - start, total=self.iterations * per - start, **self._shown(row))
+                if stop.is_set:
+                    return state, "interrupted"
+                if out_of_time:
+                    return state, "time limit"
+        return state, "finished"
+
+    def _training_row(self, metrics: dict[str, float]) -> dict[str, float]:
+        """Means of a chunk: sums over an iteration become figures an episode."""
+        per, length = self.learner.steps_per_iteration, self.learner.env.unwrapped.episode_length
+        episodes = max(metrics["sum/episodes"], 1e-9)
+        grasps = max(metrics["sum/grasped"], 1e-9)
+        self.nan_count += round(metrics["sum/nan"] * self.chunk)
+        self.overflow_count += round(metrics["sum/overflow"] * self.chunk)
+        row = {
+            "steps_per_s": self.steps_per_s,
+            "train/return": metrics["sum/reward"] / per * length,
+            "train/time_to_grasp": metrics["sum/grasp_time"] / grasps,
+            "nan_count": self.nan_count,
+            "overflow_count": self.overflow_count,
+        }
+        row |= {f"train/{name}": metrics[f"sum/{name}"] / episodes for name in ("success", "grasped", "dropped", "final_distance")}
+        prefix = "sum/reward/"
+        row |= {f"reward/{k.removeprefix(prefix)}": v / per * length for k, v in metrics.items() if k.startswith(prefix)}
+        return row | {f"ppo/{k}": v for k, v in metrics.items() if not k.startswith("sum/")}
+
+    def _log(self, steps: int, row: dict[str, float], evaluation: dict[str, Any]) -> None:
+        shown = {f"eval/{k}": v for k, v in evaluation.items() if isinstance(v, float | int)}
+        self.folder.log({"steps": steps, "wall_s": round(self.wall, 3), **row, **shown})
+        if evaluation and not self.console.is_terminal:
+            text = f"{steps:>12,} steps {self.wall:7.1f} s  return {evaluation['return_mean']:8.2f}"
+            self.console.print(f"{text}  success {evaluation['success_rate']:.3f}", highlight=False)
+
+    def _shown(self, row: dict[str, float]) -> dict[str, str]:
+        return {
+            "sps": f"{self.steps_per_s:,.0f}",
+            "ret": f"{row['train/return']:.1f}",
+            "suc": f"{self.last_eval['success_rate']:.2f}",
+        }
+
+    @contextlib.contextmanager
+    def _progress(self):
+        columns = (
+            BarColumn(bar_width=24),
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f} steps"),
+            TextColumn("{task.fields[sps]} steps/s  return {task.fields[ret]}  success {task.fields[suc]}  ETA"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=self.console, disable=not self.console.is_terminal) as bar:
+            yield bar, bar.add_task("", sps="-", ret="-", suc="-")
+
+
+class _Stop:
+    is_set = False
+
+
+@contextlib.contextmanager
+def _stop_on_ctrl_c(console: Console):
+    """The first Ctrl-C sets a flag, so that the chunk in flight ends whole; the second interrupts."""
+    stop = _Stop()
+
+    def handle(*_):
+        if stop.is_set:
+            raise KeyboardInterrupt
+        stop.is_set = True
+        console.print("stopping after this update (Ctrl-C again: at once) ...")
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _evaluator(run: RunCfg, learner: Learner):
+    """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo C where there is no accelerator."""
+    env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=run.impl, num_envs=run.eval_episodes)
+    make = rollout.native_runner if jax.default_backend() == "cpu" else rollout.mjx_runner
+    play = make(env, lambda params, obs, _: policy.make_act(learner.networks, params)(obs), run.eval_episodes)
+    return lambda state: play((state.normalizer, state.params), run.seed).summary()
+
+
+def _initial_state(learner: Learner, seed: int, source: pathlib.Path | None) -> TrainState:
+    """A fresh state, or that of a checkpoint; of a policy file, its networks alone."""
+    init = jax.jit(learner.init)
+    key = jax.random.PRNGKey(seed)
+    if source is None:
+        return init(key)
+    if checkpoint.load_meta(source).get("kind") == "checkpoint":
+        return checkpoint.load(source, jax.eval_shape(learner.init, key))
+    fresh = init(key)
+    normalizer, params = checkpoint.load(source, (fresh.normalizer, fresh.params))
+    return fresh.replace(normalizer=normalizer, params=params)
+
+
+def _checkpoint_path(restore: pathlib.Path) -> pathlib.Path:
+    """The newest checkpoint of a run folder, or the file itself."""
+    if restore.is_dir():
+        found = sorted((restore / "checkpoints").glob("*.safetensors"))
+        if not found:
+            raise UserError(f"{restore} holds no checkpoint to restore: give a run folder or a .safetensors file")
+        return found[-1]
+    checkpoint.load_meta(restore)
+    return restore
+
+
+def _video(env: ManipulationEnv, run: RunCfg, state: TrainState, learner: Learner, path: pathlib.Path, console: Console) -> None:
+    """Three episodes of the trained policy, played in MuJoCo C."""
+    play_env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=env.impl)
+    act = lambda params, obs, _: policy.make_act(learner.networks, params)(obs)  # noqa: E731
+    played = rollout.native_runner(play_env, act, 3, record=3)((state.normalizer, state.params), run.seed)
+    try:
+        render.write_video(path, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
+    except UserError as error:
+        console.print(str(error), highlight=False)
+
+
+def plot_curve(rows: list[dict[str, float]], path: pathlib.Path) -> None:
+    """Success, return and every reward term over env steps."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 3.8), layout="constrained")
+    success, returns, terms = figure.subplots(1, 3)
+
+    def line(axes, name, **style):
+        points = [(row["steps"] / 1e6, row[name]) for row in rows if name in row]
+        if points:
+            axes.plot(*zip(*points, strict=True), **style)
+
+    line(success, "train/success", label="training (with exploration noise)", color="tab:gray")
+    line(success, "eval/success_rate", label="evaluation", color="tab:blue", marker="o", markersize=3)
+    line(returns, "train/return", label="training", color="tab:gray")
+    line(returns, "eval/return_mean", label="evaluation", color="tab:blue", marker="o", markersize=3)
+    for name in sorted({k for row in rows for k in row if k.startswith("reward/")}):
+        line(terms, name, label=name.removeprefix("reward/"))
+    for axes, title in ((success, "success rate"), (returns, "return of an episode"), (terms, "return by term (training)")):
+        axes.set_title(title)
+        axes.set_xlabel("env steps [million]")
+        axes.grid(alpha=0.3)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=7)
+    success.set_ylim(-0.02, 1.02)
+    figure.savefig(path, dpi=110)
+
+
+def command_line(argv: list[str]) -> str:
+    """The user's command without --restore and --out, to show how to go on."""
+    kept, skip = [], False
+    for word in argv:
+        if skip:
+            skip = False
+        elif word in ("--restore", "--out"):
+            skip = True
+        elif not word.startswith(("--restore=", "--out=")):
+            kept.append(word)
+    return shlex.join(["python", "train.py", *kept])
+
+
+def resolve(env: str, preset: str, env_fields: dict[str, Any], ppo: PpoCfg, ppo_fields: dict[str, Any], **rest: Any) -> RunCfg:
+    """A run's config from names and dotted fields.
+
+    Raises:
+        UserError: unknown names or fields, wrong types.
+    """
+    cfg = registry.env_cfg(env, preset, **env_fields)
+    return RunCfg(env_name=env, preset=preset, env=cfg, ppo=config.override(ppo, ppo_fields), **rest)

@@ -1,0 +1,84 @@
+"""Shared by all tests: type checks at run time, a compilation cache, and the few compiled functions that cost time."""
+
+import getpass
+import os
+import pathlib
+import sys
+import tempfile
+
+import jaxtyping
+
+# Annotations are checked wherever a traced or called function of the package runs; so the hook precedes the import. Left out:
+# ``types`` and ``ppo``, whose pytrees are annotated for one environment and made again with a batch axis by ``jax.vmap``.
+_CHECKED = ("checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robots", "rollout")
+_CHECKED += ("scene", "tasks", "terms", "view")
+_hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
+import mjx_nero  # noqa: E402  (also sets XLA_FLAGS, which must happen before JAX starts its backend)
+
+import jax  # noqa: E402  isort: skip
+import jax.numpy as jnp  # noqa: E402
+import pytest  # noqa: E402
+
+from mjx_nero import wrappers  # noqa: E402
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))  # helpers beside the tests
+
+_CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
+jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+jax.config.update("jax_default_matmul_precision", "highest")
+
+# Every test that needs MJX steps a batch of this size: the step is compiled once for all of them.
+NUM_ENVS = 8
+
+
+def pytest_collection_modifyitems(items):
+    """GPU tests skip themselves where there is none."""
+    if any(item.get_closest_marker("gpu") for item in items) and jax.default_backend() != "gpu":
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
+
+
+@pytest.fixture(scope="session")
+def env() -> mjx_nero.ManipulationEnv:
+    """One environment of the default preset."""
+    return mjx_nero.make("nero_lift", impl="jax")
+
+
+class Batch:
+    """``NUM_ENVS`` auto-resetting environments with jitted ``reset`` and ``step``; ``traces`` counts compilations of the step."""
+
+    def __init__(self, env: mjx_nero.ManipulationEnv):
+        self.env = env
+        self.train_env = wrappers.for_training(env)
+        self.traces = 0
+        self.reset = jax.jit(lambda seed: self.train_env.reset(jax.random.split(jax.random.PRNGKey(seed), NUM_ENVS)))
+        self.step = jax.jit(self._step)
+
+    def _step(self, state, action):
+        self.traces += 1
+        return self.train_env.step(state, action)
+
+
+@pytest.fixture(scope="session")
+def batch(env) -> Batch:
+    return Batch(env)
+
+
+class Finish:
+    """The second half of a step on one environment, jitted: the MDP on a physics state of the test's own making."""
+
+    def __init__(self, env: mjx_nero.ManipulationEnv):
+        self.env = env
+        self.reset = jax.jit(env.reset)
+        self._finish = jax.jit(env.finish)
+
+    def __call__(self, state, action=None, sim=None):
+        action = jnp.zeros(self.env.action_size) if action is None else jnp.asarray(action, jnp.float32)
+        return self._finish(state, action, state.pipeline_state if sim is None else sim, jnp.zeros(()))
+
+
+@pytest.fixture(scope="session")
+def finish(env) -> Finish:
+    return Finish(env)
