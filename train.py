@@ -17,7 +17,7 @@ def main(argv):
     parser.add_argument("--impl", choices=IMPLS, default="auto", help="physics (default: warp where there is a GPU for it, else jax)")
     parser.add_argument("--out", type=pathlib.Path, help="run folder (default: runs/<env>_<time>)")
     parser.add_argument("--restore", type=pathlib.Path, help="run folder or checkpoint to go on from, or a policy to start from")
-    parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 20 a run)")
+    parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 12 a run)")
     parser.add_argument("--checkpoint-every", type=cli.positive, default=0, help="env steps between checkpoints (default: 5 a run)")
     parser.add_argument("--max-minutes", type=float, default=0.0, help="stop after so many minutes of training (default: no limit)")
     parser.add_argument("--no-video", dest="video", action="store_false", help="do not render the trained policy")

@@ -135,40 +135,42 @@ class ManipulationEnv(Env):
         Args:
             rng: random key of this environment.
         """
-        rng, k_event, k_command, k_obs = jax.random.split(rng, 4)
+        k_draw, k_obs = jax.random.split(rng)
+        sim, carry = self.draw(k_draw)
+        names = [f"reward/{name}" for name in self.cfg.rewards]
+        names += ["success", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
+        zero = jnp.zeros(())
+        info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
+        return State(sim, self.observe(sim, carry, k_obs), zero, zero, dict.fromkeys(names, zero), info)
+
+    def draw(self, rng: Key) -> tuple[Sim, Carry]:
+        """The start of an episode, before it is observed."""
+        rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
         joints, cube = jnp.asarray(self.cfg.robot.home), jnp.asarray(self.cfg.object_start)
-        for key, event in zip(jax.random.split(k_event, max(1, len(self.cfg.events))), self.cfg.events.values(), strict=False):
+        for key, event in zip(k_events, self.cfg.events.values(), strict=True):
             joints, cube = event.func(key, joints, cube, **event.params)
         joints = jnp.clip(joints, *self._range)
-        at = self._viewer.object_qpos
-        qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints).at[at : at + 3].set(cube)
+        at, nv = self._viewer.object_qpos, self.physics_model.nv
         sim = Sim(
-            qpos=qpos,
-            qvel=jnp.zeros(self.physics_model.nv),
+            qpos=jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints).at[at : at + 3].set(cube),
+            qvel=jnp.zeros(nv),
             ctrl=joints,
-            warmstart=jnp.zeros(self.physics_model.nv),
+            warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
         )
-        zero = jnp.zeros(self.action_size)
-        command = self.cfg.command.func(k_command, **self.cfg.command.params)
         carry = Carry(
             rng=rng,
             step=jnp.zeros((), jnp.int32),
-            action=zero,
-            command=command,
+            action=jnp.zeros(self.action_size),
+            command=self.cfg.command.func(k_command, **self.cfg.command.params),
             hold=jnp.zeros((), jnp.int32),
             grasp_time=jnp.array(jnp.inf),
         )
-        obs = terms.observe(self.cfg.observations, self._viewer(sim, carry, zero), k_obs, self.cfg.corruption)
-        names = [f"reward/{name}" for name in self.cfg.rewards]
-        names += ["success", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
-        info = {
-            "carry": carry,
-            "count": jnp.zeros((), jnp.int32),
-            "truncation": jnp.zeros(()),
-            "steps": jnp.zeros(()),
-        }
-        return State(sim, obs, jnp.zeros(()), jnp.zeros(()), {n: jnp.zeros(()) for n in names}, info)
+        return sim, carry
+
+    def observe(self, sim: Sim, carry: Carry, key: Key) -> dict[str, Float[Array, " n"]]:
+        """The observation groups; ``key`` draws their noise."""
+        return terms.observe(self.cfg.observations, self._viewer(sim, carry, carry.action), key, self.cfg.corruption)
 
     def step(self, state: State, action: Float[Array, " na"]) -> State:
         """One control step.
@@ -181,6 +183,20 @@ class ManipulationEnv(Env):
         sim, overflow = self.physics.step(state.pipeline_state, ctrl)
         return self.finish(state, action, sim, overflow)
 
+    def step_and_reset(self, state: State, action: Float[Array, " na"]) -> State:
+        """``step``, and where that ends the episode the start of a new one, with fresh draws.
+
+        Reward, done and metrics are the ended episode's; physics, observation and carry the new one's. To cache the first
+        state instead would replay one object and goal position per environment for ever.
+        """
+        ctrl = self.targets(state, action)
+        sim, overflow = self.physics.step(state.pipeline_state, ctrl)
+        state = self.advance(state, action, sim, overflow)
+        rng, k_draw, k_obs = jax.random.split(state.info["carry"].rng, 3)
+        old = (state.pipeline_state, state.info["carry"].replace(rng=rng))
+        sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), self.draw(k_draw), old)
+        return state.replace(pipeline_state=sim, obs=self.observe(sim, carry, k_obs), info={**state.info, "carry": carry})
+
     def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
         """The drives' position targets for ``action``: within the joint ranges and the drives' speed limits [rad, m]."""
         action, robot = self._clip(action), self.cfg.robot
@@ -192,7 +208,15 @@ class ManipulationEnv(Env):
         return actions.rate_limit(target, state.pipeline_state.ctrl, step=jnp.asarray(self._max_ctrl_step))
 
     def finish(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
-        """The second half of ``step``: rewards, terminations, metrics and observations of the physics state ``sim``."""
+        """The second half of ``step``: what follows from the physics state ``sim``."""
+        state = self.advance(state, action, sim, overflow)
+        carry = state.info["carry"]
+        rng, k_obs = jax.random.split(carry.rng)
+        obs = self.observe(state.pipeline_state, carry, k_obs)
+        return state.replace(obs=obs, info={**state.info, "carry": carry.replace(rng=rng)})
+
+    def advance(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
+        """Rewards, terminations, metrics and carry for the physics state ``sim``; the observation is left as it was."""
         cfg, carry = self.cfg, state.info["carry"]
         action = self._clip(action)
         # A diverged environment stays at its last good state and ends; nothing of the bad one gets any further.
@@ -200,7 +224,6 @@ class ManipulationEnv(Env):
         sim = jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.pipeline_state, sim)
         action = jnp.where(bad, carry.action, action)
 
-        rng, k_command, k_obs = jax.random.split(carry.rng, 3)
         step = carry.step + 1
         count = state.info["count"] + 1
         view = self._viewer(sim, carry.replace(step=step), action)
@@ -226,14 +249,14 @@ class ManipulationEnv(Env):
         metrics |= {name: value * done for name, value in ends.items()}
         metrics |= {"nan": bad.astype(jnp.float32), "overflow": overflow}
 
-        resample = step % self._resample_steps == 0
-        command = jnp.where(resample, cfg.command.func(k_command, **cfg.command.params), carry.command)
-        carry = carry.replace(rng=rng, step=step, action=action, command=command, hold=hold, grasp_time=grasp_time)
-        obs = terms.observe(cfg.observations, self._viewer(sim, carry, action), k_obs, cfg.corruption)
+        carry = carry.replace(step=step, action=action, hold=hold, grasp_time=grasp_time)
+        if self._resample_steps < self.episode_length:
+            rng, k_command = jax.random.split(carry.rng)
+            drawn = cfg.command.func(k_command, **cfg.command.params)
+            carry = carry.replace(rng=rng, command=jnp.where(step % self._resample_steps == 0, drawn, carry.command))
         info = {"carry": carry, "count": count, "truncation": truncated.astype(jnp.float32), "steps": step.astype(jnp.float32)}
         return state.replace(
             pipeline_state=sim,
-            obs=obs,
             reward=sum(reward_terms.values()),
             done=done,
             metrics={**state.metrics, **metrics},

@@ -1,12 +1,15 @@
-"""PPO from Brax's building blocks: its loss, networks, running statistics and adaptive learning rate, in a loop of our own.
+"""PPO from Brax's building blocks: networks, advantages, running statistics and adaptive learning rate, in a loop of our own.
 
 Brax's own ``ppo.train`` keeps optimiser, environments and random keys to itself, so a run cannot be resumed exactly, reports
 no training episodes without a host callback at every step, and in release 0.14.2 calls a function that JAX 0.10 removed.
-This loop hands its whole state to the caller, is compiled ahead of time (compilation is timed apart), and the algorithm stays Brax's.
+This loop hands its whole state to the caller and is compiled ahead of time, so compilation is timed apart.
+
+The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in every
+minibatch, where their loop over time took longer than the networks. At the first minibatch both agree to rounding (tests/test_ppo.py).
 """
 
 import dataclasses
-import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +17,6 @@ import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, networks, optimizer
-from brax.training.types import Transition
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -77,6 +79,19 @@ class TrainState:
     iteration: Int[Array, ""]
 
 
+@struct.dataclass
+class Batch:
+    """What an update learns from. Leaves are [time, env, ...], or any part of that."""
+
+    obs: dict[str, jax.Array]
+    raw_action: jax.Array  # before the distribution's squashing, if it has one
+    log_prob: jax.Array
+    distribution: Any  # parameters of the distribution that acted
+    value: jax.Array
+    returns: jax.Array
+    advantages: jax.Array
+
+
 class Learner:
     """PPO on a batch of environments.
 
@@ -92,19 +107,7 @@ class Learner:
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
         self._optimizer = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam)
-        clip_value = cfg.clip_value or None
-        self._make_policy = networks.make_inference_fn(self.networks, compute_value=clip_value is not None)
-        self._loss = functools.partial(
-            losses.compute_ppo_loss,
-            ppo_network=self.networks,
-            entropy_cost=cfg.entropy_cost,
-            discounting=cfg.discounting,
-            reward_scaling=cfg.reward_scaling,
-            gae_lambda=cfg.gae_lambda,
-            clipping_epsilon=cfg.clipping,
-            vf_coefficient=cfg.value_loss,
-            clipping_epsilon_value=clip_value,
-        )
+        self._make_policy = networks.make_inference_fn(self.networks, compute_value=True)
 
     def init(self, key: Key) -> TrainState:
         """Fresh networks and environments, the latter spread over their episodes so that they don't all end at once."""
@@ -112,9 +115,9 @@ class Learner:
         normalizer, params = init_params(self.networks, self.sizes, k_net)
         env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs))
         carry = env_state.info["carry"]
-        phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)  # type: ignore[attr-defined]
+        phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
         env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
-        opt_state = self._optimizer.init(params)  # type: ignore[arg-type]
+        opt_state = self._optimizer.init(params)
         return TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32))
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
@@ -125,49 +128,86 @@ class Learner:
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, k_roll, k_update = jax.random.split(state.key, 3)
-        env_state, data, episodes = self._rollout(state, k_roll)
-        params, opt_state, metrics = self._update(state, data, k_update)
+        env_state, batch, episodes = self.rollout(state, k_roll)
+        params, opt_state, metrics = self._update(state, batch, k_update)
         # After the update: the loss compares with log-probabilities made under the statistics that acted.
-        normalizer = running_statistics.update(state.normalizer, data.observation)
+        normalizer = running_statistics.update(state.normalizer, batch.obs)
         state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1)
         return state, {**episodes, **metrics}
 
-    def _rollout(self, state: TrainState, key: Key) -> tuple[State, Transition, Metrics]:
-        """Acts for ``unroll_length`` steps. Data leaves are [time, env, ...]."""
+    def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
+        """Acts for ``unroll_length`` steps in every environment and computes returns and advantages.
+
+        Returns:
+            the environments, the batch (leaves [time, env, ...]), and sums of the environments' metrics over it.
+        """
+        cfg = self.cfg
         policy = self._make_policy((state.normalizer, state.params.policy, state.params.value))
 
         def act(env_state: State, key: Key):
             action, extras = policy(env_state.obs, key)
             after = self.env.step(env_state, action)
-            data = Transition(
-                observation=env_state.obs,
-                action=action,
-                reward=after.reward,
-                discount=1.0 - after.done,
-                next_observation=(),
-                extras={"policy_extras": extras, "state_extras": {"truncation": after.info["truncation"]}},
-            )
             sums = {name: jnp.sum(value) for name, value in after.metrics.items()}
-            return after, (data, {**sums, "reward": jnp.sum(after.reward), "episodes": jnp.sum(after.done)})
+            sums |= {"reward": jnp.sum(after.reward), "episodes": jnp.sum(after.done)}
+            return after, (env_state.obs, extras, after.reward, after.done, after.info["truncation"], sums)
 
-        env_state, (data, sums) = jax.lax.scan(act, state.env_state, jax.random.split(key, self.cfg.unroll_length))
-        # The loss reads the last observation alone, to bootstrap from.
-        data = data._replace(next_observation=jax.tree.map(lambda x: x[None], env_state.obs))
-        return env_state, data, {f"sum/{name}": jnp.sum(value) for name, value in sums.items()}
+        keys = jax.random.split(key, cfg.unroll_length)
+        env_state, (obs, extras, reward, done, truncation, sums) = jax.lax.scan(act, state.env_state, keys)
+        last = self.networks.value_network.apply(state.normalizer, state.params.value, env_state.obs)
+        returns, advantages = losses.compute_gae(
+            truncation=truncation,
+            termination=done * (1 - truncation),
+            rewards=reward * cfg.reward_scaling,
+            values=extras["value"],
+            bootstrap_value=last,
+            lambda_=cfg.gae_lambda,
+            discount=cfg.discounting,
+        )
+        batch = Batch(
+            obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], extras["value"], returns, advantages
+        )
+        return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in sums.items()}
 
-    def _update(self, state: TrainState, data: Transition, key: Key) -> tuple[losses.PPONetworkParams, optax.OptState, Metrics]:
+    def loss(
+        self, params: losses.PPONetworkParams, normalizer: running_statistics.RunningStatisticsState, batch: Batch, key: Key
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """Clipped surrogate, clipped value loss and entropy bonus. Schulman et al. 2017; the value's clipping as in RSL-RL."""
+        cfg, nets = self.cfg, self.networks
+        dist = nets.parametric_action_distribution
+        logits = nets.policy_network.apply(normalizer, params.policy, batch.obs)
+        value = nets.value_network.apply(normalizer, params.value, batch.obs)
+
+        advantages = (batch.advantages - jnp.mean(batch.advantages)) / (jnp.std(batch.advantages) + 1e-8)
+        ratio = jnp.exp(dist.log_prob(logits, batch.raw_action) - batch.log_prob)
+        clipped = jnp.clip(ratio, 1 - cfg.clipping, 1 + cfg.clipping)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
+
+        error = jnp.square(batch.returns - value)
+        if cfg.clip_value:
+            near = batch.value + jnp.clip(value - batch.value, -cfg.clip_value, cfg.clip_value)
+            error = jnp.maximum(error, jnp.square(batch.returns - near))
+        value_loss = 0.5 * cfg.value_loss * jnp.mean(error)
+
+        entropy = jnp.mean(dist.entropy(logits, key))
+        new, old = dist.create_dist(logits), dist.create_dist(batch.distribution)
+        kl = jnp.mean(new.kl_divergence(old)) if hasattr(new, "kl_divergence") else jnp.zeros(())
+        total = policy_loss + value_loss - cfg.entropy_cost * entropy
+        metrics = {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy, "kl": kl}
+        return total, {**metrics, "action_std": jnp.mean(new.scale)}
+
+    def _update(self, state: TrainState, batch: Batch, key: Key) -> tuple[losses.PPONetworkParams, optax.OptState, Metrics]:
         cfg = self.cfg
 
         def minibatch(carry, envs_and_key):
             params, opt_state = carry
             envs, key = envs_and_key
-            batch = jax.tree.map(lambda x: jnp.swapaxes(x[:, envs], 0, 1), data)
-            grads, metrics = jax.grad(self._loss, has_aux=True)(params, state.normalizer, batch, key)
+            part = jax.tree.map(lambda x: x[:, envs], batch)
+            grads, metrics = jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key)
             if cfg.desired_kl:
                 opt_state, _ = optimizer.adaptive_kl_learning_rate(
-                    opt_state, metrics["kl_mean"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
+                    opt_state, metrics["kl"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
                 )
-            metrics["learning_rate"] = opt_state[-1].hyperparams["learning_rate"]  # type: ignore[index]
+            metrics["learning_rate"] = opt_state[-1].hyperparams["learning_rate"]
             updates, opt_state = self._optimizer.update(grads, opt_state)
             return (optax.apply_updates(params, updates), opt_state), metrics
 

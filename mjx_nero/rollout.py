@@ -82,7 +82,7 @@ def _accumulate(state: State, after: State, totals: dict, active: jax.Array) -> 
 def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
     state = jax.vmap(env.reset)(keys)
     zeros = jnp.zeros(keys.shape[0])
-    return state, {name: zeros for name in (*state.metrics, "return", "length")}, jnp.ones_like(zeros)
+    return state, dict.fromkeys((*state.metrics, "return", "length"), zeros), jnp.ones_like(zeros)
 
 
 def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, jax.Array]:

@@ -33,7 +33,7 @@ class RunCfg:
     seed: int = 0
     out: pathlib.Path | None = None
     restore: pathlib.Path | None = None
-    eval_every: int = 0  # env steps; 0: twenty times a run
+    eval_every: int = 0  # env steps; 0: twelve times a run
     checkpoint_every: int = 0  # env steps; 0: five times a run
     eval_episodes: int = 256
     max_minutes: float = 0.0  # of training, compilation apart; 0: no limit
@@ -198,7 +198,7 @@ class _Loop:
         self.r, self.learner, self.folder, self.evaluate, self.advance = run, learner, folder, evaluate, advance
         self.chunk, self.iterations, self.meta, self.console = chunk, iterations, meta, console
         total = iterations * learner.steps_per_iteration
-        self.eval_every = run.eval_every or max(1, total // 20)
+        self.eval_every = run.eval_every or max(1, total // 12)
         self.save_every = run.checkpoint_every or max(1, total // 5)
         self.wall = self.steps_per_s = 0.0
         self.seconds_to_95 = self.steps_to_95 = None

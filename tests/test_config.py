@@ -8,7 +8,7 @@ import pytest
 from mjx_nero import UserError, config, env_cfg, list_envs, list_presets, make
 from mjx_nero.env import EnvCfg
 from mjx_nero.policy import NetworkCfg
-from mjx_nero.ppo import ISAAC, PpoCfg
+from mjx_nero.ppo import PRESETS, PpoCfg
 from mjx_nero.robots import NERO
 
 
@@ -289,8 +289,8 @@ def test_runner_settings_are_the_recipe():
         "value_loss": 1.0,
         "clip_value": 0.2,
     }
-    assert {name: getattr(ISAAC, name) for name in want} == want
-    assert ISAAC.network == NetworkCfg(
+    assert {name: getattr(PRESETS["isaac"], name) for name in want} == want
+    assert PRESETS["isaac"].network == NetworkCfg(
         actor=(256, 128, 64), critic=(256, 128, 64), activation="elu", distribution="normal", init_std=1.0
     )
 
