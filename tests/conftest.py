@@ -3,25 +3,21 @@
 import getpass
 import os
 import pathlib
-import sys
 import tempfile
 
 import jaxtyping
+import pytest
 
-# Annotations are checked wherever a traced or called function of the package runs; so the hook precedes the import. Left out:
-# ``types`` and ``ppo``, whose pytrees are annotated for one environment and made again with a batch axis by ``jax.vmap``.
+# Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
+# ``types`` and ``ppo``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them with a batch axis.
 _CHECKED = ("checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robots", "rollout")
 _CHECKED += ("scene", "tasks", "terms", "view")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
-import mjx_nero  # noqa: E402  (also sets XLA_FLAGS, which must happen before JAX starts its backend)
-
-import jax  # noqa: E402  isort: skip
+import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
-import pytest  # noqa: E402
 
+import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import wrappers  # noqa: E402
-
-sys.path.insert(0, str(pathlib.Path(__file__).parent))  # helpers beside the tests
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
@@ -54,11 +50,14 @@ class Batch:
         self.train_env = wrappers.for_training(env)
         self.traces = 0
         self.reset = jax.jit(lambda seed: self.train_env.reset(jax.random.split(jax.random.PRNGKey(seed), NUM_ENVS)))
-        self.step = jax.jit(self._step)
+        self._jitted = jax.jit(self._step)
 
     def _step(self, state, action):
         self.traces += 1
         return self.train_env.step(state, action)
+
+    def step(self, state, action):
+        return self._jitted(state, jnp.asarray(action, jnp.float32))
 
 
 @pytest.fixture(scope="session")

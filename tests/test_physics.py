@@ -1,0 +1,168 @@
+"""The physics of the scene, on MJX and in MuJoCo's C library."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_nero import make
+from mjx_nero.physics import NativePhysics, Physics
+
+CUBE = slice(9, 12)
+
+
+@pytest.fixture(scope="session")
+def native(env) -> NativePhysics:
+    return NativePhysics(env.physics_model, env.cfg.sim)
+
+
+def played(batch, state, actions, steps):
+    """The physics states of ``steps`` steps on MJX."""
+    sims = [state.pipeline_state]
+    for _ in range(steps):
+        state = batch.step(state, actions)
+        assert not state.done.any()
+        sims.append(state.pipeline_state)
+    return jax.tree.map(lambda *x: np.stack(x), *sims)
+
+
+@pytest.fixture(scope="session")
+def reach(batch):
+    """Three seconds of going to, then standing at, eight poses near home, the cubes lying on the table."""
+    actions = jax.random.uniform(jax.random.PRNGKey(0), (8, 8), minval=-0.6, maxval=0.6)
+    actions = actions.at[:, 1].set(-0.4).at[:, 3].set(-jnp.abs(actions[:, 3]))  # up, and away from joint4's limit
+    return actions, played(batch, batch.reset(0), actions, 150)
+
+
+@pytest.mark.parametrize("gripper", [1.0, -1.0])
+def test_mjx_and_c_agree_without_contacts(batch, native, gripper):
+    """Single against double precision: arm and falling cube stay within 5e-6 (rad, m) for 0.4 s.
+
+    The fingers agree to 0.1 mm at their limits, and once closed. In between they differ by up to 4 mm: the closing force
+    saturates, and MJX's implicit integrator damps also with the force that the clamp cuts off, MuJoCo's does not.
+    """
+    state = batch.reset(1)
+    sim = state.pipeline_state
+    spin = jnp.array([0.1, -0.2, 0.0, 3.0, -2.0, 1.0])
+    sim = sim.replace(qpos=sim.qpos.at[:, CUBE].add(jnp.array([0.0, 0.0, 2.0])), qvel=sim.qvel.at[:, 9:].set(spin))
+    actions = jax.random.normal(jax.random.PRNGKey(0), (8, 8)).at[:, 7].set(gripper)
+    mjx = played(batch, state.replace(pipeline_state=sim), actions, 20)
+    rest = np.array([0, 1, 2, 3, 4, 5, 6, *range(9, 16)])
+    for t in range(20):
+        sim = native.step(sim, mjx.ctrl[t + 1])
+        np.testing.assert_allclose(mjx.qpos[t + 1][:, rest], sim.qpos[:, rest], rtol=0, atol=5e-6)
+        np.testing.assert_allclose(mjx.qvel[t + 1][:, rest[:-1]], sim.qvel[:, rest[:-1]], rtol=0, atol=5e-4)
+        np.testing.assert_allclose(mjx.time[t + 1], sim.time, rtol=0, atol=1e-6)
+        if gripper > 0 or t >= 10:
+            np.testing.assert_allclose(mjx.qpos[t + 1][:, 7:9], sim.qpos[:, 7:9], rtol=0, atol=1e-4)
+    assert np.abs(mjx.qpos[-1, :, :7] - mjx.qpos[0, :, :7]).max() > 0.1  # they did move
+    np.testing.assert_allclose(mjx.qpos[-1, :, 11] - mjx.qpos[0, :, 11], -9.81 * 0.4**2 / 2, atol=0.03)
+
+
+def test_native_step_is_mujocos_own(env, native):
+    """Batches on threads give what plain calls of ``mj_step`` give."""
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    sim, ctrl = states.pipeline_state, np.array(states.pipeline_state.ctrl)
+    ctrl[:, :7] += [[0.02], [0.01], [-0.02]]
+    after = native.step(sim, ctrl)
+    for i in range(3):
+        data = mujoco.MjData(env.physics_model)
+        data.qpos[:], data.ctrl[:] = sim.qpos[i], ctrl[i]
+        for _ in range(env.cfg.sim.decimation):
+            mujoco.mj_step(env.physics_model, data)
+        np.testing.assert_allclose(after.qpos[i], data.qpos, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(after.qvel[i], data.qvel, rtol=0, atol=1e-5)
+        assert float(after.time[i]) == pytest.approx(0.02)
+
+
+def test_the_robot_never_touches_itself(env):
+    model, data = env.physics_model, mujoco.MjData(env.physics_model)
+    low, high = model.jnt_range[:9].T
+    touched = set()
+    for qpos in np.random.default_rng(0).uniform(low, high, (2000, 9)):
+        data.qpos[:9] = qpos
+        mujoco.mj_forward(model, data)
+        touched |= {frozenset(model.geom(g).name for g in pair) for pair in data.contact.geom}
+    assert touched and all(pair & {"table", "cube"} for pair in touched)
+    assert {frozenset(("table", "palm")), frozenset(("table", "tip1"))} <= touched  # the test sees contacts where there are any
+
+
+def drift(qpos) -> tuple[float, float]:
+    """Most that any cube has moved [m] and turned [rad]."""
+    moved = np.linalg.norm(np.asarray(qpos)[:, :, 9:11] - np.asarray(qpos)[:1, :, 9:11], axis=-1)
+    return moved.max(), 2 * np.linalg.norm(np.asarray(qpos)[:, :, 13:], axis=-1).max()
+
+
+def test_a_cube_at_rest_stays(env, native, reach):
+    """For three seconds. In single precision it turns and creeps a little while it settles."""
+    _, sims = reach
+    moved, turned = drift(sims.qpos)
+    assert moved < 5e-4 and turned < 0.03
+    sunk = 0.015 - sims.qpos[:, :, 11]
+    assert 0 < sunk[1:].min() and sunk.max() < 1e-3 and sunk[-1].max() < 2e-4  # by the softness of the contact
+    assert np.abs(sims.qpos[-1, :, 11] - sims.qpos[-50, :, 11]).max() < 1e-6
+
+    sim, frames = jax.tree.map(lambda x: x[0], sims), []
+    for t in range(150):
+        frames.append(np.asarray(sim.qpos))
+        sim = native.step(sim, sims.ctrl[t + 1])
+    moved, turned = drift(np.stack(frames))
+    assert moved < 1e-5 and turned < 1e-3
+
+
+def test_the_arm_reaches_its_targets_but_for_the_sag(env, reach):
+    """A drive without integral part lags by the load over its stiffness: gravity alone once the arm stands still."""
+    actions, sims = reach
+    arm = env.cfg.robot.arm
+    target = np.array(arm.home) + 0.5 * np.asarray(actions[:, :7])
+    np.testing.assert_allclose(sims.ctrl[-1, :, :7], target, atol=1e-6)
+    data = mujoco.MjData(env.physics_model)
+    for i in range(8):
+        data.qpos[:] = sims.qpos[-1, i]
+        mujoco.mj_forward(env.physics_model, data)
+        sag = data.qfrc_bias[:7] / np.array(arm.stiffness)
+        np.testing.assert_allclose(target[i] - sims.qpos[-1, i, :7], sag, atol=2e-3)
+        assert np.abs(sag).max() < 0.15
+    assert np.abs(sims.qvel[-1, :, :7]).max() < 0.02
+
+
+def test_joints_keep_to_the_speed_limit(reach):
+    """Only the target is limited; the damped joint follows it without overtaking it."""
+    _, sims = reach
+    assert np.abs(np.diff(sims.ctrl, axis=0)).max() <= 0.03 + 1e-6
+    assert 0.2 < np.abs(sims.qvel[:, :, :7]).max() < 1.5
+    assert np.abs(sims.qvel[:, :, 7:9]).max() < 1.5
+
+
+def test_fingers_open_and_close_fully(env, native):
+    sim = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 1)).pipeline_state
+    for fingers in ([0.0, -0.001], [0.05, -0.05]):
+        ctrl = np.array(sim.ctrl)
+        ctrl[:, 7:] = fingers
+        for _ in range(50):
+            sim = native.step(sim, ctrl)
+        np.testing.assert_allclose(sim.qpos[0, 7:9], fingers, atol=1e-3)
+
+
+def test_backend_is_made_when_first_stepped():
+    env = make("nero_lift", impl="jax")
+    env.reset(jax.random.PRNGKey(0))
+    assert "physics" not in vars(env)
+    assert isinstance(env.physics, Physics) and env.physics is env.physics
+
+
+@pytest.mark.gpu
+def test_warp_and_c_agree_without_contacts(native):
+    env = make("nero_lift", impl="warp", num_envs=8)
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
+    sim = state.pipeline_state
+    sim = sim.replace(qpos=sim.qpos.at[:, CUBE].add(jnp.array([0.0, 0.0, 2.0])))
+    step = jax.jit(jax.vmap(env.physics.step))
+    reference, ctrl = sim, sim.ctrl.at[:, :7].add(0.02)
+    for _ in range(20):
+        sim, lost = step(sim, ctrl)
+        reference = native.step(reference, ctrl)
+        assert not lost.any()
+        np.testing.assert_allclose(sim.qpos, reference.qpos, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(sim.qvel, reference.qvel, rtol=0, atol=2e-3)

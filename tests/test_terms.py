@@ -1,0 +1,283 @@
+"""Every term on hand-made views, against numbers worked out by hand, and the folds that apply them."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_nero import UserError, terms
+from mjx_nero.mdp import actions, commands, curriculum, events, observations, rewards, terminations
+from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.types import View
+
+KEY = jax.random.PRNGKey(0)
+TANH_1, TANH_HALF, TANH_2 = 0.76159416, 0.46211716, 0.96402758
+
+
+def view(**changes) -> View:
+    """A robot with two joints at the root (1, 2, 3): the object is 5 cm from the grasp point, 10 cm from the goal."""
+    fields = {
+        "joint_pos": [0.5, -0.25],
+        "joint_vel": [2.0, -3.0],
+        "default_joint_pos": [0.25, 0.25],
+        "ctrl": [0.75, 0.0],
+        "ee_pos_w": [1.03, 2.04, 3.2],
+        "ee_quat_w": [1.0, 0.0, 0.0, 0.0],
+        "object_pos_w": [1.0, 2.0, 3.2],
+        "object_quat_w": [0.5, 0.5, 0.5, 0.5],
+        "object_linvel_w": [1.0, 2.0, 3.0],
+        "object_angvel_b": [4.0, 5.0, 6.0],
+        "root_pos_w": [1.0, 2.0, 3.0],
+        "command": [0.0, 0.0, 0.3],
+        "goal_pos_w": [1.0, 2.0, 3.3],
+        "action": [0.5, -1.0, 2.0],
+        "last_action": [0.0, 1.0, 2.0],
+        **changes,
+    }
+    step = fields.pop("step", 3)
+    arrays = {name: jnp.asarray(value, jnp.float32) for name, value in fields.items()}
+    return View(**arrays, step=jnp.asarray(step, jnp.int32), max_steps=250)
+
+
+def at_height(z: float) -> View:
+    return view(object_pos_w=[1.0, 2.0, z], ee_pos_w=[1.0, 2.0, z + 0.03], goal_pos_w=[1.0, 2.0, z + 0.1])
+
+
+REWARDS = [
+    (rewards.object_ee_distance, {"std": 0.05}, view(), 1 - TANH_1),
+    (rewards.object_ee_distance, {"std": 0.1}, view(), 1 - TANH_HALF),
+    (rewards.object_is_lifted, {"minimal_height": 3.19}, view(), 1.0),
+    (rewards.object_is_lifted, {"minimal_height": 3.21}, view(), 0.0),
+    (rewards.object_goal_distance, {"std": 0.1, "minimal_height": 0.025}, at_height(0.03), 1 - TANH_1),
+    (rewards.object_goal_distance, {"std": 0.2, "minimal_height": 0.025}, at_height(0.03), 1 - TANH_HALF),
+    (rewards.object_goal_distance, {"std": 0.1, "minimal_height": 0.025}, at_height(0.02), 0.0),
+    # 3 cm from the grasp point
+    (rewards.object_is_held, {"minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.03), 1.0),
+    (rewards.object_is_held, {"minimal_height": 0.025, "grasp_radius": 0.02}, at_height(0.03), 0.0),
+    (rewards.object_is_held, {"minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.02), 0.0),
+    (rewards.held_goal_distance, {"std": 0.05, "minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.03), 1 - TANH_2),
+    (rewards.held_goal_distance, {"std": 0.05, "minimal_height": 0.025, "grasp_radius": 0.02}, at_height(0.03), 0.0),
+    (rewards.held_goal_distance, {"std": 0.05, "minimal_height": 0.035, "grasp_radius": 0.04}, at_height(0.03), 0.0),
+    # 10 cm from the goal
+    (rewards.held_at_goal, {"threshold": 0.11, "minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.03), 1.0),
+    (rewards.held_at_goal, {"threshold": 0.09, "minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.03), 0.0),
+    (rewards.held_at_goal, {"threshold": 0.11, "minimal_height": 0.025, "grasp_radius": 0.02}, at_height(0.03), 0.0),
+    (rewards.held_at_goal, {"threshold": 0.11, "minimal_height": 0.035, "grasp_radius": 0.04}, at_height(0.03), 0.0),
+    (rewards.action_rate_l2, {}, view(), 0.25 + 4.0 + 0.0),
+    (rewards.joint_vel_l2, {}, view(), 4.0 + 9.0),
+]
+
+
+@pytest.mark.parametrize(("func", "params", "at", "value"), REWARDS)
+def test_rewards(func, params, at, value):
+    got = func(at, **params)
+    assert got.shape == () and got.dtype == jnp.float32
+    assert float(got) == pytest.approx(value, abs=2e-5)
+
+
+def test_every_public_reward_is_tested():
+    public = {f for n, f in vars(rewards).items() if callable(f) and not n.startswith("_") and f.__module__ == rewards.__name__}
+    assert public - {row[0] for row in REWARDS} == {rewards.held, rewards.at_goal}
+
+
+def test_held_and_at_goal():
+    assert rewards.held(at_height(0.03), minimal_height=0.025, grasp_radius=0.04)
+    assert not rewards.held(view(object_pos_w=[1.0, 2.0, 3.0]), minimal_height=0.025, grasp_radius=0.04)  # knocked up, not held
+    assert rewards.at_goal(view(), threshold=0.101) and not rewards.at_goal(view(), threshold=0.099)
+
+
+OBSERVATIONS = [
+    (observations.joint_pos_rel, [0.25, -0.5]),
+    (observations.joint_vel_rel, [2, -3]),
+    (observations.object_position, [0, 0, 0.2]),
+    (observations.command, [0, 0, 0.3]),
+    (observations.last_action, [0.5, -1, 2]),
+    (observations.ee_position, [0.03, 0.04, 0.2]),
+    (observations.ee_to_object, [-0.03, -0.04, 0]),
+    (observations.object_to_goal, [0, 0, 0.1]),
+    (observations.target_error, [0.25, 0.25]),
+    (observations.object_velocity, [1, 2, 3, 4, 5, 6]),
+    (observations.object_orientation, [0.5, 0.5, 0.5, 0.5]),
+]
+
+
+@pytest.mark.parametrize(("func", "value"), OBSERVATIONS)
+def test_observations(func, value):
+    np.testing.assert_allclose(func(view()), value, rtol=0, atol=5e-7)  # rounding of coordinates of size 3
+
+
+def test_every_observation_is_tested():
+    public = {f for f in vars(observations).values() if getattr(f, "__module__", "") == observations.__name__}
+    assert public == {row[0] for row in OBSERVATIONS}
+
+
+@pytest.mark.parametrize(
+    ("func", "params", "changes", "hit"),
+    [
+        (terminations.time_out, {}, {"step": 249}, False),
+        (terminations.time_out, {}, {"step": 250}, True),
+        (terminations.time_out, {}, {"step": 251}, True),
+        (terminations.object_below, {"minimum_height": -0.05}, {"object_pos_w": [0, 0, -0.049]}, False),
+        (terminations.object_below, {"minimum_height": -0.05}, {"object_pos_w": [0, 0, -0.051]}, True),
+        # the table from x = -0.2 to 0.8, y = -0.6 to 0.6
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [0.79, 0.59, 9]}, False),
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [-0.19, -0.59, 9]}, False),
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [0.81, 0, 0]}, True),
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [-0.21, 0, 0]}, True),
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [0, 0.61, 0]}, True),
+        (terminations.object_off_table, {"center": (0.3, 0.0), "size": (1.0, 1.2)}, {"object_pos_w": [0, -0.61, 0]}, True),
+    ],
+)
+def test_terminations(func, params, changes, hit):
+    assert bool(func(view(**changes), **params)) is hit
+
+
+def test_actions():
+    target = actions.joint_targets(jnp.array([1.0, -2.0]), scale=0.5, offset=jnp.array([0.25, 2.0]))
+    np.testing.assert_array_equal(target, [0.75, 1.0])
+    opened, closed = jnp.array([0.05, -0.05]), jnp.array([0.0, -0.001])
+    for action, want in [(-1e-6, closed), (-5.0, closed), (0.0, opened), (3.0, opened)]:
+        np.testing.assert_array_equal(actions.binary_gripper(jnp.array(action), open=opened, close=closed), want)
+    ctrl = actions.rate_limit(
+        jnp.array([1.0, -1.0, 0.51, 0.5]), jnp.array([0.5, 0.5, 0.5, 0.5]), step=jnp.array([0.03, 0.03, 0.03, 0.03])
+    )
+    np.testing.assert_allclose(ctrl, [0.53, 0.47, 0.51, 0.5], atol=1e-7)
+
+
+def test_uniform_position_fills_its_box():
+    box = {"x": (0.3, 0.35), "y": (-0.2, 0.2), "z": (0.2, 0.2)}
+    points = jax.vmap(lambda k: commands.uniform_position(k, **box))(jax.random.split(KEY, 2000))
+    low, high = np.float32([0.3, -0.2, 0.2]), np.float32([0.35, 0.2, 0.2])
+    assert (points >= low).all() and (points <= high).all()
+    np.testing.assert_allclose(points.min(0), low, atol=0.002)
+    np.testing.assert_allclose(points.max(0), high, atol=0.002)
+    np.testing.assert_allclose(points.mean(0), (low + high) / 2, atol=0.01)
+
+
+def test_object_event_adds_to_where_the_object_was():
+    box = {"x": (0.1, 0.2), "y": (-0.1, 0.2), "z": (0.0, 0.0)}
+    joints, start = jnp.array([1.0, 2.0]), jnp.array([0.2, 0.0, 0.015])
+
+    def draw(key):
+        return events.object_position_uniform(key, joints, start, **box)
+
+    same, cubes = jax.vmap(draw)(jax.random.split(KEY, 2000))
+    assert (same == joints).all()
+    np.testing.assert_allclose(cubes.min(0), [0.3, -0.1, 0.015], atol=0.001)
+    np.testing.assert_allclose(cubes.max(0), [0.4, 0.2, 0.015], atol=0.001)
+
+
+def test_joint_event_adds_to_every_joint():
+    joints, start = jnp.array([1.0, 2.0]), jnp.array([0.2, 0.0, 0.015])
+    moved, cubes = jax.vmap(lambda k: events.joints_offset_uniform(k, joints, start, offset=0.1))(jax.random.split(KEY, 2000))
+    assert (cubes == start).all()
+    np.testing.assert_allclose(moved.min(0), [0.9, 1.9], atol=0.001)
+    np.testing.assert_allclose(moved.max(0), [1.1, 2.1], atol=0.001)
+    assert abs(np.corrcoef(moved.T)[0, 1]) < 0.1  # each joint by its own draw
+
+
+@pytest.mark.parametrize(("count", "weight"), [(0, -1e-4), (10_000, -1e-4), (10_001, -0.1), (20_000, -0.1)])
+def test_step_weight(count, weight):
+    got = curriculum.step_weight(jnp.asarray(count), -1e-4, to=-0.1, num_steps=10_000)
+    assert float(got) == np.float32(weight)
+
+
+def test_rewards_fold_weighs_scales_by_time_and_follows_the_curriculum():
+    group = {
+        "near": RewardTerm(rewards.object_ee_distance, weight=2.0, params={"std": 0.05}),
+        "speed": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+    }
+    change = {"speed": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10})}
+    for count, speed_weight in [(10, -1e-4), (11, -1e-1)]:
+        out = terms.rewards(group, change, view(), jnp.asarray(count), 0.02)
+        assert list(out) == ["near", "speed"]
+        assert float(out["near"]) == pytest.approx(0.02 * 2.0 * (1 - TANH_1), rel=1e-4)
+        assert float(out["speed"]) == pytest.approx(0.02 * speed_weight * 13.0, rel=1e-6)
+    assert float(terms.rewards(group, {}, view(), jnp.asarray(11), 0.02)["speed"]) == pytest.approx(-1e-4 * 13 * 0.02, rel=1e-6)
+
+
+EXACT = {
+    "b": {"command": ObservationTerm(observations.command), "actions": ObservationTerm(observations.last_action)},
+    "a": {"actions": ObservationTerm(observations.last_action), "command": ObservationTerm(observations.command)},
+}
+NOISY = {
+    "state": {
+        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+        "command": ObservationTerm(observations.command),
+        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.1),
+    },
+    "privileged_state": {"joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01)},
+}
+
+
+def test_observe_concatenates_in_the_order_of_the_config():
+    out = terms.observe(EXACT, view(), KEY, True)
+    assert list(out) == ["b", "a"]
+    np.testing.assert_allclose(out["b"], [0, 0, 0.3, 0.5, -1, 2], atol=1e-7)
+    np.testing.assert_allclose(out["a"], [0.5, -1, 2, 0, 0, 0.3], atol=1e-7)
+
+
+def test_noise_keeps_its_bounds_and_is_independent():
+    exact = np.array([0.25, -0.5, 0, 0, 0.3, 2, -3], np.float32)
+    off = terms.observe(NOISY, view(), KEY, False)
+    np.testing.assert_array_equal(off["state"], exact)
+    np.testing.assert_array_equal(off["privileged_state"], exact[:2])
+
+    draws = jax.vmap(lambda k: terms.observe(NOISY, view(), k, True))(jax.random.split(KEY, 4000))
+    noise = np.asarray(draws["state"]) - exact
+    assert (noise[:, 2:5] == 0).all()  # no noise asked for
+    bounds = np.array([0.01, 0.01, 0.1, 0.1])
+    noise = noise[:, [0, 1, 5, 6]]
+    assert (np.abs(noise) <= bounds + 3e-7).all()  # 3e-7: rounding of the sum
+    np.testing.assert_allclose(noise.min(0), -bounds, rtol=0.01)
+    np.testing.assert_allclose(noise.max(0), bounds, rtol=0.01)
+    np.testing.assert_allclose(noise.std(0), bounds / math.sqrt(3), rtol=0.05)  # uniform
+    other_group = np.asarray(draws["privileged_state"]) - exact[:2]
+    correlation = np.corrcoef(np.hstack([noise, other_group]).T) - np.eye(6)
+    assert np.abs(correlation).max() < 0.08  # 5 sigma of 4,000 independent draws
+
+
+def always(view: View, *, hit: bool):
+    return jnp.asarray(hit)
+
+
+@pytest.mark.parametrize(
+    ("fails", "times_out", "terminated", "truncated"),
+    [(False, False, False, False), (True, False, True, False), (False, True, False, True), (True, True, True, False)],
+)
+def test_termination_takes_precedence_over_truncation(fails, times_out, terminated, truncated):
+    dones = {"out": DoneTerm(always, params={"hit": times_out}, time_out=True), "fall": DoneTerm(always, params={"hit": fails})}
+    for order in (dones, dict(reversed(dones.items()))):
+        got = terms.terminations(order, view())
+        assert (bool(got[0]), bool(got[1])) == (terminated, truncated)
+
+
+def test_any_of_several_terms_ends_the_episode():
+    dones = {n: DoneTerm(always, params={"hit": n == "b"}) for n in "abc"}
+    assert bool(terms.terminations(dones, view())[0])
+    assert not any(bool(x) for x in terms.terminations({}, view()))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RewardTerm(rewards.object_ee_distance, weight=1.0), "object_ee_distance takes the parameters std; given: none"),
+        (
+            lambda: RewardTerm(rewards.object_ee_distance, weight=1.0, params={"sdt": 1.0}),
+            "object_ee_distance takes the parameters std; given: sdt",
+        ),
+        (
+            lambda: RewardTerm(rewards.object_goal_distance, weight=1.0, params={"std": 0.1}),
+            "object_goal_distance takes the parameters std, minimal_height; given: std",
+        ),
+        (lambda: ObservationTerm(observations.command, params={"x": 1}), "command takes the parameters none; given: x"),
+        (lambda: DoneTerm(terminations.object_below), "object_below takes the parameters minimum_height; given: none"),
+        (lambda: CommandTerm(commands.uniform_position, params={"x": (0, 1)}), "uniform_position takes the parameters x, y, z; given: x"),
+        (lambda: Term(curriculum.step_weight, params={"to": 1.0}), "step_weight takes the parameters to, num_steps; given: to"),
+    ],
+)
+def test_wrong_parameters_are_refused_when_the_term_is_made(make, message):
+    with pytest.raises(UserError, match=f"^{message}$"):
+        make()
