@@ -8,18 +8,30 @@ from mjx_nero.physics import IMPLS
 
 
 def main(argv):
-    parser = cli.Parser(prog="train.py", description="Trains a policy with PPO on thousands of environments in one compiled step.")
-    parser.add_argument("--env", default="nero_lift", help=f"environment: {', '.join(registry.list_envs())} (default: %(default)s)")
+    parser = cli.Parser(
+        prog="train.py", description="Trains a policy with PPO on thousands of environments in one compiled step."
+    )
+    parser.add_argument(
+        "--env", default="nero_lift", help=f"environment: {', '.join(registry.list_envs())} (default: %(default)s)"
+    )
     parser.add_argument("--preset", default="default", help="default, or isaac: the Isaac Lab recipe's numbers, word for word")
-    parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 8192 on a GPU, 256 on a CPU)")
-    parser.add_argument("--num-timesteps", type=cli.positive, help="env steps in all (default: 80 M on a GPU, 4 minutes' worth on a CPU)")
+    parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 4096 on a GPU, 256 on a CPU)")
+    parser.add_argument(
+        "--num-timesteps", type=cli.positive, help="env steps in all (default: 60 M on a GPU, 4 minutes' worth on a CPU)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
-    parser.add_argument("--impl", choices=IMPLS, default="auto", help="physics (default: warp where there is a GPU for it, else jax)")
+    parser.add_argument(
+        "--impl", choices=IMPLS, default="auto", help="physics (default: warp where there is a GPU for it, else jax)"
+    )
     parser.add_argument("--out", type=pathlib.Path, help="run folder (default: runs/<env>_<time>)")
     parser.add_argument("--restore", type=pathlib.Path, help="run folder or checkpoint to go on from, or a policy to start from")
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 12 a run)")
-    parser.add_argument("--checkpoint-every", type=cli.positive, default=0, help="env steps between checkpoints (default: 5 a run)")
-    parser.add_argument("--max-minutes", type=float, default=0.0, help="stop after so many minutes of training (default: no limit)")
+    parser.add_argument(
+        "--checkpoint-every", type=cli.positive, default=0, help="env steps between checkpoints (default: 5 a run)"
+    )
+    parser.add_argument(
+        "--max-minutes", type=float, default=0.0, help="stop after so many minutes of training (default: no limit)"
+    )
     parser.add_argument("--no-video", dest="video", action="store_false", help="do not render the trained policy")
     if "-h" in argv or "--help" in argv:
         parser.epilog = cli.fields_help({"env": registry.env_cfg("nero_lift"), "ppo": ppo.preset("default")})
@@ -43,7 +55,8 @@ def main(argv):
     cli.setup_jax()
     summary = training.train(run, command=training.command_line(argv))
     result = summary["evaluation"]
-    print(f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s), success {result['success_rate']:.1%}")
+    pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
+    print(f"{pace}, success {result['success_rate']:.1%}")
     print(f"{summary['folder']}: policy.safetensors, curve.png, metrics.jsonl, checkpoints/")
     if summary["stopped"] == "interrupted":
         sys.exit(130)

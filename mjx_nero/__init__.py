@@ -27,9 +27,9 @@ if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
 with contextlib.redirect_stdout(io.StringIO()):  # without Warp, which only GPUs need, MJX prints that it is missing
     import mujoco.mjx  # noqa: F401
 
-from mjx_nero.env import EnvCfg, ManipulationEnv  # noqa: E402
-from mjx_nero.registry import env_cfg, list_envs, list_presets, make  # noqa: E402
-from mjx_nero.types import UserError  # noqa: E402
+from mjx_nero.env import EnvCfg, ManipulationEnv
+from mjx_nero.registry import env_cfg, list_envs, list_presets, make
+from mjx_nero.types import UserError
 
 __version__ = "0.1.0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "make"]

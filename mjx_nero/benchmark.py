@@ -65,7 +65,9 @@ def measure_ppo(env: ManipulationEnv, preset: str, iterations: int, repeats: int
     return _row(env, "ppo", rates, compile_s, compiled, nans, overflows)
 
 
-def _row(env: ManipulationEnv, what: str, rates: list[float], compile_s: float, compiled, nans: float, overflows: float) -> dict[str, Any]:
+def _row(
+    env: ManipulationEnv, what: str, rates: list[float], compile_s: float, compiled, nans: float, overflows: float
+) -> dict[str, Any]:
     memory = None
     with contextlib.suppress(Exception):  # not every backend tells
         use = compiled.memory_analysis()
@@ -104,7 +106,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--impl", default="auto", help="list of auto, jax, warp (default: %(default)s)")
     parser.add_argument("--what", default="step", help="list of step (random actions) and ppo (training) (default: %(default)s)")
     parser.add_argument("--steps", type=cli.positive, default=100, help="control steps a measurement (default: %(default)s)")
-    parser.add_argument("--repeats", type=cli.positive, default=5, help="measurements, of which the median counts (default: %(default)s)")
+    parser.add_argument(
+        "--repeats", type=cli.positive, default=5, help="measurements, of which the median counts (default: %(default)s)"
+    )
     parser.add_argument("--json", type=pathlib.Path, help="write the rows as JSON")
     args, _ = parser.parse(argv)
     try:
@@ -128,7 +132,17 @@ def main(argv: Sequence[str]) -> None:
                     row = measure_ppo(env, args.preset, max(1, args.steps // 24), args.repeats)
                 rows.append({"env": args.env, **row})
     view = Table(title=f"{args.env} on {rows[0]['device']}")
-    names = ("what", "impl", "num_envs", "env_steps_per_s", "physics_steps_per_s", "compile_s", "memory_mb", "nan_count", "overflow_count")
+    names = (
+        "what",
+        "impl",
+        "num_envs",
+        "env_steps_per_s",
+        "physics_steps_per_s",
+        "compile_s",
+        "memory_mb",
+        "nan_count",
+        "overflow_count",
+    )
     for name in names:
         view.add_column(name, justify="right")
     for row in rows:

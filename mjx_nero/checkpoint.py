@@ -49,7 +49,9 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
         with safe_open(path, framework="numpy") as file:
             return json.loads(file.metadata()["meta"])
     except (SafetensorError, KeyError, TypeError, ValueError, OSError):
-        raise UserError(f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew") from None
+        raise UserError(
+            f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew"
+        ) from None
 
 
 def load(path: pathlib.Path, template: Tree) -> Tree:
@@ -65,7 +67,9 @@ def load(path: pathlib.Path, template: Tree) -> Tree:
             for name, want in zip(_names(template), jax.tree.leaves(template), strict=True):
                 value = file.get_tensor(name)
                 if value.shape != want.shape or value.dtype != want.dtype:
-                    raise UserError(f"{path} does not fit: {name} is {value.dtype}{value.shape}, expected {want.dtype}{want.shape}")
+                    raise UserError(
+                        f"{path} does not fit: {name} is {value.dtype}{value.shape}, expected {want.dtype}{want.shape}"
+                    )
                 leaves.append(jnp.asarray(value))
     except (SafetensorError, OSError):
         raise UserError(f"{path} does not fit this environment and these networks, or it is damaged") from None

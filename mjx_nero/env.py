@@ -119,7 +119,7 @@ class ManipulationEnv(Env):
         return len(self.cfg.robot.arm.joints) + 1
 
     @functools.cached_property
-    def observation_size(self) -> dict[str, tuple[int, ...]]:  # type: ignore[override]
+    def observation_size(self) -> dict[str, tuple[int, ...]]:
         """Shape of each observation group."""
         state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
         return {name: value.shape for name, value in state.obs.items()}
@@ -201,9 +201,7 @@ class ManipulationEnv(Env):
         """The drives' position targets for ``action``: within the joint ranges and the drives' speed limits [rad, m]."""
         action, robot = self._clip(action), self.cfg.robot
         arm = actions.joint_targets(action[:-1], scale=self.cfg.action.scale, offset=jnp.asarray(robot.arm.home))
-        gripper = actions.binary_gripper(
-            action[-1], open=jnp.asarray(robot.gripper.open), close=jnp.asarray(robot.gripper.close)
-        )
+        gripper = actions.binary_gripper(action[-1], open=jnp.asarray(robot.gripper.open), close=jnp.asarray(robot.gripper.close))
         target = jnp.clip(jnp.concatenate([arm, gripper]), *self._range)
         return actions.rate_limit(target, state.pipeline_state.ctrl, step=jnp.asarray(self._max_ctrl_step))
 

@@ -100,7 +100,10 @@ def table(result: dict[str, Any]) -> Table:
     title = f"{result['env']} · {result['agent']} · {result['backend']} · {result['episodes']} episodes"
     view = Table(title=title, show_header=False)
     view.add_row("success rate", f"{result['success_rate']:.1%}  (95% interval {low:.1%} to {high:.1%})")
-    view.add_row("final distance", f"{100 * result['final_distance_mean']:.2f} cm mean, {100 * result['final_distance_median']:.2f} cm median")
+    view.add_row(
+        "final distance",
+        f"{100 * result['final_distance_mean']:.2f} cm mean, {100 * result['final_distance_median']:.2f} cm median",
+    )
     view.add_row("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
     view.add_row("dropped", f"{result['dropped_rate']:.1%}")
     view.add_row("return", f"{result['return_mean']:.2f}")

@@ -1,4 +1,4 @@
-"""Physics backends behind one function: ``Physics.step(sim, ctrl) -> sim``. The only caller of ``mjx.put_model`` and ``mjx.step``."""
+"""Physics backends behind one function, ``Physics.step``. The only caller of ``mjx.put_model`` and ``mjx.step``."""
 
 import functools
 import os
@@ -36,7 +36,7 @@ def resolve_impl(impl: str) -> str:
     if impl == "auto":
         return "warp" if warp_available() else "jax"
     if impl == "warp" and not warp_available():
-        raise UserError("impl 'warp' needs an NVIDIA GPU and the cuda extra (pip install 'mjx_nero[cuda]'): use --impl jax here")
+        raise UserError("impl 'warp' needs an NVIDIA GPU and the cuda extra (pip install -e '.[cuda]'): use --impl jax here")
     return impl
 
 
@@ -62,20 +62,13 @@ class Physics:
         else:
             self._template = mjx.make_data(self._mx)
 
-    def init(self, qpos: Float[Array, " nq"], ctrl: Float[Array, " nu"]) -> Sim:
-        """A state at rest."""
-        nv = self.model.nv
-        return Sim(qpos=qpos, qvel=jnp.zeros(nv), ctrl=ctrl, warmstart=jnp.zeros(nv), time=jnp.zeros(()))
-
     def step(self, sim: Sim, ctrl: Float[Array, " nu"]) -> tuple[Sim, Float[Array, ""]]:
         """One control step (``decimation`` physics steps) of one environment; vmap it for many.
 
         Returns:
             the state, and 1.0 if contacts or constraint rows were lost for want of buffer (Warp only), else 0.0.
         """
-        data = self._template.replace(
-            qpos=sim.qpos, qvel=sim.qvel, ctrl=ctrl, qacc_warmstart=sim.warmstart, time=sim.time
-        )
+        data = self._template.replace(qpos=sim.qpos, qvel=sim.qvel, ctrl=ctrl, qacc_warmstart=sim.warmstart, time=sim.time)
         lost = jnp.zeros(())
         for _ in range(self.decimation):
             data = mjx.step(self._mx, data)
@@ -98,8 +91,6 @@ class NativePhysics:
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = functools.partial(rollout.Rollout(nthread=threads).rollout, model, self._data)
-        self._spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        self._data[0].mocap_pos[:] = 0
 
     def step(self, sim: Sim, ctrl) -> Sim:
         """One control step of a batch: leaves of ``sim`` are [n, ...], ``ctrl`` is [n, nu]."""

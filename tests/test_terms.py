@@ -28,7 +28,7 @@ def view(**changes) -> View:
         "object_pos_w": [1.0, 2.0, 3.2],
         "object_quat_w": [0.5, 0.5, 0.5, 0.5],
         "object_linvel_w": [1.0, 2.0, 3.0],
-        "object_angvel_b": [4.0, 5.0, 6.0],
+        "object_angvel_local": [4.0, 5.0, 6.0],
         "root_pos_w": [1.0, 2.0, 3.0],
         "command": [0.0, 0.0, 0.3],
         "goal_pos_w": [1.0, 2.0, 3.3],
@@ -274,7 +274,10 @@ def test_any_of_several_terms_ends_the_episode():
         ),
         (lambda: ObservationTerm(observations.command, params={"x": 1}), "command takes the parameters none; given: x"),
         (lambda: DoneTerm(terminations.object_below), "object_below takes the parameters minimum_height; given: none"),
-        (lambda: CommandTerm(commands.uniform_position, params={"x": (0, 1)}), "uniform_position takes the parameters x, y, z; given: x"),
+        (
+            lambda: CommandTerm(commands.uniform_position, params={"x": (0, 1)}),
+            "uniform_position takes the parameters x, y, z; given: x",
+        ),
         (lambda: Term(curriculum.step_weight, params={"to": 1.0}), "step_weight takes the parameters to, num_steps; given: to"),
     ],
 )

@@ -53,7 +53,7 @@ def target_error(view: View) -> Float[Array, " nj"]:
 
 def object_velocity(view: View) -> Float[Array, "6"]:
     """Linear [m/s] and angular [rad/s] velocity of the object."""
-    return jnp.concatenate([view.object_linvel_w, view.object_angvel_b])
+    return jnp.concatenate([view.object_linvel_w, view.object_angvel_local])
 
 
 def object_orientation(view: View) -> Float[Array, "4"]:
