@@ -5,7 +5,7 @@ no training episodes without a host callback at every step, and in release 0.14.
 This loop hands its whole state to the caller and is compiled ahead of time, so compilation is timed apart.
 
 The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in
-every minibatch, which halves the time of an update. At the first minibatch both agree to rounding (tests/test_ppo.py).
+each of its forty minibatches, as their loop over time is slow on a GPU. At the first minibatch both agree (tests/test_ppo.py).
 """
 
 import dataclasses

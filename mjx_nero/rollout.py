@@ -149,6 +149,6 @@ def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
 
 
 def _collect(totals: dict, frames: tuple) -> Episodes:
-    totals = {name: np.asarray(value) for name, value in totals.items()}
+    totals = {name: np.asarray(value, np.float64) for name, value in totals.items()}
     returns, lengths = totals.pop("return"), totals.pop("length")
     return Episodes(totals, returns, lengths, np.asarray(frames[0]), np.asarray(frames[1]))
