@@ -1,5 +1,6 @@
 """Arrays and a JSON description in one safetensors file: no pickle, so a file from a stranger runs no code."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -33,7 +34,8 @@ def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
         save_file(arrays, part, metadata={"meta": json.dumps(meta)})
         os.replace(part, path)
     except (OSError, SafetensorError) as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise UserError(f"cannot write {path}: {error}") from None
 
 

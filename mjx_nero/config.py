@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import difflib
+import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -58,13 +59,23 @@ def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise UserError(f"no field {name!r}: {head!r} is not one of {', '.join(valid) or 'no fields'}{hint}")
     old = children[head]
-    new = _replace(old, rest, value, name) if rest else _coerce(old, value, name)
+    if rest:
+        new = _replace(old, rest, value, name)
+    else:
+        new = _coerce(old, value, name, any_length=head in _any_length(node))
     if dataclasses.is_dataclass(node):
         return dataclasses.replace(node, **{head: new})  # type: ignore[type-var]
     return {**children, head: new}
 
 
-def _coerce(old: Any, value: Any, name: str) -> Any:
+def _any_length(node: Any) -> set[str]:
+    """Fields declared ``tuple[x, ...]``."""
+    if not dataclasses.is_dataclass(node):
+        return set()
+    return {f.name for f in dataclasses.fields(node) if typing.get_args(f.type)[-1:] == (...,)}
+
+
+def _coerce(old: Any, value: Any, name: str, any_length: bool = False) -> Any:
     """``value`` as the type of ``old``, the field's present value."""
     if _children(old) is not None and not isinstance(value, str):
         if type(value) is not type(old):
@@ -79,8 +90,9 @@ def _coerce(old: Any, value: Any, name: str) -> Any:
         value = tuple(value)
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if isinstance(old, tuple) and isinstance(value, tuple) and old and len(value) == len(old):
-        return tuple(_coerce(o, v, name) for o, v in zip(old, value, strict=True))
+    if isinstance(old, tuple) and isinstance(value, tuple) and old and value and (any_length or len(value) == len(old)):
+        like = old[:1] * len(value) if any_length else old
+        return tuple(_coerce(o, v, name) for o, v in zip(like, value, strict=True))
     if old is not None and value is not None and (type(value) is not type(old) or isinstance(old, tuple)):
         raise UserError(f"{name} takes a value like {old!r}, got {value!r}")
     return value

@@ -244,7 +244,7 @@ class ManipulationEnv(Env):
             "dropped": terminated & ~bad,
         }
         metrics = {f"reward/{name}": value for name, value in reward_terms.items()}
-        metrics |= {name: value * done for name, value in ends.items()}
+        metrics |= {name: jnp.where(bad, 0.0, value * done) for name, value in ends.items()}
         metrics |= {"nan": bad.astype(jnp.float32), "overflow": overflow}
 
         carry = carry.replace(step=step, action=action, hold=hold, grasp_time=grasp_time)

@@ -77,8 +77,9 @@ def init_params(nets: networks.PPONetworks, sizes: Mapping[str, tuple[int, ...]]
     k_actor, k_critic = jax.random.split(key)
     # The floor keeps a constant observation, whose deviation is 0, from being divided by nothing.
     normalizer = running_statistics.init_state(
-        {name: specs.Array(tuple(size), jnp.dtype("float32")) for name, size in sizes.items()}, std_eps=1e-4
+        {name: specs.Array(tuple(size), jnp.dtype("float32")) for name, size in sizes.items()}
     )
+    normalizer = normalizer.replace(std_eps=jnp.float32(1e-4))
     params = losses.PPONetworkParams(policy=nets.policy_network.init(k_actor), value=nets.value_network.init(k_critic))
     return normalizer, params
 

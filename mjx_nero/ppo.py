@@ -50,10 +50,6 @@ class PpoCfg:
     matmul_precision: str = "float32"  # of the networks; TF32 products can spoil learning
     network: NetworkCfg = NetworkCfg()
 
-    def __post_init__(self):
-        if self.num_envs % self.num_minibatches:
-            raise UserError(f"ppo.num_envs ({self.num_envs}) must be a multiple of ppo.num_minibatches ({self.num_minibatches})")
-
 
 PRESETS = {
     "default": PpoCfg(),
@@ -98,9 +94,16 @@ class Learner:
     Args:
         env: from ``wrappers.for_training``.
         cfg: with ``num_envs`` filled in.
+
+    Raises:
+        UserError: sizes or options that do not go together.
     """
 
     def __init__(self, env: Env, cfg: PpoCfg):
+        if not cfg.num_envs or cfg.num_envs % cfg.num_minibatches:
+            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of ppo.num_minibatches ({cfg.num_minibatches})")
+        if cfg.desired_kl and cfg.network.distribution != "normal":
+            raise UserError("an adaptive learning rate needs the normal distribution: pass --ppo.desired_kl 0")
         self.env, self.cfg = env, cfg
         self.sizes = env.observation_size
         self.networks = make_networks(self.sizes, env.action_size, cfg.network)

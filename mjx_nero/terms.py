@@ -24,6 +24,7 @@ class Term:
     params: Params = dataclasses.field(default_factory=dict, kw_only=True)
 
     def __post_init__(self):
+        object.__setattr__(self, "params", dict(self.params))  # its own: a dict that two terms share is changed for both
         wanted = [p.name for p in inspect.signature(self.func).parameters.values() if p.kind is p.KEYWORD_ONLY]
         if set(wanted) != set(self.params):
             given, valid = ", ".join(self.params) or "none", ", ".join(wanted) or "none"

@@ -132,8 +132,6 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     """
     console = Console(stderr=True)
     run, note = fit_machine(run)
-    if note:
-        console.print(note, highlight=False)
     ppo = run.ppo
     source = _checkpoint_path(run.restore) if run.restore else None
     resume_folder = run.restore if run.restore and run.restore.is_dir() else None
@@ -144,6 +142,8 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     folder = RunFolder(path, resume=resume_folder is not None and path.resolve() == resume_folder.resolve())
     meta = policy.describe(env, run.env_name, run.preset, ppo.network)
 
+    if note:
+        console.print(note, highlight=False)
     started = time.perf_counter()
     with console.status("compiling (a minute or two the first time) ..."):
         state = _initial_state(learner, run.seed, source)
@@ -226,7 +226,8 @@ class _Loop:
                 self.wall = time.perf_counter() - begun
                 row = self._training_row(metrics)
                 out_of_time = 0 < self.r.max_minutes * 60 <= self.wall
-                last = steps >= self.iterations * per or out_of_time or stop.is_set
+                interrupted = stop.is_set  # read once: a Ctrl-C from here on ends the next round, not this one half-saved
+                last = steps >= self.iterations * per or out_of_time or interrupted
                 evaluation = {}
                 if steps >= wait["eval"] or last:
                     self.last_eval = evaluation = self.evaluate(state)
@@ -240,7 +241,7 @@ class _Loop:
                     name = f"{steps:012d}.safetensors"
                     checkpoint.save(self.folder.path / "checkpoints" / name, state, {**self.meta, "kind": "checkpoint"})
                 bar.update(task, completed=steps - start, total=self.iterations * per - start, **self._shown(row))
-                if stop.is_set:
+                if interrupted:
                     return state, "interrupted"
                 if out_of_time:
                     return state, "time limit"

@@ -101,14 +101,10 @@ def scene() -> mujoco.MjModel:
         drive = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         drive.set_to_position(kp=kp, kv=kv)
         drive.forcerange = [-force, force]
-    spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], contype=1, conaffinity=0
-    )
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], contype=1, conaffinity=0)
     cube = spec.worldbody.add_body(name="cube")
     cube.add_freejoint()
-    cube.add_geom(
-        name="cube", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.015] * 3, mass=0.03, contype=2, conaffinity=1
-    )
+    cube.add_geom(name="cube", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.015] * 3, mass=0.03, contype=2, conaffinity=1)
     return spec.compile()
 
 

@@ -237,9 +237,15 @@ def test_learning_rate_keeps_its_bounds(learner, eventful, rolled):
         assert float(opt_state[-1].hyperparams["learning_rate"]) == pytest.approx(bound)
 
 
-def test_minibatches_must_divide_the_environments():
-    with pytest.raises(UserError, match=r"ppo.num_envs \(8\) must be a multiple of ppo.num_minibatches \(3\)"):
-        dataclasses.replace(SMALL, num_minibatches=3)
+def test_minibatches_must_divide_the_environments(learner):
+    with pytest.raises(UserError, match=r"num_envs \(8\) must be a multiple of ppo.num_minibatches \(3\)"):
+        Learner(learner.env, dataclasses.replace(SMALL, num_minibatches=3))
+
+
+def test_an_adaptive_learning_rate_needs_a_distribution_with_kl(learner):
+    network = dataclasses.replace(SMALL.network, distribution="tanh_normal")
+    with pytest.raises(UserError, match="pass --ppo.desired_kl 0"):
+        Learner(learner.env, dataclasses.replace(SMALL, desired_kl=0.01, network=network))
 
 
 # --- repeatability

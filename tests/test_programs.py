@@ -1,0 +1,213 @@
+"""train.py, eval.py and the benchmark as a user calls them: results, files, and mistakes that end in one line."""
+
+import importlib.util
+import json
+import os
+import pathlib
+import shutil
+import signal
+import sys
+
+import imageio.v3 as imageio
+import jax
+import mujoco
+import pytest
+
+from mjx_nero import benchmark, checkpoint, cli, policy, render, training
+from mjx_nero.types import UserError
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(f"program_{name}", ROOT / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main
+
+
+MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main}
+
+
+@pytest.fixture
+def call(monkeypatch, capfd, tmp_path):
+    """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "setup_jax", lambda: None)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(program, *argv):
+        monkeypatch.setattr(sys, "argv", [program, *map(str, argv)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.run(MAINS[program])
+        return stop.value.code, *capfd.readouterr()
+
+    return run
+
+
+def can_draw():
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='front'/></worldbody></mujoco>")
+    try:
+        with render.Renderer(model, 16, 16):
+            return True
+    except UserError:
+        return False
+
+
+MISTAKES = [
+    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of nero_lift"),
+    ("train", ["--preset", "isac"], "unknown preset of nero_lift 'isac' (did you mean 'isaac'?): choose one of default, isaac"),
+    ("train", ["--env.sim.td", "0.01"], "no field 'sim.td': 'td' is not one of dt, decimation"),
+    ("train", ["--env.rewards.reaching_object.params.sdt=1"], "(did you mean 'std'?)"),
+    ("train", ["--env.sim.dt", "fast"], "sim.dt takes a value like 0.01, got 'fast'"),
+    ("train", ["--env.sim.dt"], "--env.sim.dt needs a value"),
+    ("train", ["--ppo.num_epoch", "3"], "(did you mean 'num_epochs'?)"),
+    ("train", ["--numenvs", "3"], "unknown argument '--numenvs'"),
+    ("train", ["--num-envs", "many"], "expected a whole number, got 'many'"),
+    ("train", ["--num-timesteps", "0"], "at least 1, got '0'"),
+    ("train", ["--num-envs", "100"], "num_envs (100) must be a multiple of ppo.num_minibatches (8)"),
+    ("train", ["--ppo.network.distribution", "tanh_normal"], "pass --ppo.desired_kl 0"),
+    ("train", ["--restore", "nowhere"], "no such file: nowhere"),
+    ("train", ["--restore", "."], "holds no checkpoint to restore"),
+    ("train", ["--out", "/proc/run"], "cannot write to /proc/run"),
+    ("eval", ["--env", "nero"], "unknown env 'nero'"),
+    ("eval", ["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
+    ("eval", ["--policy", "README.md"], "is not a policy or checkpoint of mjx_nero, or it is damaged"),
+    ("eval", ["--preset", "isaac"], "was trained on other observations (preset default): pass --preset default"),
+    ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
+    ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
+    ("eval", ["--video", "."], "is a folder: give a file name"),
+    ("benchmark", ["--impl", "cuda"], "unknown impl cuda: choose from auto, jax, warp"),
+    ("benchmark", ["--num-envs", "8,x"], "--num-envs: expected a whole number, got 'x'"),
+    ("benchmark", ["--what", "everything"], "unknown what everything"),
+]
+
+
+@pytest.mark.parametrize(("program", "argv", "message"), MISTAKES, ids=[" ".join([p, *a]) for p, a, _ in MISTAKES])
+def test_a_mistake_is_one_line(call, tmp_path, program, argv, message):
+    (tmp_path / "README.md").write_text("no policy")
+    code, out, err = call(program, *argv)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ") and err.count("\n") == 1
+    assert message in err
+    assert [p.name for p in tmp_path.iterdir()] == ["README.md"]
+
+
+@pytest.mark.parametrize("program", ["train", "eval", "benchmark"])
+def test_warp_needs_a_gpu(call, program):
+    if jax.default_backend() == "gpu":
+        pytest.skip("there is one")
+    argv = ["--impl", "warp"] + (["--backend", "mjx"] if program == "eval" else [])
+    code, _, err = call(program, *argv)
+    assert code == 2 and "impl 'warp' needs an NVIDIA GPU" in err and err.count("\n") == 1
+
+
+def test_policy_of_another_env(call, tmp_path):
+    meta = checkpoint.load_meta(policy.shipped("nero_lift"))
+    shipped = policy.load(policy.shipped("nero_lift"))
+    checkpoint.save(tmp_path / "other.safetensors", shipped.params, {**meta, "env": "cobotta_lift"})
+    code, _, err = call("eval", "--policy", "other.safetensors")
+    assert code == 2 and "is a policy of cobotta_lift, not of nero_lift: pass --env cobotta_lift" in err
+
+
+def test_help_is_complete(call):
+    code, out, _ = call("train", "--help")
+    assert code == 0
+    flags = ("--env", "--preset", "--num-envs", "--num-timesteps", "--seed", "--impl", "--out", "--restore", "--eval-every")
+    fields = ("--env.rewards.reaching_object.params.std 0.1", "--env.robot.arm.effort 25.0", "--ppo.discounting 0.98")
+    assert all(text in out for text in (*flags, *fields))
+
+
+def test_eval_of_the_shipped_policy(call, tmp_path):
+    code, out, _ = call("eval", "--episodes", 64, "--backend", "mujoco", "--json", "result.json")
+    assert code == 0 and "success rate" in out
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert (result["env"], result["episodes"], result["seed"], result["backend"]) == ("nero_lift", 64, 1, "mujoco")
+    assert result["success_rate"] >= 0.9
+    assert result["final_distance_median"] < 0.01  # the mean rests on the rare lost cube
+    assert result["nan_count"] == 0
+    assert result["return_mean"] == pytest.approx(sum(result["return_by_term"].values()), rel=1e-3)
+
+
+@pytest.mark.parametrize("agent", ["zero", "random"])
+def test_agents_that_do_not_know_the_task(call, tmp_path, agent):
+    code, _, _ = call("eval", "--agent", agent, "--episodes", 8, "--backend", "mujoco", "--json", "result.json")
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert code == 0 and result["agent"] == agent and result["success_rate"] == 0.0
+
+
+def test_video_has_real_frames(call, tmp_path):
+    if not can_draw() and not os.environ.get("CI"):
+        pytest.skip("no offscreen OpenGL")
+    code, out, _ = call("eval", "--episodes", 1, "--backend", "mujoco", "--video", "lift.mp4")
+    assert code == 0 and "video: lift.mp4" in out
+    frames = imageio.imread(tmp_path / "lift.mp4")
+    assert frames.shape == (84, 480, 640, 3)  # every third of 250 steps
+    assert frames[0].std() > 20  # a picture, not a blank
+    assert abs(frames[0].astype(int) - frames[20]).max() > 100  # and things move in it
+
+
+def test_without_opengl_all_but_the_video(call, tmp_path, monkeypatch):
+    def broken(*_):
+        raise ImportError("no GL")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    code, out, _ = call(
+        "eval", "--agent", "zero", "--episodes", 1, "--backend", "mujoco", "--video", "lift.mp4", "--json", "r.json"
+    )
+    assert code == 0 and "install libegl1" in out
+    assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
+
+
+@pytest.mark.slow
+def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
+    log, rows = training.RunFolder.log, []
+
+    def log_and_interrupt(self, row):
+        log(self, row)
+        rows.append(row)
+        if len(rows) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(training.RunFolder, "log", log_and_interrupt)
+    sizes = ["--num-envs", 64, "--no-video"]
+    code, out, err = call("train", *sizes, "--num-timesteps", 100_000, "--seed", 3, "--out", "run")
+    run = tmp_path / "run"
+    assert code == 130
+    assert "go on with: python train.py --num-envs 64 --no-video --num-timesteps 100000 --seed 3 --restore run" in err
+    config = json.loads((run / "config.json").read_text())
+    assert (config["env_name"], config["seed"], config["ppo"]["num_envs"]) == ("nero_lift", 3, 64)
+    saved = sorted((run / "checkpoints").iterdir())
+    assert saved and not list(run.rglob("*.part"))
+
+    code, _, err = call("train", *sizes, "--out", "run")
+    assert code == 2 and "run already holds a run: pass another --out, or --restore run" in err
+
+    stopped = int(rows[-1]["steps"])
+    code, out, _ = call("train", *sizes, "--num-timesteps", stopped + 3072, "--seed", 3, "--restore", "run")
+    assert code == 0 and f"{stopped + 3072:,} env steps" in out
+    history = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    steps = [row["steps"] for row in history]
+    assert steps == sorted(steps) and steps[0] == 0 and steps[-1] == stopped + 3072
+    assert {"train/return", "reward/reaching_object", "nan_count", "steps_per_s"} <= history[-1].keys()
+    assert imageio.imread(run / "curve.png").std() > 5
+    assert list((run / "tensorboard").glob("events*"))
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["nan_count"] == 0 and summary["evaluation"]["episode_length_mean"] == 250
+
+    code, out, _ = call("eval", "--policy", "run/policy.safetensors", "--episodes", 4, "--backend", "mujoco")
+    assert code == 0 and "success rate" in out
+    shutil.rmtree(run)
+
+
+@pytest.mark.slow
+def test_benchmark(call, tmp_path):
+    code, out, _ = call("benchmark", "--num-envs", 8, "--impl", "jax", "--steps", 4, "--repeats", 2, "--json", "rows.json")
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert code == 0 and "env_steps_per_s" in out
+    assert (row["env"], row["impl"], row["num_envs"]) == ("nero_lift", "jax", 8)
+    assert row["env_steps_per_s"] > 0 and row["compile_s"] > 0
+    assert abs(row["physics_steps_per_s"] - 2 * row["env_steps_per_s"]) <= 1  # both are rounded
+    assert row["env_steps_per_s_min"] <= row["env_steps_per_s"] <= row["env_steps_per_s_max"]
+    assert row["nan_count"] == row["overflow_count"] == 0
