@@ -58,6 +58,10 @@ def main(argv):
     pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
     print(f"{pace}, success {result['success_rate']:.1%}")
     print(f"{summary['folder']}: policy.safetensors, curve.png, metrics.jsonl, checkpoints/")
+    if summary["nan_count"] or summary["overflow_count"]:
+        print(
+            f"physics: {summary['nan_count']} environments reset after NaN, {summary['overflow_count']} steps with lost contacts"
+        )
     if summary["stopped"] == "interrupted":
         sys.exit(130)
 

@@ -1,4 +1,4 @@
-"""A training run: machine defaults, run folder, progress, checkpoints, curve and video."""
+"""A training run: machine defaults, the loop with progress and checkpoints, final files."""
 
 import contextlib
 import dataclasses
@@ -6,7 +6,6 @@ import json
 import pathlib
 import shlex
 import signal
-import sys
 import time
 from typing import Any
 
@@ -18,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from mjx_nero import checkpoint, config, policy, registry, render, rollout, wrappers
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.ppo import Learner, PpoCfg, TrainState
+from mjx_nero.run_folder import RunFolder
 from mjx_nero.types import UserError
 
 
@@ -59,68 +59,6 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
     return run, note
 
 
-class RunFolder:
-    """Where a run writes. Refuses a folder that holds another run, unless that run goes on.
-
-    Raises:
-        UserError: the folder holds a run, or cannot be written.
-    """
-
-    def __init__(self, path: pathlib.Path, resume: bool):
-        self.path = path
-        self.rows: list[dict[str, float]] = []
-        self._tensorboard: Any = None
-        if (path / "config.json").exists() and not resume:
-            raise UserError(f"{path} already holds a run: pass another --out, or --restore {path} to go on with it")
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            probe = path / ".probe"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            raise UserError(f"cannot write to {path}: {error.strerror or error}; pass another --out") from None
-        self._metrics = path / "metrics.jsonl"
-
-    def begin(self, run: RunCfg, start: int) -> None:
-        """Writes the resolved config; keeps the metrics of a resumed run up to env step ``start``."""
-        from tensorboardX import SummaryWriter
-
-        resolved = {**config.to_dict(run), "versions": versions()}
-        (self.path / "config.json").write_text(json.dumps(resolved, indent=2, default=str) + "\n")
-        if self._metrics.exists():
-            rows = [json.loads(line) for line in self._metrics.read_text().splitlines() if line]
-            self.rows = [row for row in rows if row["steps"] <= start]
-        self._metrics.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
-        self._tensorboard = SummaryWriter(str(self.path / "tensorboard"), purge_step=start or None)
-
-    def log(self, row: dict[str, float]) -> None:
-        """Appends one row of metrics."""
-        self.rows.append(row)
-        with self._metrics.open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        for name, value in row.items():
-            self._tensorboard.add_scalar(name, value, int(row["steps"]))
-
-    def close(self) -> None:
-        """Flushes the logs and draws the learning curve."""
-        if self._tensorboard is not None:
-            self._tensorboard.close()
-        if self.rows:
-            plot_curve(self.rows, self.path / "curve.png")
-
-
-def versions() -> dict[str, str]:
-    """Versions of what decides a result, and the device."""
-    import importlib.metadata as metadata
-
-    names = ("mjx-nero", "mujoco", "mujoco-mjx", "jax", "brax", "flax", "optax", "warp-lang")
-    found = {}
-    for name in names:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return {**found, "python": sys.version.split()[0], "device": jax.devices()[0].device_kind}
-
-
 def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     """Trains a policy and leaves everything about it in the run folder; returns the summary that it prints.
 
@@ -145,9 +83,12 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     if note:
         console.print(note, highlight=False)
     started = time.perf_counter()
-    with console.status("compiling (a minute or two the first time) ..."):
+    with console.status("compiling (a minute or two the first time) ..."), folder.unless_failed():
         state = _initial_state(learner, run.seed, source)
         iterations = -(-ppo.num_timesteps // learner.steps_per_iteration)
+        if state.iteration >= iterations:
+            made = int(state.iteration) * learner.steps_per_iteration
+            raise UserError(f"{source} has made its {made:,} steps already: pass a larger --num-timesteps")
         chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
         advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
         evaluate = _evaluator(run, learner)
@@ -158,7 +99,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     console.print(f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments", highlight=False)
 
     done = int(state.iteration)
-    folder.begin(run, done * learner.steps_per_iteration)
+    folder.begin(config.to_dict(run), done * learner.steps_per_iteration)
     loop = _Loop(run, learner, folder, evaluate, advance, chunk, iterations, meta, console)
     try:
         state, stopped = loop.run(state, first)
@@ -213,7 +154,8 @@ class _Loop:
         per = self.learner.steps_per_iteration
         steps = start = int(state.iteration) * per
         self.last_eval = first
-        self._log(steps, {}, first)
+        if not self.folder.rows:
+            self._log(steps, {}, first)
         wait = {"eval": steps + self.eval_every, "save": steps + self.save_every}
         begun = time.perf_counter()
         with self._progress() as (bar, task), _stop_on_ctrl_c(self.console) as stop:
@@ -357,34 +299,6 @@ def _video(env: ManipulationEnv, run: RunCfg, state: TrainState, learner: Learne
         render.write_video(path, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
     except UserError as error:
         console.print(str(error), highlight=False)
-
-
-def plot_curve(rows: list[dict[str, float]], path: pathlib.Path) -> None:
-    """Success, return and every reward term over env steps."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 3.8), layout="constrained")
-    success, returns, terms = figure.subplots(1, 3)
-
-    def line(axes, name, **style):
-        points = [(row["steps"] / 1e6, row[name]) for row in rows if name in row]
-        if points:
-            axes.plot(*zip(*points, strict=True), **style)
-
-    line(success, "train/success", label="training (with exploration noise)", color="tab:gray")
-    line(success, "eval/success_rate", label="evaluation", color="tab:blue", marker="o", markersize=3)
-    line(returns, "train/return", label="training", color="tab:gray")
-    line(returns, "eval/return_mean", label="evaluation", color="tab:blue", marker="o", markersize=3)
-    for name in sorted({k for row in rows for k in row if k.startswith("reward/")}):
-        line(terms, name, label=name.removeprefix("reward/"))
-    for axes, title in ((success, "success rate"), (returns, "return of an episode"), (terms, "return by term (training)")):
-        axes.set_title(title)
-        axes.set_xlabel("env steps [million]")
-        axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7)
-    success.set_ylim(-0.02, 1.02)
-    figure.savefig(path, dpi=110)
 
 
 def command_line(argv: list[str]) -> str:

@@ -189,7 +189,7 @@ def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
     assert code == 0 and f"{stopped + 3072:,} env steps" in out
     history = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     steps = [row["steps"] for row in history]
-    assert steps == sorted(steps) and steps[0] == 0 and steps[-1] == stopped + 3072
+    assert steps == sorted(set(steps)) and steps[0] == 0 and steps[-1] == stopped + 3072
     assert {"train/return", "reward/reaching_object", "nan_count", "steps_per_s"} <= history[-1].keys()
     assert imageio.imread(run / "curve.png").std() > 5
     assert list((run / "tensorboard").glob("events*"))
@@ -198,6 +198,11 @@ def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
 
     code, out, _ = call("eval", "--policy", "run/policy.safetensors", "--episodes", 4, "--backend", "mujoco")
     assert code == 0 and "success rate" in out
+
+    code, _, err = call("train", *sizes, "--num-timesteps", stopped, "--restore", "run")
+    assert code == 2 and "has made its" in err and "pass a larger --num-timesteps" in err
+    code, _, err = call("train", "--num-envs", 32, "--restore", "run", "--out", "other")
+    assert code == 2 and "does not fit" in err and not (tmp_path / "other").exists()
     shutil.rmtree(run)
 
 
