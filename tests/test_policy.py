@@ -144,7 +144,5 @@ def test_no_policy_ships(env, monkeypatch):
 
 
 def test_the_policy_that_ships_fits(env):
-    if not policy.shipped("nero_lift").is_file():
-        pytest.skip("none ships yet")
     loaded = policy.load_for(env, "nero_lift", None)
     assert loaded.act(env.reset(jax.random.PRNGKey(0)).obs).shape == (8,)
