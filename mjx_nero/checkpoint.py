@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save as serialize
 
 from mjx_nero.types import UserError
 
@@ -31,7 +31,7 @@ def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(arrays, part, metadata={"meta": json.dumps(meta)})
+        part.write_bytes(serialize(arrays, metadata={"meta": json.dumps(meta)}))
         os.replace(part, path)
     except (OSError, SafetensorError) as error:
         with contextlib.suppress(OSError):

@@ -87,9 +87,9 @@ def evaluate(
     if video:
         try:
             render.write_video(video, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
-            console.print(f"video: {video}", highlight=False)
+            console.print(f"video: {video}", highlight=False, soft_wrap=True)
         except UserError as error:
-            console.print(str(error), highlight=False)
+            console.print(str(error), highlight=False, soft_wrap=True)
     return result
 
 

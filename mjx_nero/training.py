@@ -81,7 +81,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     meta = policy.describe(env, run.env_name, run.preset, ppo.network)
 
     if note:
-        console.print(note, highlight=False)
+        console.print(note, highlight=False, soft_wrap=True)
     started = time.perf_counter()
     with console.status("compiling (a minute or two the first time) ..."), folder.unless_failed():
         state = _initial_state(learner, run.seed, source)
@@ -96,7 +96,9 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         # Loads what the backend compiles at its first call (Warp's kernels), on a copy.
         jax.block_until_ready(jax.jit(learner.env.step)(state.env_state, np.zeros((ppo.num_envs, env.action_size), np.float32)))
     compile_s = time.perf_counter() - started
-    console.print(f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments", highlight=False)
+    console.print(
+        f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments", highlight=False, soft_wrap=True
+    )
 
     done = int(state.iteration)
     folder.begin(config.to_dict(run), done * learner.steps_per_iteration)
@@ -298,7 +300,7 @@ def _video(env: ManipulationEnv, run: RunCfg, state: TrainState, learner: Learne
     try:
         render.write_video(path, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
     except UserError as error:
-        console.print(str(error), highlight=False)
+        console.print(str(error), highlight=False, soft_wrap=True)
 
 
 def command_line(argv: list[str]) -> str:
