@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import policy, registry, render, rollout
+from mjx_nero import config, policy, registry, render, rollout
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.types import UserError
 
@@ -57,7 +57,7 @@ def evaluate(
         UserError: unknown names, a policy that does not fit, files that cannot be written.
     """
     cfg = dataclasses.replace(registry.env_cfg(env_name, preset), corruption=False)
-    cfg = registry.config.override(cfg, overrides or {})
+    cfg = config.override(cfg, overrides or {})
     if backend == "auto":
         backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     env = ManipulationEnv(cfg, impl=impl if backend == "mjx" else "jax", num_envs=episodes)
