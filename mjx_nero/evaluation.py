@@ -86,7 +86,7 @@ def evaluate(
         part.replace(out)
     if video:
         try:
-            render.write_video(video, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
+            render.write_episodes(video, env.mj_model, played.qpos, played.goals, env.dt)
             console.print(f"video: {video}", highlight=False, soft_wrap=True)
         except UserError as error:
             console.print(str(error), highlight=False, soft_wrap=True)

@@ -63,6 +63,15 @@ def frames(model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, every: in
         return [renderer.draw(qpos[t, k], goals[t, k]) for k in range(episodes) for t in range(0, steps, every)]
 
 
+def write_episodes(path: pathlib.Path, model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, dt: float) -> None:
+    """Writes recorded episodes, one step each ``dt`` seconds, as an MP4 in real time that shows every third step.
+
+    Raises:
+        UserError: the machine cannot draw, or the path cannot be written.
+    """
+    write_video(path, frames(model, qpos, goals, every=3), fps=1 / (3 * dt))
+
+
 def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> None:
     """Writes an MP4; the file appears whole or not at all.
 

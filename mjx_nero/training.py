@@ -260,11 +260,16 @@ def _stop_on_ctrl_c(console: Console):
         signal.signal(signal.SIGINT, before)
 
 
+def _act(learner: Learner) -> rollout.Act:
+    """The learner's deterministic policy, as the runners take it."""
+    return lambda params, obs, _: policy.make_act(learner.networks, params)(obs)
+
+
 def _evaluator(run: RunCfg, learner: Learner):
     """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo C where there is no accelerator."""
     env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=run.impl, num_envs=run.eval_episodes)
     make = rollout.native_runner if jax.default_backend() == "cpu" else rollout.mjx_runner
-    play = make(env, lambda params, obs, _: policy.make_act(learner.networks, params)(obs), run.eval_episodes)
+    play = make(env, _act(learner), run.eval_episodes)
     return lambda state: play((state.normalizer, state.params), run.seed).summary()
 
 
@@ -295,10 +300,9 @@ def _checkpoint_path(restore: pathlib.Path) -> pathlib.Path:
 def _video(env: ManipulationEnv, run: RunCfg, state: TrainState, learner: Learner, path: pathlib.Path, console: Console) -> None:
     """Three episodes of the trained policy, played in MuJoCo C."""
     play_env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=env.impl)
-    act = lambda params, obs, _: policy.make_act(learner.networks, params)(obs)  # noqa: E731
-    played = rollout.native_runner(play_env, act, 3, record=3)((state.normalizer, state.params), run.seed)
+    played = rollout.native_runner(play_env, _act(learner), 3, record=3)((state.normalizer, state.params), run.seed)
     try:
-        render.write_video(path, render.frames(env.mj_model, played.qpos, played.goals, every=3), fps=1 / (3 * env.dt))
+        render.write_episodes(path, env.mj_model, played.qpos, played.goals, env.dt)
     except UserError as error:
         console.print(str(error), highlight=False, soft_wrap=True)
 
