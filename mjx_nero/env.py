@@ -12,13 +12,13 @@ from brax.envs.base import Env, State
 from jaxtyping import Array, Float
 
 from mjx_nero import scene, terms
-from mjx_nero.mdp import actions
-from mjx_nero.mdp.rewards import at_goal, held
+from mjx_nero.mdp import actions, success
+from mjx_nero.mdp.rewards import held
 from mjx_nero.physics import Physics, resolve_impl
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg, SimCfg
 from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
-from mjx_nero.types import Carry, Key, Sim, UserError
+from mjx_nero.types import Carry, Key, Sim, UserError, View
 from mjx_nero.view import Viewer
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
@@ -28,18 +28,21 @@ _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it 
 class ActionCfg:
     """One action a arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes).
 
-    ``clip`` bounds every action to +-clip before use; 0 leaves them alone.
+    ``clip`` bounds every action to +-clip before use; 0 leaves them alone. ``absolute`` takes the drives' position targets
+    themselves [rad or m], one a drive, and leaves their speed to whoever gives them: for controllers.
     """
 
     scale: float = 0.5
     clip: float = 0.0
+    absolute: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class SuccessCfg:
-    """The object within ``threshold`` [m] of the commanded point for the last ``hold_s`` seconds of the episode."""
+    """``condition`` has held for the last ``hold_s`` seconds of the episode; ``distance`` [m] is what it is about."""
 
-    threshold: float = 0.02
+    condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
+    distance: Term = Term(success.object_distance)
     hold_s: float = 0.5
     minimal_height: float = 0.025  # with grasp_radius: what counts as a grasp in the metrics [m]
     grasp_radius: float = 0.04
@@ -47,7 +50,10 @@ class SuccessCfg:
 
 @dataclasses.dataclass(frozen=True)
 class EnvCfg:
-    """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name."""
+    """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
+
+    ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task.
+    """
 
     robot: RobotCfg
     command: CommandTerm
@@ -63,6 +69,8 @@ class EnvCfg:
     episode_length_s: float = 5.0
     object_start: tuple[float, float, float] = (0.2, 0.0, 0.015)  # before the reset events [m]
     corruption: bool = True  # observation noise: on to train, off to play
+    motion: Term | None = None
+    controllers: tuple[str, ...] = ()
 
     def __post_init__(self):
         unknown = set(self.curriculum) - set(self.rewards)
@@ -92,13 +100,14 @@ class ManipulationEnv(Env):
         self.episode_length = round(cfg.episode_length_s / self.dt)
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
         self.physics_model = model
-        self._viewer = Viewer(model, cfg.robot, self.episode_length)
+        motion = None if cfg.motion is None else functools.partial(cfg.motion.func, **cfg.motion.params)
+        self._viewer = Viewer(model, cfg.robot, self.episode_length, self.dt, motion)
         ids = self._viewer.qpos_ids
+        self._coupled = _couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._qpos0[ids] = cfg.robot.home
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
-        speeds = [cfg.robot.arm.speed] * len(cfg.robot.arm.joints) + [cfg.robot.gripper.speed] * len(cfg.robot.gripper.joints)
-        self._max_ctrl_step = np.array(speeds, np.float32) * self.dt
+        self._max_ctrl_step = np.array(cfg.robot.arm.speed + cfg.robot.gripper.speed, np.float32) * self.dt
         self._hold_steps = round(cfg.success.hold_s / self.dt)
         self._resample_steps = round(cfg.command.resample_s / self.dt)
 
@@ -115,8 +124,8 @@ class ManipulationEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """One a arm joint and one for the gripper."""
-        return len(self.cfg.robot.arm.joints) + 1
+        """One a arm joint and one for the gripper, or one a drive."""
+        return len(self.cfg.robot.joints) if self.cfg.action.absolute else len(self.cfg.robot.arm.joints) + 1
 
     @functools.cached_property
     def observation_size(self) -> dict[str, tuple[int, ...]]:
@@ -138,7 +147,7 @@ class ManipulationEnv(Env):
         k_draw, k_obs = jax.random.split(rng)
         sim, carry = self.draw(k_draw)
         names = [f"reward/{name}" for name in self.cfg.rewards]
-        names += ["success", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
+        names += ["success", "distance", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow"]
         zero = jnp.zeros(())
         info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
         return State(sim, self.observe(sim, carry, k_obs), zero, zero, dict.fromkeys(names, zero), info)
@@ -150,11 +159,15 @@ class ManipulationEnv(Env):
         for key, event in zip(k_events, self.cfg.events.values(), strict=True):
             joints, cube = event.func(key, joints, cube, **event.params)
         joints = jnp.clip(joints, *self._range)
-        at, nv = self._viewer.object_qpos, self.physics_model.nv
+        qpos, nv = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints), self.physics_model.nv
+        for follower, leader, offset, ratio in self._coupled:
+            qpos = qpos.at[follower].set(offset + ratio * qpos[leader])
+        at = self._viewer.object_qpos
+        command, command_quat = self._draw_command(k_command)
         sim = Sim(
-            qpos=jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints).at[at : at + 3].set(cube),
+            qpos=qpos if at is None else qpos.at[at : at + 3].set(cube),
             qvel=jnp.zeros(nv),
-            ctrl=joints,
+            ctrl=qpos[self._viewer.qpos_ids],
             warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
         )
@@ -162,11 +175,21 @@ class ManipulationEnv(Env):
             rng=rng,
             step=jnp.zeros((), jnp.int32),
             action=jnp.zeros(self.action_size),
-            command=self.cfg.command.func(k_command, **self.cfg.command.params),
+            command=command,
+            command_quat=command_quat,
             hold=jnp.zeros((), jnp.int32),
             grasp_time=jnp.array(jnp.inf),
         )
         return sim, carry
+
+    def view(self, state: State) -> View:
+        """What the terms and the controllers read of a state."""
+        carry = state.info["carry"]
+        return self._viewer(state.pipeline_state, carry, carry.action)
+
+    def goal(self, state: State) -> Float[Array, "3"]:
+        """Where the goal is now, world frame [m]."""
+        return self._viewer.goal(state.info["carry"])[0]
 
     def observe(self, sim: Sim, carry: Carry, key: Key) -> dict[str, Float[Array, " n"]]:
         """The observation groups; ``key`` draws their noise."""
@@ -200,6 +223,8 @@ class ManipulationEnv(Env):
     def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
         """The drives' position targets for ``action``: within the joint ranges and the drives' speed limits [rad, m]."""
         action, robot = self._clip(action), self.cfg.robot
+        if self.cfg.action.absolute:
+            return jnp.clip(action, *self._range)
         arm = actions.joint_targets(action[:-1], scale=self.cfg.action.scale, offset=jnp.asarray(robot.arm.home))
         gripper = actions.binary_gripper(action[-1], open=jnp.asarray(robot.gripper.open), close=jnp.asarray(robot.gripper.close))
         target = jnp.clip(jnp.concatenate([arm, gripper]), *self._range)
@@ -231,27 +256,31 @@ class ManipulationEnv(Env):
         terminated, truncated = terminated | bad, truncated & ~bad
         done = (terminated | truncated).astype(jnp.float32)
 
-        hold = jnp.where(at_goal(view, threshold=cfg.success.threshold), carry.hold + 1, 0)
+        hold = jnp.where(cfg.success.condition.func(view, **cfg.success.condition.params), carry.hold + 1, 0)
+        distance = cfg.success.distance.func(view, **cfg.success.distance.params)
         grasp = held(view, minimal_height=cfg.success.minimal_height, grasp_radius=cfg.success.grasp_radius)
         grasp_time = jnp.minimum(carry.grasp_time, jnp.where(grasp, step * self.dt, jnp.inf))
         grasped = jnp.isfinite(grasp_time)
         # Episode results appear at the last step and are 0 before it: a sum over the episode gives them.
         ends = {
             "success": truncated & (hold >= self._hold_steps),
-            "final_distance": jnp.linalg.norm(view.goal_pos_w - view.object_pos_w),
+            "final_distance": distance,
             "grasped": grasped,
             "grasp_time": jnp.where(grasped, grasp_time, 0.0),
             "dropped": terminated & ~bad,
         }
         metrics = {f"reward/{name}": value for name, value in reward_terms.items()}
         metrics |= {name: jnp.where(bad, 0.0, value * done) for name, value in ends.items()}
-        metrics |= {"nan": bad.astype(jnp.float32), "overflow": overflow}
+        metrics |= {"distance": jnp.where(bad, 0.0, distance), "nan": bad.astype(jnp.float32), "overflow": overflow}
 
         carry = carry.replace(step=step, action=action, hold=hold, grasp_time=grasp_time)
         if self._resample_steps < self.episode_length:
             rng, k_command = jax.random.split(carry.rng)
-            drawn = cfg.command.func(k_command, **cfg.command.params)
-            carry = carry.replace(rng=rng, command=jnp.where(step % self._resample_steps == 0, drawn, carry.command))
+            pos, quat = (
+                jnp.where(step % self._resample_steps == 0, new, old)
+                for new, old in zip(self._draw_command(k_command), (carry.command, carry.command_quat), strict=True)
+            )
+            carry = carry.replace(rng=rng, command=pos, command_quat=quat)
         info = {"carry": carry, "count": count, "truncation": truncated.astype(jnp.float32), "steps": step.astype(jnp.float32)}
         return state.replace(
             pipeline_state=sim,
@@ -261,5 +290,16 @@ class ManipulationEnv(Env):
             info={**state.info, **info},
         )
 
+    def _draw_command(self, key: Key) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+        drawn = self.cfg.command.func(key, **self.cfg.command.params)
+        return drawn if isinstance(drawn, tuple) else (drawn, jnp.array([1.0, 0.0, 0.0, 0.0]))
+
     def _clip(self, action: Float[Array, " na"]) -> Float[Array, " na"]:
         return jnp.clip(action, -self.cfg.action.clip, self.cfg.action.clip) if self.cfg.action.clip else action
+
+
+def _couplings(model: mujoco.MjModel) -> list[tuple[int, int, float, float]]:
+    """(follower, leader, offset, ratio) of the joints that equalities couple linearly: where a linkage starts closed."""
+    joint = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
+    pairs = zip(model.eq_obj1id[joint], model.eq_obj2id[joint], model.eq_data[joint], strict=True)
+    return [(int(model.jnt_qposadr[a]), int(model.jnt_qposadr[b]), float(c[0]), float(c[1])) for a, b, c in pairs]

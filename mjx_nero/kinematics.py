@@ -1,54 +1,155 @@
-"""Forward kinematics of one site in plain JAX.
+"""Forward kinematics and Jacobians in plain JAX.
 
 ``mjx.step`` leaves body and site poses one physics step behind ``qpos``, and every backend keeps them elsewhere. A chain
-of seven joints is cheap enough to compute where it is read, so the terms see poses that fit ``qpos`` on every backend,
-also right after a reset.
+of a few joints is cheap enough to compute where it is read, so the terms see poses that fit ``qpos`` on every backend,
+also right after a reset; and controllers need neither a simulator nor its data.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero import math
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+class Chain:
+    """Poses and Jacobians of frames as functions of some hinges and slides; pure, for one configuration (vmap it).
+
+    Joints that are not listed stay where the model's ``qpos0`` has them. What does not move between two joints is merged
+    into one fixed transform when the chain is made.
+
+    Args:
+        model: compiled model.
+        joints: names, in the order of ``q``.
+        frames: names of sites or bodies, in the order of the results.
+
+    Attributes:
+        joints, frames: as given.
+        lower, upper: [nj] joint limits [rad or m]; +-inf where there is none.
+
+    Raises:
+        KeyError: the model has no such joint or frame.
+        ValueError: a ball or free joint lies between the world and a frame, or is listed.
+    """
+
+    def __init__(self, model: mujoco.MjModel, joints: Sequence[str], frames: Sequence[str]):
+        self.joints, self.frames = tuple(joints), tuple(frames)
+        ids = [model.joint(j).id for j in joints]
+        for name, j in zip(joints, ids, strict=True):
+            if model.jnt_type[j] not in (_HINGE, _SLIDE):
+                raise ValueError(f"joint {name!r} is a ball or free joint: only hinges and slides are supported")
+        limited = model.jnt_limited[ids].astype(bool)
+        self.lower = np.where(limited, model.jnt_range[ids, 0], -np.inf).astype(np.float32)
+        self.upper = np.where(limited, model.jnt_range[ids, 1], np.inf).astype(np.float32)
+        # A node is a listed joint, its frame at the joint's anchor: (index in q, parent node, fixed transform from it, axis, slide?)
+        self._nodes: list[tuple[int, int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]] = []
+        self._index = {j: i for i, j in enumerate(ids)}
+        self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), np.array([1.0, 0, 0, 0])))}
+        self._model = model
+        self._ends = [self._end(name) for name in frames]
+        # path[f, i]: joint i (in the order of q) moves frame f
+        self._path = np.zeros((len(self.frames), len(ids)), bool)
+        for f, (node, _) in enumerate(self._ends):
+            while node >= 0:
+                self._path[f, self._nodes[node][0]] = True
+                node = self._nodes[node][1]
+        del self._model, self._last
+
+    def _body(self, body: int, frame: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+        """The node that carries a body, and the fixed transform from there; adds nodes on the way."""
+        if body in self._last:
+            return self._last[body]
+        m = self._model
+        node, fixed = self._body(int(m.body_parentid[body]), frame)
+        fixed = _compose(fixed, (m.body_pos[body], m.body_quat[body]))
+        for j in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
+            if m.jnt_type[j] not in (_HINGE, _SLIDE):
+                raise ValueError(f"frame {frame!r} hangs on a ball or free joint: only hinges and slides are supported")
+            anchor, slide, still = m.jnt_pos[j], bool(m.jnt_type[j] == _SLIDE), np.array([1.0, 0, 0, 0])
+            if j in self._index:
+                self._nodes.append((self._index[j], node, _compose(fixed, (anchor, still)), m.jnt_axis[j].copy(), slide))
+                node, fixed = len(self._nodes) - 1, (-anchor, still)
+            # else: at qpos0, where a joint displaces nothing
+        self._last[body] = node, fixed
+        return node, fixed
+
+    def _end(self, name: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+        m = self._model
+        site = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SITE, name)
+        if site < 0:
+            return self._body(int(m.body(name).id), name)  # KeyError lists the bodies
+        node, fixed = self._body(int(m.site_bodyid[site]), name)
+        return node, _compose(fixed, (m.site_pos[site], m.site_quat[site]))
+
+    def poses(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
+        """Positions [m] and orientations (wxyz) of the frames in the world."""
+        return self._frames(self._forward(q))
+
+    def jacobians(
+        self, q: Float[Array, " nj"]
+    ) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
+        """``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
+        nodes = self._forward(q)
+        pos, quat = self._frames(nodes)
+        columns: list[Array] = [jnp.zeros((len(self.frames), 6))] * len(self.joints)
+        for (i, _, _, axis, slide), (anchor, turn) in zip(self._nodes, nodes, strict=True):
+            axis_w = jnp.broadcast_to(math.rotate(turn, jnp.asarray(axis, jnp.float32)), pos.shape)
+            linear = axis_w if slide else jnp.cross(axis_w, pos - anchor)
+            columns[i] = jnp.concatenate([linear, jnp.zeros_like(linear) if slide else axis_w], axis=1)
+        return pos, quat, jnp.stack(columns, axis=-1) * jnp.asarray(self._path[:, None], jnp.float32)
+
+    def _forward(self, q: Float[Array, " nj"]) -> list[Pose]:
+        nodes: list[Pose] = []
+        for i, parent, fixed, axis, slide in self._nodes:
+            pos, quat = _attach(nodes, parent, fixed)
+            axis = jnp.asarray(axis, jnp.float32)
+            if slide:
+                pos = pos + math.rotate(quat, axis * q[i])
+            else:
+                quat = math.quat_mul(quat, math.axis_angle(axis, q[i]))
+            nodes.append((pos, quat))
+        return nodes
+
+    def _frames(self, nodes: list[Pose]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
+        ends = [_attach(nodes, node, fixed) for node, fixed in self._ends]
+        return jnp.stack([pos for pos, _ in ends]), jnp.stack([quat for _, quat in ends])
 
 
 def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " nq"]], Pose]:
-    """Builds ``qpos -> (position [m], orientation wxyz)`` of a site in the world frame.
+    """Builds ``qpos -> (position [m], orientation wxyz)`` of a site or body in the world frame.
 
     Raises:
-        KeyError: the model has no such site.
+        KeyError: the model has no such site or body.
         ValueError: a ball or free joint lies between the world and the site.
     """
-    site_id = model.site(site).id
-    chain = []
-    body = model.site_bodyid[site_id]
-    while body:
-        chain.append(body)
-        body = model.body_parentid[body]
-    joints = {b: range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]) for b in chain}
-    hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-    if any(model.jnt_type[j] not in (hinge, slide) for b in chain for j in joints[b]):
-        raise ValueError(f"site {site!r} hangs on a ball or free joint: only hinges and slides are supported")
+    ids = [j for j in range(model.njnt) if model.jnt_type[j] in (_HINGE, _SLIDE)]
+    chain = Chain(model, [model.joint(j).name for j in ids], [site])
+    at = model.jnt_qposadr[ids]
 
     def pose(qpos: Float[Array, " nq"]) -> Pose:
-        pos, quat = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-        for b in reversed(chain):
-            pos = pos + math.rotate(quat, jnp.asarray(model.body_pos[b]))
-            quat = math.quat_mul(quat, jnp.asarray(model.body_quat[b]))
-            for j in joints[b]:
-                axis, q = jnp.asarray(model.jnt_axis[j]), qpos[model.jnt_qposadr[j]]
-                if model.jnt_type[j] == slide:
-                    pos = pos + math.rotate(quat, axis * q)
-                else:  # a turn about the joint's anchor, which stays where it is
-                    anchor = jnp.asarray(model.jnt_pos[j])
-                    turned = math.quat_mul(quat, math.axis_angle(axis, q))
-                    pos = pos + math.rotate(quat, anchor) - math.rotate(turned, anchor)
-                    quat = turned
-        pos = pos + math.rotate(quat, jnp.asarray(model.site_pos[site_id]))
-        return pos, math.quat_mul(quat, jnp.asarray(model.site_quat[site_id]))
+        pos, quat = chain.poses(qpos[at])
+        return pos[0], quat[0]
 
     return pose
+
+
+def _attach(nodes: list[Pose], parent: int, fixed: tuple[np.ndarray, np.ndarray]) -> Pose:
+    pos, quat = jnp.asarray(fixed[0], jnp.float32), jnp.asarray(fixed[1], jnp.float32)
+    if parent < 0:
+        return pos, quat
+    at, turn = nodes[parent]
+    return at + math.rotate(turn, pos), math.quat_mul(turn, quat)
+
+
+def _compose(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The transform ``b`` in the frame ``a``; double precision, when a chain is made."""
+    pos, quat = np.zeros(3), np.zeros(4)
+    mujoco.mju_rotVecQuat(pos, np.asarray(b[0], float), a[1])
+    mujoco.mju_mulQuat(quat, a[1], np.asarray(b[1], float))
+    return a[0] + pos, quat

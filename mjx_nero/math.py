@@ -19,3 +19,30 @@ def rotate(quat: Float[Array, "4"], vec: Float[Array, "3"]) -> Float[Array, "3"]
 def axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
     """Quaternion of a turn by ``angle`` [rad] about the unit vector ``axis``."""
     return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])
+
+
+def quat_conj(quat: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The inverse rotation."""
+    return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quat_log(quat: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Rotation vector (axis times angle, angle in 0 to pi) [rad]; smooth at the identity."""
+    quat = jnp.where(quat[0] < 0, -quat, quat)  # q and -q are one rotation: take the short way
+    v = quat[1:]
+    square = v @ v
+    small = square < 1e-8
+    sine = jnp.sqrt(jnp.where(small, 1.0, square))
+    return v * jnp.where(small, 2.0, 2.0 * jnp.arctan2(sine, quat[0]) / sine)
+
+
+def rotation_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Columns are the frame's axes in the outer frame."""
+    w, x, y, z = quat
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

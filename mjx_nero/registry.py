@@ -6,13 +6,27 @@ from typing import Any
 
 from mjx_nero import config
 from mjx_nero.env import EnvCfg, ManipulationEnv
-from mjx_nero.robots import NERO
-from mjx_nero.tasks import lift
+from mjx_nero.robots import COBOTTA_PRO_900, NERO
+from mjx_nero.tasks import follow_target, lift, pick_place
 from mjx_nero.types import UserError
 
-# name -> preset -> factory of a fresh config
+# name -> preset -> factory of a fresh config; the default preset first
 _ENVS: dict[str, dict[str, Callable[[], EnvCfg]]] = {
-    "nero_lift": {name: (lambda make=make: make(NERO)) for name, make in lift.PRESETS.items()},  # type: ignore[misc]
+    "nero_lift": {
+        "default": lambda: lift.default(NERO, lift.NERO_WORK),
+        "isaac": lambda: lift.isaac(NERO, lift.NERO_WORK),
+    },
+    "nero_follow_target": {
+        "default": lambda: follow_target.default(NERO, follow_target.NERO_WORK),
+        "static": lambda: follow_target.static(NERO, follow_target.NERO_WORK),
+    },
+    "nero_pick_place": {"default": lambda: pick_place.default(NERO, pick_place.NERO_WORK)},
+    "cobotta_lift": {"default": lambda: lift.default(COBOTTA_PRO_900, lift.COBOTTA_WORK)},
+    "cobotta_follow_target": {
+        "default": lambda: follow_target.default(COBOTTA_PRO_900, follow_target.COBOTTA_WORK),
+        "static": lambda: follow_target.static(COBOTTA_PRO_900, follow_target.COBOTTA_WORK),
+    },
+    "cobotta_pick_place": {"default": lambda: pick_place.default(COBOTTA_PRO_900, pick_place.COBOTTA_WORK)},
 }
 
 

@@ -16,16 +16,16 @@ class DriveCfg:
         joints: names in the model.
         stiffness: [N m/rad] or [N/m].
         damping: [N m s/rad] or [N s/m].
-        effort: limit of the drive's force [N m] or [N].
-        speed: limit of how fast the position target moves [rad/s] or [m/s].
+        effort: limits of the drives' forces [N m] or [N].
+        speed: limits of how fast the position targets move [rad/s] or [m/s].
         home: joint positions at reset and at action zero [rad] or [m].
     """
 
     joints: tuple[str, ...]
     stiffness: tuple[float, ...]
     damping: tuple[float, ...]
-    effort: float
-    speed: float
+    effort: tuple[float, ...]
+    speed: tuple[float, ...]
     home: tuple[float, ...]
 
 
@@ -46,6 +46,9 @@ class RobotCfg:
         base_pos: where the robot stands in the world [m].
         base_quat: how its base link is turned there, wxyz. Commands and observations use the unturned frame.
         ee_site: site at the grasp point.
+        down: orientation of ``ee_site`` when the gripper points straight down and its fingers open along y, wxyz.
+        gravity_compensation: the drives carry the links' weight, as a robot's own controller does; False where the recipe that a
+            robot comes from does not.
     """
 
     name: str
@@ -55,6 +58,8 @@ class RobotCfg:
     base_link: str = "base_link"
     base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     base_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    down: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+    gravity_compensation: bool = False
 
     @property
     def xml(self) -> pathlib.Path:
@@ -82,18 +87,45 @@ NERO = RobotCfg(
         joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "joint7"),
         stiffness=(200.0, 170.0, 120.0, 80.0, 50.0, 20.0, 10.0),
         damping=(100.0, 60.0, 70.0, 24.0, 20.0, 10.0, 5.0),
-        effort=25.0,
-        speed=1.5,
+        effort=(25.0,) * 7,
+        speed=(1.5,) * 7,
         home=(0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0),
     ),
     gripper=GripperCfg(
         joints=("gripper_joint1", "gripper_joint2"),
         stiffness=(800.0, 800.0),
         damping=(20.0, 20.0),
-        effort=22.0,
-        speed=1.5,
+        effort=(22.0, 22.0),
+        speed=(1.5, 1.5),
         home=(0.05, -0.05),
         open=(0.05, -0.05),
         close=(0.0, -0.001),
+    ),
+)
+
+# Stiffness and damping: critical damping at home, from measured step responses (assets/cobotta_pro_900/README.md). Speeds: a
+# collaborative half of the published ones. Home: the grasp point at (0.5, 0, 0.28), gripper straight down, fingers opening along y.
+COBOTTA_PRO_900 = RobotCfg(
+    name="cobotta_pro_900",
+    down=(0.0, 0.0, 1.0, 0.0),
+    gravity_compensation=True,
+    arm=DriveCfg(
+        joints=("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6"),
+        stiffness=(2000.0, 2000.0, 1500.0, 300.0, 300.0, 100.0),
+        damping=(180.0, 190.0, 95.0, 19.0, 16.0, 6.5),
+        effort=(200.0, 200.0, 120.0, 50.0, 50.0, 30.0),
+        speed=(2.0,) * 6,
+        home=(-0.24237, 0.18845, 1.41048, 0.0, 1.54266, -0.24237),
+    ),
+    # The tutorial's two driven joints. The linkage couples all six, so they share the load.
+    gripper=GripperCfg(
+        joints=("finger_joint", "right_outer_knuckle_joint"),
+        stiffness=(20.0, 20.0),
+        damping=(1.0, 1.0),
+        effort=(2.3, 2.3),  # 30 N a finger at a 51.5 mm grip: within the gripper's 25 to 120 N
+        speed=(0.9, 0.9),  # the gap at the gripper's top speed, 135 mm/s
+        home=(0.0, 0.0),
+        open=(0.0, 0.0),
+        close=(0.628, -0.628),
     ),
 )

@@ -10,17 +10,22 @@ from mjx_nero.robots import RobotCfg
 
 @dataclasses.dataclass(frozen=True)
 class SceneCfg:
-    """Table and cube. Lengths in m, mass in kg.
+    """Table, cube and goal marker. Lengths in m, mass in kg.
 
-    The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
+    ``cube`` False leaves the cube out. ``goal`` is the marker's shape, ``sphere`` or ``cube`` (of the cube's size). The cameras
+    look at ``look_at`` from ``view_distance``. The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
     termination that counts a cube beyond them as fallen.
     """
 
     table_center: tuple[float, float] = (0.3, 0.0)
     table_size: tuple[float, float] = (1.0, 1.2)
+    cube: bool = True
     cube_edge: float = 0.03
     cube_mass: float = 0.03
     cube_friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
+    goal: str = "sphere"
+    look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
+    view_distance: float = 1.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,16 +43,14 @@ class SimCfg:
 
 
 def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -> mujoco.MjModel:
-    """Compiles robot, table, cube and goal marker.
+    """Compiles robot, table, cube (joint ``cube``, if there is one) and goal marker.
 
     Args:
         visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
             ctrl, less work a step.
     """
-    spec = mujoco.MjSpec.from_file(str(robot.xml))
-    base = spec.body(robot.base_link)
-    base.pos, base.quat = robot.base_pos, robot.base_quat
-    spec.modelname = f"{robot.name}_lift"
+    spec = _robot_spec(robot)
+    spec.modelname = f"{robot.name}_scene"
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -63,19 +66,19 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
     for drive in (robot.arm, robot.gripper):
         _add_drives(spec, drive)
 
-    cube = world.add_body(name="cube", pos=[0.35, 0, scene.cube_edge / 2])
-    cube.add_freejoint(name="cube")
-    half = [scene.cube_edge / 2] * 3
-    cube.add_geom(
-        name="cube",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=half,
-        mass=scene.cube_mass,
-        friction=scene.cube_friction,
-        contype=2,
-        conaffinity=1,
-        rgba=[0.85, 0.3, 0.2, 1],
-    )
+    if scene.cube:
+        cube = world.add_body(name="cube", pos=[0.35, 0, scene.cube_edge / 2])
+        cube.add_freejoint(name="cube")
+        cube.add_geom(
+            name="cube",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[scene.cube_edge / 2] * 3,
+            mass=scene.cube_mass,
+            friction=scene.cube_friction,
+            contype=2,
+            conaffinity=1,
+            rgba=[0.85, 0.3, 0.2, 1],
+        )
     goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
     if visuals:
         _add_visuals(spec, scene, goal)
@@ -84,23 +87,38 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
     return spec.compile()
 
 
+def robot_model(robot: RobotCfg) -> mujoco.MjModel:
+    """The robot alone where it is mounted: what kinematics need."""
+    return _robot_spec(robot).compile()
+
+
+def _robot_spec(robot: RobotCfg) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_file(str(robot.xml))
+    base = spec.body(robot.base_link)
+    base.pos, base.quat = robot.base_pos, robot.base_quat
+    if robot.gravity_compensation:
+        for body in [base, *base.find_all(mujoco.mjtObj.mjOBJ_BODY)]:
+            body.gravcomp = 1.0
+    return spec
+
+
 def _add_drives(spec: mujoco.MjSpec, drive) -> None:
-    for name, kp, kd in zip(drive.joints, drive.stiffness, drive.damping, strict=True):
+    for name, kp, kd, effort in zip(drive.joints, drive.stiffness, drive.damping, drive.effort, strict=True):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=kp, kv=kd)
-        actuator.forcelimited, actuator.forcerange = True, [-drive.effort, drive.effort]
+        actuator.forcelimited, actuator.forcerange = True, [-effort, effort]
         actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
 
 
 def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal) -> None:
     hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
-    goal.add_geom(name="goal", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
+    box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.cube_edge / 2
+    shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
+    goal.add_geom(name="goal", type=shape, size=extent, rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
     world = spec.worldbody
     x, y = scene.table_center
     size = [scene.table_size[0] / 2, scene.table_size[1] / 2, 0.02]
-    world.add_geom(
-        name="table_top", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=[x, y, -0.0205], rgba=[0.72, 0.6, 0.47, 1], **hidden
-    )
+    world.add_geom(name="table_top", type=box, size=size, pos=[x, y, -0.0205], rgba=[0.72, 0.6, 0.47, 1], **hidden)
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -110,18 +128,17 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal) -> None:
         width=64,
         height=64,
     )
-    world.add_light(pos=[0.8, -0.8, 1.6], dir=[-0.4, 0.6, -1.2], diffuse=[0.7, 0.7, 0.7], castshadow=True)
-    world.add_light(pos=[0.4, 1.0, 1.4], dir=[0, -0.7, -1.0], diffuse=[0.3, 0.3, 0.3], castshadow=False)
-    for name, pos, target in (
-        ("front", (0.95, -0.72, 0.52), (0.17, 0.0, 0.2)),
-        ("side", (0.25, -1.1, 0.4), (0.18, 0.0, 0.24)),
-    ):
+    target, far = np.array(scene.look_at), scene.view_distance
+    for direction, color, shadow in (((-0.4, 0.6, -1.2), 0.7, True), ((0.0, -0.7, -1.0), 0.3, False)):
+        world.add_light(pos=target - 1.1 * far * np.array(direction), dir=direction, diffuse=[color] * 3, castshadow=shadow)
+    for name, direction in (("front", (0.71, -0.65, 0.28)), ("side", (0.07, -0.98, 0.17))):
+        pos = target + far * np.array(direction)
         world.add_camera(name=name, pos=pos, quat=_look_at(pos, target), fovy=42)
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     spec.visual.quality.shadowsize = 2048
-    spec.stat.center, spec.stat.extent = [0.25, 0, 0.25], 1.0
+    spec.stat.center, spec.stat.extent = target, far
 
 
 def _look_at(pos, target) -> np.ndarray:

@@ -34,8 +34,9 @@ class Carry:
     rng: Key
     step: Int[Array, ""]  # control steps since the start of the episode
     action: Float[Array, " na"]  # the last action, as the policy gave it
-    command: Float[Array, "3"]  # goal of the object, robot root frame [m]
-    hold: Int[Array, ""]  # consecutive control steps, up to now, with the object at the goal
+    command: Float[Array, "3"]  # goal, robot root frame [m]
+    command_quat: Float[Array, "4"]  # its orientation, wxyz
+    hold: Int[Array, ""]  # consecutive control steps, up to now, of success
     grasp_time: Float[Array, ""]  # when the object was first held off the table [s]; inf: not yet
 
 
@@ -53,13 +54,15 @@ class View:
     ctrl: Float[Array, " nu"]
     ee_pos_w: Float[Array, "3"]  # grasp point between the fingers [m]
     ee_quat_w: Float[Array, "4"]
-    object_pos_w: Float[Array, "3"]
+    object_pos_w: Float[Array, "3"]  # the cube; in a scene without one the goal itself is the object
     object_quat_w: Float[Array, "4"]
     object_linvel_w: Float[Array, "3"]  # [m/s]
     object_angvel_local: Float[Array, "3"]  # in the object's own frame [rad/s]
     root_pos_w: Float[Array, "3"]
-    command: Float[Array, "3"]  # goal of the object in the robot's root frame [m]
-    goal_pos_w: Float[Array, "3"]
+    command: Float[Array, "3"]  # goal in the robot's root frame, as drawn [m]
+    goal_pos_w: Float[Array, "3"]  # where it is now: a goal may move
+    goal_quat_w: Float[Array, "4"]
+    goal_linvel_w: Float[Array, "3"]  # [m/s]
     action: Float[Array, " na"]  # this step's action
     last_action: Float[Array, " na"]  # the step's before
     step: Int[Array, ""]  # control steps since the start of the episode

@@ -1,4 +1,4 @@
-"""Commands: sample(key, *, params) -> the goal, kept in the carry."""
+"""Commands: sample(key, *, params) -> the goal's position, or (position, orientation), kept in the carry; and paths of goals."""
 
 import jax
 import jax.numpy as jnp
@@ -7,9 +7,21 @@ from jaxtyping import Array, Float
 from mjx_nero.types import Key
 
 Range = tuple[float, float]
+Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
 
 def uniform_position(key: Key, *, x: Range, y: Range, z: Range) -> Float[Array, "3"]:
     """A point drawn uniformly from a box in the robot's root frame [m]."""
     low, high = jnp.array([x, y, z]).T
     return jax.random.uniform(key, (3,), minval=low, maxval=high)
+
+
+def pose(key: Key, *, x: Range, y: Range, z: Range, quat: tuple[float, float, float, float]) -> Pose:
+    """A point drawn uniformly from a box in the robot's root frame [m], with one orientation (wxyz)."""
+    return uniform_position(key, x=x, y=y, z=z), jnp.array(quat, jnp.float32)
+
+
+def circle(position: Float[Array, "3"], time: Float[Array, ""], *, radius: float, frequency: float) -> Float[Array, "3"]:
+    """A path: a vertical circle about ``position`` in the world's yz plane [m], ``frequency`` turns a second; a zero of both stays."""
+    phase = 2 * jnp.pi * frequency * time
+    return position + radius * jnp.stack([jnp.zeros_like(phase), jnp.cos(phase), jnp.sin(phase)])

@@ -6,6 +6,11 @@ from jaxtyping import Array, Float
 from mjx_nero.types import View
 
 
+def joint_pos(view: View) -> Float[Array, " nj"]:
+    """Joint positions [rad, m]."""
+    return view.joint_pos
+
+
 def joint_pos_rel(view: View) -> Float[Array, " nj"]:
     """Joint positions relative to home [rad, m]."""
     return view.joint_pos - view.default_joint_pos
@@ -59,3 +64,18 @@ def object_velocity(view: View) -> Float[Array, "6"]:
 def object_orientation(view: View) -> Float[Array, "4"]:
     """Orientation of the object, wxyz."""
     return view.object_quat_w
+
+
+def ee_orientation(view: View) -> Float[Array, "4"]:
+    """Orientation of the end effector, wxyz."""
+    return view.ee_quat_w
+
+
+def goal_position(view: View) -> Float[Array, "3"]:
+    """Where the goal is now, in the robot's root frame [m]."""
+    return view.goal_pos_w - view.root_pos_w
+
+
+def goal_orientation(view: View) -> Float[Array, "4"]:
+    """Orientation of the goal, wxyz."""
+    return view.goal_quat_w

@@ -42,6 +42,16 @@ def object_goal_distance(view: View, *, std: float, minimal_height: float) -> Fl
     return object_is_lifted(view, minimal_height=minimal_height) * (1.0 - jnp.tanh(_goal_distance(view) / std))
 
 
+def goal_distance(view: View, *, std: float) -> Float[Array, ""]:
+    """1 - tanh(distance of the object to the goal / std)."""
+    return 1.0 - jnp.tanh(_goal_distance(view) / std)
+
+
+def ee_goal_distance(view: View, *, std: float) -> Float[Array, ""]:
+    """1 - tanh(distance of the end effector to the goal / std)."""
+    return 1.0 - jnp.tanh(jnp.linalg.norm(view.goal_pos_w - view.ee_pos_w) / std)
+
+
 def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
     """1 while the object is held (see ``held``)."""
     return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius).astype(jnp.float32)

@@ -2,19 +2,61 @@
 
 import dataclasses
 
-from mjx_nero.env import ActionCfg, EnvCfg
+from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
 from mjx_nero.mdp import commands, curriculum, events, observations, rewards, terminations
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg
 from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 
-# The object's centre above this is off the table [m]; a cube at rest has its centre at 0.015.
-LIFTED = {"minimal_height": 0.025}
-# ... and held, if it is this near to the grasp point [m].
-HELD = {**LIFTED, "grasp_radius": 0.04}
+Range = tuple[float, float]
 
 
-def isaac(robot: RobotCfg) -> EnvCfg:
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What differs from robot to robot: the cube, where it lies and where it has to go [m], robot root frame.
+
+    Attributes:
+        cube: ``x`` and ``y`` of the cube at the start of an episode.
+        goal: ``x``, ``y`` and ``z`` of the commanded point.
+    """
+
+    scene: SceneCfg
+    cube: tuple[Range, Range]
+    goal: tuple[Range, Range, Range]
+
+    @property
+    def lifted(self) -> dict[str, float]:
+        """The object's centre above this is off the table [m]: 1 cm above a cube at rest."""
+        return {"minimal_height": self.scene.cube_edge / 2 + 0.01}
+
+    @property
+    def held(self) -> dict[str, float]:
+        """... and held, if it is this near to the grasp point [m]."""
+        return {**self.lifted, "grasp_radius": 0.04}
+
+
+# The Isaac Lab recipe's numbers.
+NERO_WORK = Work(
+    scene=SceneCfg(cube_edge=0.03, cube_mass=0.03),
+    cube=((0.3, 0.4), (-0.1, 0.2)),
+    goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
+)
+# The tutorial's cube in front of the arm, which reaches 0.9 m.
+COBOTTA_WORK = Work(
+    scene=SceneCfg(
+        cube_edge=0.0515,
+        cube_mass=0.1,
+        table_center=(0.35, 0.0),
+        table_size=(1.1, 1.4),
+        look_at=(0.25, 0.0, 0.35),
+        view_distance=1.9,
+    ),
+    cube=((0.4, 0.6), (-0.2, 0.2)),
+    goal=((0.4, 0.6), (-0.2, 0.2), (0.2, 0.4)),
+)
+
+
+def isaac(robot: RobotCfg, work: Work) -> EnvCfg:
     """The Isaac Lab recipe's MDP, its numbers word for word.
 
     Kept to compare with. Its lifting reward is open to a shortcut: a cube knocked into the air scores like a held one.
@@ -24,10 +66,12 @@ def isaac(robot: RobotCfg) -> EnvCfg:
         robot=robot,
         episode_length_s=5.0,
         action=ActionCfg(scale=0.5),
-        object_start=(0.2, 0.0, 0.015),
+        scene=work.scene,
+        object_start=(0.0, 0.0, work.scene.cube_edge / 2),
+        success=SuccessCfg(**work.held),
         command=CommandTerm(
             commands.uniform_position,
-            params={"x": (0.3, 0.35), "y": (-0.2, 0.2), "z": (0.2, 0.35)},
+            params=dict(zip("xyz", work.goal, strict=True)),
             resample_s=5.0,
         ),
         observations={
@@ -42,15 +86,15 @@ def isaac(robot: RobotCfg) -> EnvCfg:
         events={
             "reset_object_position": Term(
                 events.object_position_uniform,
-                params={"x": (0.1, 0.2), "y": (-0.1, 0.2), "z": (0.0, 0.0)},
+                params={"x": work.cube[0], "y": work.cube[1], "z": (0.0, 0.0)},
             ),
         },
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.05}),
-            "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=LIFTED),
-            "object_goal_tracking": RewardTerm(rewards.object_goal_distance, weight=16.0, params={"std": 0.3, **LIFTED}),
+            "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=work.lifted),
+            "object_goal_tracking": RewardTerm(rewards.object_goal_distance, weight=16.0, params={"std": 0.3, **work.lifted}),
             "object_goal_tracking_fine_grained": RewardTerm(
-                rewards.object_goal_distance, weight=5.0, params={"std": 0.05, **LIFTED}
+                rewards.object_goal_distance, weight=5.0, params={"std": 0.05, **work.lifted}
             ),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
@@ -65,15 +109,15 @@ def isaac(robot: RobotCfg) -> EnvCfg:
             # The physics' table has no edge to fall from, so leaving the drawn one counts as the fall.
             "object_off_table": DoneTerm(
                 terminations.object_off_table,
-                params={"center": SceneCfg().table_center, "size": SceneCfg().table_size},
+                params={"center": work.scene.table_center, "size": work.scene.table_size},
             ),
         },
     )
 
 
-def default(robot: RobotCfg) -> EnvCfg:
+def default(robot: RobotCfg, work: Work) -> EnvCfg:
     """The preset that learns to grasp: height and tracking count only for a held cube, and relative positions are observed."""
-    recipe = isaac(robot)
+    recipe, held = isaac(robot, work), work.held
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
@@ -97,16 +141,13 @@ def default(robot: RobotCfg) -> EnvCfg:
         },
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
-            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=HELD),
-            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **HELD}),
-            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **HELD}),
-            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **HELD}),
-            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **HELD}),
+            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
+            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
+            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
         curriculum={},
     )
-
-
-PRESETS = {"default": default, "isaac": isaac}

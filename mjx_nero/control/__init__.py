@@ -1,0 +1,1 @@
+"""Classical control: pure functions for one robot, vmapped for many."""

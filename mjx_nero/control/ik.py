@@ -1,0 +1,242 @@
+"""Inverse kinematics: damped least squares from a warm start, then from random starts; pure JAX, one pose or thousands."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from mjx_nero import math, scene
+from mjx_nero.kinematics import Chain
+from mjx_nero.robots import RobotCfg
+from mjx_nero.types import Key
+
+_FAR = 1e3  # above any distance between two configurations
+_MIN_DAMPING = 1e-6  # keeps the factors of a singular matrix real in float32
+
+
+@dataclasses.dataclass(frozen=True)
+class IkCfg:
+    """Tolerances and budget.
+
+    Attributes:
+        position_tolerance: [m]; a descent ends where both tolerances are met, so tighten them for more than that.
+        orientation_tolerance: angle between the frames [rad].
+        orientation_weight: a radian counts as so many metres [m/rad].
+        damping: of a step, as a share of the squared residual: large steps far away, quadratic convergence close by.
+        max_distance: a target further away than this pulls no harder [m].
+        iterations: most steps of one descent.
+        restarts: rounds of descents from random starts, if the warm start fails; each ends as soon as all poses are solved.
+        starts: descents in a round, or the number of poses where that is larger. The unsolved poses share them evenly.
+        candidates: random configurations from which each start is chosen: the one closest to the target.
+        spread: share of the joint ranges, about their centres, that candidates are drawn from. Starts near a limit often get
+            stuck there.
+    """
+
+    position_tolerance: float = 1e-3
+    orientation_tolerance: float = 1e-2
+    orientation_weight: float = 0.3
+    damping: float = 0.1
+    max_distance: float = 1.0
+    iterations: int = 12
+    restarts: int = 8
+    starts: int = 8
+    candidates: int = 8
+    spread: float = 0.8
+
+
+@struct.dataclass
+class Solution:
+    """What was found for one pose. Where ``success`` is False, ``q`` is the closest that was found, still within the limits."""
+
+    q: Float[Array, "*b nj"]  # [rad or m]
+    success: Bool[Array, "*b"]  # both tolerances met
+    position_error: Float[Array, "*b"]  # [m]
+    orientation_error: Float[Array, "*b"]  # [rad]
+
+
+class InverseKinematics:
+    """Joint positions that bring a frame of a robot to a pose in the world. Collisions are not looked at.
+
+    Levenberg-Marquardt steps with the geometric Jacobian, damped in proportion to the squared residual (Sugihara, "Solvability-
+    unconcerned inverse kinematics by the Levenberg-Marquardt method", 2011) and projected onto the joint limits: a joint that
+    a step would push through its limit stays there and the others do the work. Turns of more than 2 pi are undone where the
+    limits allow it, towards ``q0``.
+
+    The methods are pure; compile them with ``jax.jit``. A target that is not finite, or a zero quaternion, gives ``q0`` (within
+    the limits), no success and infinite errors.
+
+    Args:
+        robot: its arm is what moves.
+        frame: site or body to place; the grasp point unless given.
+        cfg: tolerances and budget.
+
+    Attributes:
+        chain: poses and Jacobians of ``frame`` as a function of the arm joints.
+
+    Raises:
+        KeyError: the robot has no such frame.
+    """
+
+    def __init__(self, robot: RobotCfg, frame: str | None = None, cfg: IkCfg = IkCfg()):
+        model = scene.robot_model(robot)
+        self.cfg = cfg
+        self.chain = Chain(model, robot.arm.joints, [frame or robot.ee_site])
+        self._hinge = np.array([model.joint(j).type[0] == mujoco.mjtJoint.mjJNT_HINGE for j in robot.arm.joints])
+        # Where candidates come from; a joint without limits gets one turn, or a metre each way.
+        unlimited = np.where(self._hinge, np.pi, 1.0).astype(np.float32)
+        lower = np.where(np.isfinite(self.chain.lower), self.chain.lower, -unlimited)
+        upper = np.where(np.isfinite(self.chain.upper), self.chain.upper, unlimited)
+        self._center, self._half = (lower + upper) / 2, cfg.spread * (upper - lower) / 2
+
+    def solve(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"], key: Key) -> Solution:
+        """One pose, from ``q0`` first, then from random starts; of several solutions in a round the one closest to ``q0``.
+
+        Args:
+            pos: position of the frame in the world [m].
+            quat: its orientation, wxyz.
+            q0: warm start [rad or m].
+            key: of the random starts; the result is a function of the arguments.
+        """
+        return jax.tree.map(lambda x: x[0], self.solve_batch(pos[None], quat[None], q0[None], key))
+
+    def local(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"]) -> Solution:
+        """One pose from ``q0`` alone: for control loops, where the target is near and a jump to another solution is not wanted."""
+        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], None))
+
+    def solve_batch(
+        self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key
+    ) -> Solution:
+        """``solve`` for many poses at once. Quicker than ``vmap``: the starts go to the poses that are still unsolved."""
+        return self._solve(pos, quat, q0, key)
+
+    def _solve(self, pos: Array, quat: Array, q0: Array, key: Key | None) -> Solution:
+        # On a GPU the default precision of products is too coarse for kinematics.
+        with jax.default_matmul_precision("highest"):
+            norm = jnp.linalg.norm(quat, axis=-1)
+            valid = jnp.all(jnp.isfinite(pos), axis=-1) & jnp.isfinite(norm) & (norm > 0)
+            pos = jnp.where(valid[:, None], pos, 0.0)
+            quat = jnp.where(valid[:, None], quat / norm[:, None], jnp.array([1.0, 0.0, 0.0, 0.0]))
+            q0 = self._within(jnp.where(jnp.isfinite(q0), q0, self._center))
+            return self._search(pos, quat, q0, valid, key)
+
+    def _search(
+        self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], valid: Bool[Array, " b"], key: Key | None
+    ) -> Solution:
+        b = len(pos)
+        nothing = Solution(q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
+        found = self._descents(q0, jnp.arange(b), pos, quat, q0, ~valid, nothing)
+
+        def unsolved(carry):
+            restart, found = carry
+            return (restart < self.cfg.restarts) & ~jnp.all(found.success | ~valid)
+
+        def again(carry):
+            restart, found = carry
+            solved = found.success | ~valid
+            left = jnp.argsort(solved)  # the unsolved poses come first
+            target = left[jnp.arange(max(b, self.cfg.starts)) % jnp.maximum(jnp.sum(~solved), 1)]
+            start = self._starts(jax.random.fold_in(key, restart), pos[target], quat[target])
+            return restart + 1, self._descents(start, target, pos, quat, q0, solved, found)
+
+        if key is not None:
+            _, found = jax.lax.while_loop(unsolved, again, (0, found))
+        return jax.tree.map(lambda x, none: jnp.where(valid.reshape(b, *[1] * (x.ndim - 1)), x, none), found, nothing)
+
+    def _starts(self, key: Key, pos: Float[Array, "n 3"], quat: Float[Array, "n 4"]) -> Float[Array, "n nj"]:
+        shape = (len(pos), self.cfg.candidates, len(self._center))
+        q = self._center + self._half * jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+        distance = jax.vmap(jax.vmap(self._distance, (0, None, None)))(q, pos, quat)
+        return q[jnp.arange(len(pos)), jnp.argmin(distance, axis=1)]
+
+    def _descents(
+        self,
+        start: Float[Array, "n nj"],
+        target: Int[Array, " n"],  # the pose that each start is for
+        pos: Float[Array, "b 3"],
+        quat: Float[Array, "b 4"],
+        q0: Float[Array, "b nj"],
+        solved: Bool[Array, " b"],
+        found: Solution,
+    ) -> Solution:
+        """Runs all descents until every pose is solved or the budget is spent; keeps what is better than ``found``."""
+        def going(carry):
+            i, trial, _ = carry
+            return (i <= self.cfg.iterations) & ~jnp.all(solved.at[target].max(trial.success))
+
+        def step(carry):
+            i, trial, q = carry
+            trial, following = jax.vmap(self._step)(q, pos[target], quat[target])
+            return i + 1, trial, jnp.where(trial.success[:, None], q, following)
+
+        n = len(target)
+        trial = Solution(start, jnp.zeros(n, bool), jnp.full(n, jnp.inf), jnp.full(n, jnp.inf))
+        _, trial, _ = jax.lax.while_loop(going, step, (0, trial, start))
+        # The same pose, with each joint as close to the warm start as whole turns bring it
+        q = trial.q - 2 * jnp.pi * self._hinge * jnp.round((trial.q - q0[target]) / (2 * jnp.pi))
+        trial = trial.replace(q=jnp.where(q == self._within(q), q, trial.q))
+
+        rating, before = self._rating(trial, q0[target]), self._rating(found, q0)
+        best = before.at[target].min(rating)[target]
+        at = jnp.where((rating == best) & (rating < before[target]), target, len(pos))  # beyond the end: dropped
+        return jax.tree.map(lambda old, x: old.at[at].set(x, mode="drop"), found, trial)
+
+    def _rating(self, found: Solution, q0: Float[Array, "n nj"]) -> Float[Array, " n"]:
+        """The less, the better: successes by their distance from the warm start, then failures by their error."""
+        error = found.position_error + self.cfg.orientation_weight * found.orientation_error
+        return jnp.where(found.success, jnp.linalg.norm(found.q - q0, axis=1), _FAR + error)
+
+    def _step(
+        self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]
+    ) -> tuple[Solution, Float[Array, " nj"]]:
+        """How far ``q`` is from the target, and the configuration after one step."""
+        at, turn, jacobian = (x[0] for x in self.chain.jacobians(q))
+        linear, angular = _residual(at, turn, pos, quat)
+        position, orientation = jnp.linalg.norm(linear), jnp.linalg.norm(angular)
+        met = (position <= self.cfg.position_tolerance) & (orientation <= self.cfg.orientation_tolerance)
+        weight = self.cfg.orientation_weight
+        error = jnp.concatenate([linear * jnp.minimum(1.0, self.cfg.max_distance / jnp.maximum(position, 1e-6)), weight * angular])
+        jacobian = jacobian * jnp.array([1.0, 1.0, 1.0, weight, weight, weight])[:, None]
+        uphill = error @ jacobian
+        held = ((q <= self.chain.lower) & (uphill < 0)) | ((q >= self.chain.upper) & (uphill > 0))
+        jacobian = jnp.where(held, 0.0, jacobian)
+        normal = jacobian @ jacobian.T + (self.cfg.damping * (error @ error) + _MIN_DAMPING) * jnp.eye(6)
+        return Solution(q, met, position, orientation), self._within(q + _solve_spd(normal, error) @ jacobian)
+
+    def _distance(self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]) -> Float[Array, ""]:
+        at, turn = (x[0] for x in self.chain.poses(q))
+        linear, angular = _residual(at, turn, pos, quat)
+        return jnp.linalg.norm(linear) + self.cfg.orientation_weight * jnp.linalg.norm(angular)
+
+    def _within(self, q: Float[Array, "*n nj"]) -> Float[Array, "*n nj"]:
+        return jnp.clip(q, self.chain.lower, self.chain.upper)
+
+
+def _residual(
+    at: Float[Array, "3"], turn: Float[Array, "4"], pos: Float[Array, "3"], quat: Float[Array, "4"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """From a pose to its target: the way [m] and the rotation vector [rad], in the world."""
+    return pos - at, math.quat_log(math.quat_mul(quat, math.quat_conj(turn)))
+
+
+def _solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solves ``a x = b`` for a small positive definite matrix by Cholesky's factors.
+
+    Unrolled: for thousands of tiny systems side by side, plain arithmetic that the compiler fuses is many times quicker than a
+    batched call of a linear algebra library.
+    """
+    n = len(b)
+    low: list[list[Array]] = [[] for _ in range(n)]
+    y: list[Array] = []
+    for i in range(n):
+        for j in range(i):
+            low[i].append((a[i, j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
+        low[i].append(jnp.sqrt(a[i, i] - sum(x * x for x in low[i])))
+        y.append((b[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i])
+    x: list[Array] = [b[0]] * n
+    for i in reversed(range(n)):
+        x[i] = (y[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
+    return jnp.stack(x)

@@ -1,0 +1,394 @@
+"""RMPflow: reactive motion generation by a tree of Riemannian motion policies.
+
+A leaf of the tree sees the arm through a task map x = phi(q), and asks for an acceleration a there, with a metric M that says how
+much each direction matters. They are summed at the root: (sum J^T M J) qdd = sum J^T M (a - c), with the curvature c = Jdot qd.
+
+Algebra: Cheng et al. 2018 (arXiv 1811.07049). Leaves and their parameters: Isaac Sim 5.x, "RMPflow" concept and tuning pages;
+where these leave something open, the docstring says what is assumed. All is pure, for one robot; ``jax.vmap`` makes it many.
+
+A reactive policy has no plan: a target on the other side of the base, or behind a wall, can leave the arm stuck on the way.
+"""
+
+import dataclasses
+import math
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from mjx_nero import scene
+from mjx_nero.control import rmpflow_config as cfg
+from mjx_nero.kinematics import Chain
+from mjx_nero.math import rotate, rotation_matrix
+from mjx_nero.robots import ASSETS, RobotCfg
+from mjx_nero.types import UserError
+
+
+@struct.dataclass
+class Obstacles:
+    """Capsules in the world [m]; a sphere is a capsule whose ends coincide. Taken to stand still."""
+
+    pt1: Float[Array, "n 3"]
+    pt2: Float[Array, "n 3"]
+    radius: Float[Array, " n"]
+
+    @classmethod
+    def none(cls) -> "Obstacles":
+        """Nothing in the way; costs less than obstacles far off."""
+        return cls.spheres(np.zeros((0, 3)), 0.0)
+
+    @classmethod
+    def spheres(cls, center, radius) -> "Obstacles":
+        """Spheres at ``center`` [n, 3] with ``radius`` [n], or one radius for all."""
+        return cls.cylinders(center, center, radius)
+
+    @classmethod
+    def cylinders(cls, pt1, pt2, radius) -> "Obstacles":
+        """Cylinders round the lines from ``pt1`` to ``pt2`` [n, 3], with round caps beyond; ``radius`` [n], or one for all."""
+        pt1, pt2 = jnp.asarray(pt1, jnp.float32), jnp.asarray(pt2, jnp.float32)
+        return cls(pt1, pt2, jnp.broadcast_to(jnp.asarray(radius, jnp.float32), pt1.shape[:1]))
+
+
+@struct.dataclass
+class Target:
+    """Where the controlled frame is to go, in the world. What is None is left free.
+
+    The velocity (None: at rest) is an extension of ours: the leaves damp the motion relative to it. Damped against the world, as
+    the original has it, the frame lags behind a moving target (at 0.157 m/s on a circle by 50 mm instead of 1 mm).
+
+    A target out of reach is approached as far as the arm goes. Within some 0.2 m of it the orientation matters more than the last
+    bit of the way, and is kept; leave it free to come as near as can be.
+    """
+
+    position: Float[Array, "3"] | None = None  # [m]
+    orientation: Float[Array, "4"] | None = None  # wxyz
+    velocity: Float[Array, "3"] | None = None  # [m/s]
+
+
+class Rmp(NamedTuple):
+    """A policy in natural form: force f = M a, and metric M. Scalar and diagonal metrics have the force's shape."""
+
+    force: Array
+    metric: Array
+
+
+# Leaves, under the names of their groups in the parameter file, whose keys they read.
+
+
+def cspace_target_rmp(p: cfg.CspaceTargetCfg, q, qd, default_q) -> Rmp:
+    """Pull to the posture ``default_q``: constant from afar, linear within the threshold; and the joints' inertia. All [nj]."""
+    error = default_q - q
+    pull = error * jnp.minimum(1.0, p.robust_position_term_thresh / _length(error))
+    accel = p.position_gain * pull - p.damping_gain * qd
+    return Rmp(p.metric_scalar * accel, jnp.full_like(q, p.metric_scalar + p.inertia))
+
+
+def joint_limit_rmp(p: cfg.JointLimitCfg, x, xd) -> Rmp:
+    """Push away from a limit at distance ``x``, in parts of the joint's range; a damper that only acts on the way there."""
+    x = jnp.maximum(x, 0.0)
+    accel = p.accel_potential_gain / ((x / p.accel_potential_exploder_length_scale) ** 2 + p.accel_potential_exploder_eps)
+    accel = accel - p.accel_damper_gain * xd
+    gate = 1.0 - jax.nn.sigmoid(xd / p.metric_velocity_gate_length_scale)
+    metric = gate * p.metric_scalar / (x / p.metric_length_scale + p.metric_exploder_eps)
+    return Rmp(metric * accel, metric)
+
+
+def joint_velocity_cap_rmp(p: cfg.JointVelocityCapCfg, qd) -> Rmp:
+    """Brake on a joint within ``velocity_damping_region`` of the top speed, infinitely heavy at the top speed."""
+    region = p.velocity_damping_region
+    excess = jnp.abs(qd) - (p.max_velocity - region)
+    accel = -p.damping_gain * jnp.sign(qd) * excess
+    share = jnp.minimum(excess / region, 1.0 - 1e-4)
+    metric = jnp.where(excess < 0, 0.0, p.metric_weight / (1.0 - share**2))
+    return Rmp(metric * accel, metric)
+
+
+def target_rmp(p: cfg.TargetCfg, error: Float[Array, "3"], vel: Float[Array, "3"]) -> Rmp:
+    """Pull along ``error`` = target - position [m], damping of ``vel``, the velocity relative to the target [m/s].
+
+    From afar mainly the direction of the error matters, close to the target all directions, and close by more.
+    """
+    length = _length(error)
+    direction = error / length
+    accel = p.accel_p_gain * error / (length + p.accel_norm_eps) - p.accel_d_gain * vel
+    near = (1.0 - p.min_metric_alpha) * _bell(length, p.metric_alpha_length_scale) + p.min_metric_alpha
+    metric = near * p.max_metric_scalar * jnp.eye(3) + (1.0 - near) * p.min_metric_scalar * jnp.outer(direction, direction)
+    return _weighted(metric * _boost(p, length), accel)
+
+
+def axis_target_rmp(p: cfg.AxisTargetCfg, error: Float[Array, "3"], vel: Float[Array, "3"], distance) -> Rmp:
+    """Pull of one axis (a unit vector) along ``error`` = target - axis; heavier as the ``distance`` [m] to the target shrinks."""
+    metric = p.metric_scalar * (1.0 if distance is None else _boost(p, distance)) * jnp.eye(3)
+    return _weighted(metric, p.accel_p_gain * error - p.accel_d_gain * vel)
+
+
+def damping_rmp(p: cfg.DampingCfg, xd) -> Rmp:
+    """Quadratic drag and inertia on the distance to the target, which changes by ``xd`` [m/s]."""
+    metric = p.metric_scalar * jnp.abs(xd)
+    return Rmp(-metric * p.accel_d_gain * jnp.abs(xd) * xd, metric + p.inertia)
+
+
+def collision_rmp(p: cfg.CollisionCfg, x, xd) -> Rmp:
+    """Push away from a surface at distance ``x`` [m]; metric and damper only count on the way there."""
+    x = jnp.maximum(x, 0.0)
+    gate = 1.0 - jax.nn.sigmoid(xd / p.damping_velocity_gate_length_scale)
+    damper = p.damping_gain * gate * xd / (x / p.damping_std_dev + p.damping_robustness_eps)
+    accel = p.repulsion_gain * jnp.exp(-x / p.repulsion_std_dev) - damper
+    nearness = jnp.maximum(1.0 - x / p.metric_modulation_radius, 0.0) ** 2
+    metric = gate * nearness * p.metric_scalar / (x / p.metric_exploder_std_dev + p.metric_exploder_eps)
+    return Rmp(metric * accel, metric)
+
+
+# The tree.
+
+
+def along(direction: Float[Array, "*n 3"], curvature: Float[Array, "*n"], leaf: Rmp) -> Rmp:
+    """Pulls scalar leaves back to points, whose coordinate they see changes along ``direction``, its gradient.
+
+    ``curvature``: the coordinate's second derivative in time while the point moves straight on.
+    """
+    outer = direction[..., :, None] * direction[..., None, :]
+    return Rmp((leaf.force - leaf.metric * curvature)[..., None] * direction, leaf.metric[..., None, None] * outer)
+
+
+def clearance(point, vel, pt1, pt2) -> tuple[Array, Array, Array, Array]:
+    """Distance of a point to a segment [m], its gradient, its rate, its second derivative while the point moves straight on."""
+    axis = pt2 - pt1
+    square = jnp.maximum(axis @ axis, 1e-12)
+    share = jnp.clip((point - pt1) @ axis / square, 0.0, 1.0)
+    offset = point - pt1 - share * axis
+    distance = _length(offset)
+    direction = offset / distance
+    rate = direction @ vel
+    slide = jnp.where((share > 0) & (share < 1), (axis @ vel) ** 2 / square, 0.0)  # along a cylinder nothing turns
+    return distance, direction, rate, jnp.maximum(vel @ vel - rate**2 - slide, 0.0) / distance
+
+
+def pull_back(jac: Float[Array, "n 3 nj"], curvature: Float[Array, "n 3"], node: Rmp) -> Rmp:
+    """The sum at the root of policies on ``n`` points; ``curvature`` = Jdot qd."""
+    weighted = jnp.einsum("nab,nbj->naj", node.metric, jac, precision="highest")  # a GPU's default would round to 10 bits
+    force = node.force - jnp.sum(node.metric * curvature[:, None, :], axis=-1)
+    return Rmp(jnp.sum(jac * force[..., None], axis=(0, 1)), jnp.einsum("nai,naj->ij", jac, weighted, precision="highest"))
+
+
+def resolve(p: cfg.ResolveCfg, root: Rmp) -> Float[Array, " nj"]:
+    """The acceleration that the root asks for [rad/s^2], scaled down to the largest norm allowed (assumed: no source says how).
+
+    Cholesky's decomposition, unrolled: for matrices this small, GPU libraries take longer to start than to solve.
+    """
+    metric, n = root.metric, root.force.shape[0]
+    # As large as the metric's rounding: keeps the root solvable where no leaf cares.
+    ridge = 1e-6 + float(jnp.finfo(metric.dtype).eps) * jnp.trace(metric)
+    low = [[metric[i, j] for j in range(i + 1)] for i in range(n)]
+    x = [root.force[i] for i in range(n)]
+    for j in range(n):
+        low[j][j] = jnp.sqrt(low[j][j] + ridge - sum(low[j][k] ** 2 for k in range(j)))
+        for i in range(j + 1, n):
+            low[i][j] = (low[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j]
+    for i in range(n):
+        x[i] = (x[i] - sum(low[i][k] * x[k] for k in range(i))) / low[i][i]
+    for i in reversed(range(n)):
+        x[i] = (x[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
+    accel = jnp.stack(x)
+    return accel * jnp.minimum(1.0, p.max_acceleration_norm / _length(accel))
+
+
+class RmpFlow:
+    """The policy of one robot: pure functions of its joints, a target and obstacles.
+
+    Args:
+        robot: its arm joints are controlled; all others stay at the model's zero.
+        frame: body or site to steer; None: the robot's grasp point.
+        descriptor, config: YAML files; None: the robot's own, in ``assets/<robot>/rmpflow``.
+        maximum_substep_size: longest step of the integration [s].
+
+    Attributes:
+        joints: names, in the order of ``q``.
+        default_q: [nj] preferred posture [rad].
+        chain: kinematics; its first frame is the one to steer.
+        config: the parameters.
+
+    Raises:
+        UserError: a file cannot be read or does not fit the robot, there is no such frame, or the step is not above 0.
+    """
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        frame: str | None = None,
+        descriptor: pathlib.Path | None = None,
+        config: pathlib.Path | None = None,
+        maximum_substep_size: float = 0.00334,
+    ):
+        if not maximum_substep_size > 0:
+            raise UserError(f"maximum_substep_size takes a time above 0 s, got {maximum_substep_size!r}")
+        frame, folder = frame or robot.ee_site, ASSETS / robot.name / "rmpflow"
+        descriptor, config = descriptor or folder / "robot_descriptor.yaml", config or folder / "rmpflow_common.yaml"
+        arm, self.config = cfg.load_pair(descriptor, config, robot.arm.joints)
+        self.joints, self.default_q = arm.cspace, np.array(arm.default_q, np.float32)
+        self._max_substep = maximum_substep_size
+
+        model = scene.robot_model(robot)
+        frames = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(model.nbody)]
+        if frame not in frames:
+            raise UserError(f"{robot.name}: {cfg.unknown('frame', frame, frames)}")
+        if arm.root_link not in ("world", robot.base_link):
+            raise UserError(f"{descriptor}: root_link: {cfg.unknown('root', arm.root_link, ('world', robot.base_link))}")
+
+        # Spheres: those of the controllers, which also the base repels, then the descriptor's, which only obstacles do.
+        controllers = self.config.body_collision_controllers
+        spheres = [(c.name, (0.0, 0.0, 0.0), c.radius) for c in controllers]
+        places = [f"{config}: body_collision_controllers[{i}].name" for i in range(len(controllers))]
+        for i, entry in enumerate(arm.collision_spheres):
+            for link, own in entry.items():
+                spheres += [(link, s.center, s.radius) for s in own]
+                places += [f"{descriptor}: collision_spheres[{i}]"] * len(own)
+        for (name, _, _), place in zip(spheres, places, strict=True):
+            if name not in frames:
+                raise UserError(f"{place}: {cfg.unknown('frame', name, frames)}")
+        self._controllers = len(controllers)
+        self._radius = np.array([radius for _, _, radius in spheres], np.float32)
+
+        # Nodes of the tree, each a vector in a frame: the steered frame's origin, its three axes, the spheres' centres.
+        used = list(dict.fromkeys([frame, *(name for name, _, _ in spheres)]))
+        self.chain = Chain(model, self.joints, used)
+        self._frame = np.array([0] * 4 + [used.index(name) for name, _, _ in spheres])
+        self._vector = np.array([(0, 0, 0), *np.eye(3), *(center for _, center, _ in spheres)], np.float32)
+        self._is_point = np.array([1.0] + [0.0] * 3 + [1.0] * len(spheres), np.float32)
+
+        base, cylinders = model.body(robot.base_link), self.config.body_cylinders
+        ends = np.array([(c.pt1, c.pt2) for c in cylinders]).reshape(-1, 2, 3)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, base.quat)
+        self._cylinders = (base.pos + ends @ turn.reshape(3, 3).T).astype(np.float32)
+        self._cylinder_radius = np.array([c.radius for c in cylinders], np.float32)
+
+        buffers = np.array(self.config.joint_limit_buffers, np.float32)
+        lower, upper = self.chain.lower + buffers, self.chain.upper - buffers
+        for name, low, high in zip(self.joints, lower, upper, strict=True):
+            if low >= high:
+                raise UserError(f"{config}: joint_limit_buffers leave {name} no range")
+        limited = np.isfinite(upper - lower)
+        self._limits = np.where(limited, [lower, upper], 0.0).astype(np.float32)
+        self._per_range = np.where(limited, 1.0 / (upper - lower), 0.0)  # 0 switches an unlimited joint's leaves off
+
+    def acceleration(
+        self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles
+    ) -> Float[Array, " nj"]:
+        """The policy: joint accelerations [rad/s^2] at positions [rad] and velocities [rad/s]."""
+        # Without obstacles the spheres beyond the controllers' meet nothing.
+        count = 4 + (len(self._radius) if len(obstacles.radius) else self._controllers)
+        x, xd, curvature, jac = self._nodes(q, qd, count)
+        frame = self._frame_leaves(target, x[:4], xd[:4])
+        spheres = self._sphere_leaves(obstacles, x[4:], xd[4:])
+        tasks = pull_back(jac, curvature, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), frame, spheres))
+        joints = self._joint_leaves(q, qd)
+        return resolve(self.config.canonical_resolve, Rmp(tasks.force + joints.force, tasks.metric + jnp.diag(joints.metric)))
+
+    def step(
+        self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles, dt: float
+    ) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
+        """Positions [rad] and velocities [rad/s] ``dt`` later, by explicit Euler substeps: set-points for the drives.
+
+        Args:
+            dt: control step [s]; a Python number. A target with a velocity moves on meanwhile.
+        """
+        n = max(1, math.ceil(dt / self._max_substep - 1e-6))
+        h, cap = dt / n, self.config.rmp_params.joint_velocity_cap_rmp.max_velocity
+
+        def substep(i, state):
+            q, qd = state
+            goal = target
+            if target.position is not None and target.velocity is not None:
+                goal = dataclasses.replace(target, position=target.position + i * h * target.velocity)
+            accel = self.acceleration(q, qd, goal, obstacles)
+            # The cap's leaf is one of many: what a substep still carries beyond it is cut off.
+            return q + h * qd, jnp.clip(qd + h * accel, -cap, cap)
+
+        return jax.lax.fori_loop(0, n, substep, (q, qd))
+
+    def spheres(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+        """Centres in the world and radii of the spheres that keep clear of obstacles [m]; the controllers' first."""
+        return self._nodes(q, jnp.zeros_like(q), len(self._frame))[0][4:], jnp.asarray(self._radius)
+
+    def _nodes(self, q, qd, count: int) -> tuple[Array, Array, Array, Array]:
+        """Of the first ``count`` nodes: values and velocities [n, 3], Jdot qd [n, 3], J [n, 3, nj]."""
+        frame, vector, is_point = (
+            self._frame[:count],
+            jnp.asarray(self._vector[:count]),
+            jnp.asarray(self._is_point[:count, None]),
+        )
+
+        def moves(q):
+            pos, quat, jac = self.chain.jacobians(q)
+            arm = jax.vmap(rotate)(quat[frame], vector)
+            jac = is_point[..., None] * jac[frame, :3] + jnp.cross(jac[frame, 3:], arm[..., None], axis=1)
+            return jnp.sum(jac * qd, axis=-1), (is_point * pos[frame] + arm, jac)
+
+        xd, curvature, (x, jac) = jax.jvp(moves, (q,), (qd,), has_aux=True)
+        return x, xd, curvature, jac
+
+    def _frame_leaves(self, target: Target, x: Float[Array, "4 3"], xd: Float[Array, "4 3"]) -> Rmp:
+        """On the steered frame's origin and its three axes."""
+        p, distance = self.config.rmp_params, None
+        nodes = [Rmp(jnp.zeros((1, 3)), jnp.zeros((1, 3, 3))), Rmp(jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)))]
+        if target.position is not None:
+            error, vel = target.position - x[0], xd[0] if target.velocity is None else xd[0] - target.velocity
+            distance = _length(error)
+            away = -error / distance
+            rate = away @ vel
+            # Closer than a millimetre the line to the target has no direction worth the name.
+            bend = jnp.maximum(vel @ vel - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
+            pull, drag = target_rmp(p.target_rmp, error, vel), along(away, bend, damping_rmp(p.damping_rmp, rate))
+            nodes[0] = jax.tree.map(lambda a, b: (a + b)[None], pull, drag)
+        if target.orientation is not None:
+            errors = rotation_matrix(target.orientation).T - x[1:]
+            nodes[1] = jax.vmap(lambda e, v: axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
+
+    def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> Rmp:
+        """On the spheres' centres: all of them with all obstacles, the controllers' with the base as well."""
+        pt1 = jnp.concatenate([self._cylinders[:, 0], obstacles.pt1])
+        pt2 = jnp.concatenate([self._cylinders[:, 1], obstacles.pt2])
+        radius = jnp.concatenate([self._cylinder_radius, obstacles.radius])
+        pairs = jax.vmap(jax.vmap(clearance, (None, None, 0, 0)), (0, 0, None, None))
+        distance, direction, rate, curvature = pairs(x, xd, pt1, pt2)
+        gap = distance - radius - self._radius[: len(x), None]
+        meets = np.ones(gap.shape, np.float32)
+        meets[self._controllers :, : len(self._cylinders)] = 0.0
+        leaf = collision_rmp(self.config.rmp_params.collision_rmp, gap, rate)
+        pushes = along(direction, curvature, Rmp(leaf.force * meets, leaf.metric * meets))
+        return Rmp(pushes.force.sum(axis=1), pushes.metric.sum(axis=1))
+
+    def _joint_leaves(self, q, qd) -> Rmp:
+        """On the joints themselves; the metric is diagonal."""
+        p = self.config.rmp_params
+        leaves = [cspace_target_rmp(p.cspace_target_rmp, q, qd, self.default_q)]
+        leaves.append(joint_velocity_cap_rmp(p.joint_velocity_cap_rmp, qd))
+        for limit, jac in zip(self._limits, (self._per_range, -self._per_range), strict=True):
+            leaf = joint_limit_rmp(p.joint_limit_rmp, jac * (q - limit), jac * qd)
+            leaves.append(Rmp(jac * leaf.force, jac**2 * leaf.metric))
+        return jax.tree.map(lambda *parts: sum(parts), *leaves)
+
+
+def _length(vec: Float[Array, " n"]) -> Float[Array, ""]:
+    """Euclidean norm, with a derivative also at zero."""
+    return jnp.sqrt(jnp.sum(vec * vec) + 1e-12)
+
+
+def _bell(x, width):
+    return jnp.exp(-0.5 * (x / width) ** 2)
+
+
+def _boost(p: cfg.TargetCfg | cfg.AxisTargetCfg, distance):
+    beta = _bell(distance, p.proximity_metric_boost_length_scale)
+    return beta * p.proximity_metric_boost_scalar + 1.0 - beta
+
+
+def _weighted(metric: Float[Array, "3 3"], accel: Float[Array, "3"]) -> Rmp:
+    return Rmp(jnp.sum(metric * accel, axis=-1), metric)

@@ -1,0 +1,77 @@
+"""Follow target: the end effector keeps to a target cube. The Isaac Sim tutorial's first task, for controllers and for learning."""
+
+import dataclasses
+
+from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
+from mjx_nero.mdp import commands, observations, rewards, success, terminations
+from mjx_nero.robots import RobotCfg
+from mjx_nero.scene import SceneCfg
+from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What differs from robot to robot: the frame that follows, and where the target is [m]."""
+
+    frame: str
+    center: tuple[float, float, float]
+    radius: float
+    scene: SceneCfg
+
+
+# The tutorial's frame and target.
+COBOTTA_WORK = Work(
+    frame="flange",
+    center=(0.5, 0.0, 0.5),
+    radius=0.1,
+    scene=SceneCfg(cube=False, cube_edge=0.0515, goal="cube", table_size=(1.2, 1.4), look_at=(0.2, 0.0, 0.4), view_distance=2.1),
+)
+NERO_WORK = Work(frame="ee", center=(0.36, 0.0, 0.25), radius=0.06, scene=SceneCfg(cube=False, goal="cube"))
+
+
+def default(robot: RobotCfg, work: Work) -> EnvCfg:
+    """The target runs round a vertical circle, four seconds a turn; success is to stay within 2 cm of it."""
+    x, y, z = ((c, c) for c in work.center)
+    return EnvCfg(
+        # As a robot's own controller would: a weak drive that sags would never arrive.
+        robot=dataclasses.replace(robot, ee_site=work.frame, gravity_compensation=True),
+        scene=work.scene,
+        episode_length_s=12.0,
+        action=ActionCfg(absolute=True),
+        controllers=("rmpflow", "ik"),
+        command=CommandTerm(commands.pose, params={"x": x, "y": y, "z": z, "quat": robot.down}, resample_s=12.0),
+        motion=Term(commands.circle, params={"radius": work.radius, "frequency": 0.25}),
+        success=SuccessCfg(
+            condition=Term(success.ee_at_goal, params={"threshold": 0.02}),
+            distance=Term(success.ee_distance),
+        ),
+        observations={
+            "state": {
+                "joint_positions": ObservationTerm(observations.joint_pos),
+                "end_effector_position": ObservationTerm(observations.ee_position),
+                "end_effector_orientation": ObservationTerm(observations.ee_orientation),
+                "target_position": ObservationTerm(observations.goal_position),
+                "target_orientation": ObservationTerm(observations.goal_orientation),
+            },
+        },
+        events={},
+        rewards={
+            "position_tracking": RewardTerm(rewards.ee_goal_distance, weight=1.0, params={"std": 0.2}),
+            "position_tracking_fine": RewardTerm(rewards.ee_goal_distance, weight=1.0, params={"std": 0.02}),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum={},
+        terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
+    )
+
+
+def static(robot: RobotCfg, work: Work) -> EnvCfg:
+    """The target stands still; success is to stay within 5 mm of it."""
+    return dataclasses.replace(
+        default(robot, work),
+        motion=None,
+        success=SuccessCfg(
+            condition=Term(success.ee_at_goal, params={"threshold": 0.005}),
+            distance=Term(success.ee_distance),
+        ),
+    )
