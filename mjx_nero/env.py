@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +53,8 @@ class SuccessCfg:
 class EnvCfg:
     """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
 
-    ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task.
+    ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task, the usual one
+    first, with what their configs have to say of it (fields by dotted name).
     """
 
     robot: RobotCfg
@@ -70,7 +72,7 @@ class EnvCfg:
     object_start: tuple[float, float, float] = (0.2, 0.0, 0.015)  # before the reset events [m]
     corruption: bool = True  # observation noise: on to train, off to play
     motion: Term | None = None
-    controllers: tuple[str, ...] = ()
+    controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         unknown = set(self.curriculum) - set(self.rewards)

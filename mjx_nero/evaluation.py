@@ -1,9 +1,10 @@
-"""Plays and measures a policy, the zero agent or the random agent."""
+"""Plays and measures a policy, a controller, the zero agent or the random agent."""
 
 import dataclasses
 import json
 import os
 import pathlib
+import sys
 import time
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import config, policy, registry, render, rollout
+from mjx_nero import config, control, policy, registry, render, rollout
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.types import UserError
 
@@ -26,17 +27,35 @@ def agent(name: str, env: ManipulationEnv, env_name: str, path: pathlib.Path | N
         trained = policy.load_for(env, env_name, path)
         return lambda params, obs, key: trained.act(obs), None
 
+    # Where actions are drive targets, staying home means home's; random ones go as far about it as a policy's would.
+    home = jnp.array(env.cfg.robot.home) if env.cfg.action.absolute else jnp.zeros(env.action_size)
+
     def act(params, obs, key):
         shape = (obs["state"].shape[0], env.action_size)
-        return jnp.zeros(shape) if name == "zero" else jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+        still = jnp.broadcast_to(home, shape)
+        return still if name == "zero" else still + jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
     return act, None
+
+
+def controller(name: str, env: ManipulationEnv, env_name: str, overrides: dict[str, Any] | None = None) -> control.Controller:
+    """A controller that can do the environment's task.
+
+    Raises:
+        UserError: it cannot, or a field of its config is wrong.
+    """
+    able = env.cfg.controllers
+    if not able:
+        raise UserError(f"{env_name} has no controller, only policies")
+    if name not in able:
+        raise UserError(f"controller {name!r} cannot do {env_name}: choose one of {', '.join(able)}")
+    return control.make(name, env.cfg.robot, env.dt, {**able[name], **(overrides or {})})
 
 
 def evaluate(
     env_name: str,
     preset: str = "default",
-    agent_name: str = "policy",
+    agent_name: str | None = None,
     policy_path: pathlib.Path | None = None,
     episodes: int = 64,
     seed: int = 1,
@@ -45,23 +64,40 @@ def evaluate(
     video: pathlib.Path | None = None,
     out: pathlib.Path | None = None,
     overrides: dict[str, Any] | None = None,
+    controller_name: str | None = None,
+    control_overrides: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Plays ``episodes`` episodes side by side, prints the result, writes JSON and video where asked.
 
     Args:
+        agent_name: one of ``AGENTS``; None: the controller, where one is named or the task has its own and no policy is given.
         backend: ``mjx``, ``mujoco`` (the C library on the CPU), or ``auto``: mjx on an accelerator, mujoco else.
         out: JSON file.
         overrides: config fields by dotted name.
+        controller_name: one of the task's.
+        control_overrides: fields of the controller's config by dotted name.
 
     Raises:
-        UserError: unknown names, a policy that does not fit, files that cannot be written.
+        UserError: unknown names, agent and controller together, a policy that does not fit, files that cannot be written.
     """
     cfg = dataclasses.replace(registry.env_cfg(env_name, preset), corruption=False)
     cfg = config.override(cfg, overrides or {})
     if backend == "auto":
         backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     env = ManipulationEnv(cfg, impl=impl if backend == "mjx" else "jax", num_envs=episodes)
-    act, params = agent(agent_name, env, env_name, policy_path)
+    if controller_name and (agent_name or policy_path):
+        raise UserError("one can play: give --controller, or --agent or --policy")
+    if not (controller_name or agent_name or policy_path):
+        controller_name = next(iter(cfg.controllers), None)
+    act: rollout.Act | rollout.Agent
+    steering, params = None, None
+    if controller_name:
+        steering = controller(controller_name, env, env_name, control_overrides)
+        act = rollout.controller_agent(env, steering)
+    elif control_overrides:
+        raise UserError("--control.* needs --controller")
+    else:
+        act, params = agent(agent_name or "policy", env, env_name, policy_path)
     for path in filter(None, (video, out)):
         _check_writable(path)
     runner = rollout.mjx_runner if backend == "mjx" else rollout.native_runner
@@ -71,15 +107,23 @@ def evaluate(
     result = {
         "env": env_name,
         "preset": preset,
-        "agent": agent_name,
+        **({"controller": controller_name} if controller_name else {"agent": agent_name or "policy"}),
         "backend": f"mjx-{env.impl}" if backend == "mjx" else "mujoco",
         "episodes": episodes,
         "seed": seed,
         **played.summary(),
         "seconds": round(seconds, 2),
     }
+    if not cfg.scene.cube:
+        for name in ("grasp_rate", "time_to_grasp_mean", "dropped_rate"):
+            del result[name]
+    if steering:
+        result |= tracking(played, round(cfg.success.hold_s / env.dt))
+        result["warning"] = steering.warning(played.memory)
     console = Console()
     console.print(table(result))
+    if result.get("warning"):
+        print(f"warning: {result['warning']}", file=sys.stderr)
     if out:
         part = out.with_name(f".{out.name}.part")
         part.write_text(json.dumps(result, indent=2) + "\n")
@@ -93,19 +137,36 @@ def evaluate(
     return result
 
 
+def tracking(played: rollout.Episodes, last: int) -> dict[str, float]:
+    """Distances to the goal [m]: over the last ``last`` steps, and over the second half of the episodes, when all has settled."""
+    half = played.distance[len(played.distance) // 2 :]
+    return {
+        "position_error_mean": float(played.distance[-last:].mean()),
+        "settled_error_mean": float(half.mean()),
+        "settled_error_max": float(half.max()),
+    }
+
+
 def table(result: dict[str, Any]) -> Table:
     """The result for people."""
     low, high = result["success_rate_95"]
-    grasp = result["time_to_grasp_mean"]
-    title = f"{result['env']} · {result['agent']} · {result['backend']} · {result['episodes']} episodes"
+    who = result.get("controller") or result["agent"]
+    title = f"{result['env']} · {who} · {result['backend']} · {result['episodes']} episodes"
     view = Table(title=title, show_header=False)
     view.add_row("success rate", f"{result['success_rate']:.1%}  (95% interval {low:.1%} to {high:.1%})")
     view.add_row(
         "final distance",
         f"{100 * result['final_distance_mean']:.2f} cm mean, {100 * result['final_distance_median']:.2f} cm median",
     )
-    view.add_row("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
-    view.add_row("dropped", f"{result['dropped_rate']:.1%}")
+    if "settled_error_max" in result:
+        view.add_row(
+            "second half",
+            f"{100 * result['settled_error_mean']:.2f} cm mean, {100 * result['settled_error_max']:.2f} cm at most",
+        )
+    if "grasp_rate" in result:
+        grasp = result["time_to_grasp_mean"]
+        view.add_row("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
+        view.add_row("dropped", f"{result['dropped_rate']:.1%}")
     view.add_row("return", f"{result['return_mean']:.2f}")
     for name, value in result["return_by_term"].items():
         view.add_row(f"  {name}", f"{value:.3f}")

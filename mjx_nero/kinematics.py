@@ -108,11 +108,11 @@ class Chain:
         nodes: list[Pose] = []
         for i, parent, fixed, axis, slide in self._nodes:
             pos, quat = _attach(nodes, parent, fixed)
-            axis = jnp.asarray(axis, jnp.float32)
+            along = jnp.asarray(axis, jnp.float32)
             if slide:
-                pos = pos + math.rotate(quat, axis * q[i])
+                pos = pos + math.rotate(quat, along * q[i])
             else:
-                quat = math.quat_mul(quat, math.axis_angle(axis, q[i]))
+                quat = math.quat_mul(quat, math.axis_angle(along, q[i]))
             nodes.append((pos, quat))
         return nodes
 

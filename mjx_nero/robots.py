@@ -2,6 +2,10 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 # In a checkout the assets lie beside the package, in a wheel inside it.
 _HERE = pathlib.Path(__file__).resolve().parent
@@ -29,12 +33,42 @@ class DriveCfg:
     home: tuple[float, ...]
 
 
+    @property
+    def lead(self) -> tuple[float, ...]:
+        """Damping over stiffness [s]. A target this many seconds ahead of a moving set-point makes a drive that damps a joint's
+        speed damp its speed error instead: it tracks without lag."""
+        return tuple(d / k for d, k in zip(self.damping, self.stiffness, strict=True))
+
+
 @dataclasses.dataclass(frozen=True)
 class GripperCfg(DriveCfg):
-    """A gripper: drives with an open and a closed target."""
+    """A parallel gripper: drives with an open and a closed target.
+
+    Attributes:
+        gap: ``positions [n] -> distance between the fingers' pads [m]``.
+        positions: its inverse.
+    """
 
     open: tuple[float, ...] = ()
     close: tuple[float, ...] = ()
+    gap: Callable = dataclasses.field(default=lambda q: q[0] - q[1])
+    positions: Callable = dataclasses.field(default=lambda gap: jnp.stack([gap / 2, -gap / 2]))
+
+
+# OnRobot RG6: parallel cranks of 80 mm (assets/cobotta_pro_900/README.md).
+_CRANK, _CLOSED_ANGLE, _OFFSET = 0.08, 0.6331, 0.000488
+
+
+def rg6_gap(q: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance between the pads [m] at the two driven joints' positions [rad]; 0 to 0.151."""
+    left, right = (_CRANK * jnp.sin(_CLOSED_ANGLE - angle) - _OFFSET for angle in (q[0], -q[1]))
+    return left + right
+
+
+def rg6_positions(gap: Float[Array, ""]) -> Float[Array, "2"]:
+    """Positions of the two driven joints [rad] that leave ``gap`` [m] between the pads."""
+    q = _CLOSED_ANGLE - jnp.arcsin((gap / 2 + _OFFSET) / _CRANK)
+    return jnp.stack([q, -q])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,5 +161,7 @@ COBOTTA_PRO_900 = RobotCfg(
         home=(0.0, 0.0),
         open=(0.0, 0.0),
         close=(0.628, -0.628),
+        gap=rg6_gap,
+        positions=rg6_positions,
     ),
 )

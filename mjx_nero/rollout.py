@@ -1,4 +1,4 @@
-"""Evaluation: whole episodes with a policy, on MJX or in MuJoCo's C library."""
+"""Evaluation: whole episodes with a policy or a controller, on MJX or in MuJoCo's C library."""
 
 import dataclasses
 import functools
@@ -11,12 +11,44 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 
+from mjx_nero.control import Controller
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import NativePhysics
 from mjx_nero.types import Key
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]
 Act = Callable[[Any, dict[str, jax.Array], Key], jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """Who plays a batch of environments.
+
+    Attributes:
+        act: (parameters, memory, states, key) -> (actions [n, ...], memory).
+        init: states at the start -> memory.
+    """
+
+    act: Callable[[Any, Any, State, Key], tuple[jax.Array, Any]]
+    init: Callable[[State], Any]
+
+
+def policy_agent(act: Act) -> Agent:
+    """A policy of the observations alone, without memory."""
+    return Agent(act=lambda params, memory, state, key: (act(params, state.obs, key), memory), init=lambda state: ())
+
+
+def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
+    """A controller in every environment of the batch; it has no parameters and draws nothing.
+
+    The environment has to take drive targets (``ActionCfg.absolute``).
+    """
+
+    def act(params, memory, state, key):
+        memory, targets = jax.vmap(lambda m, s: controller.step(m, env.view(s)))(memory, state)
+        return targets, memory
+
+    return Agent(act, init=jax.vmap(lambda state: controller.init(env.view(state))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +61,8 @@ class Episodes:
         lengths: [n] control steps.
         qpos: [steps, k, nq] of the first k environments, where asked for.
         goals: [steps, k, 3], the goals in the world frame [m].
+        distance: [steps, n], what the task's success is about [m]; an ended episode's stays.
+        memory: the agent's, after the last step.
     """
 
     metrics: dict[str, np.ndarray]
@@ -36,6 +70,8 @@ class Episodes:
     lengths: np.ndarray
     qpos: np.ndarray
     goals: np.ndarray
+    distance: np.ndarray
+    memory: Any
 
     def summary(self) -> dict:
         """Figures for people and for JSON: distances in m, times in s."""
@@ -85,41 +121,46 @@ def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
     return state, dict.fromkeys((*state.metrics, "return", "length"), zeros), jnp.ones_like(zeros)
 
 
-def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, jax.Array]:
-    goals = state.info["carry"].command[:record] + jnp.asarray(env.cfg.robot.base_pos)
-    return state.pipeline_state.qpos[:record], goals
+def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    first = jax.tree.map(lambda x: x[:record], state)
+    return first.pipeline_state.qpos, jax.vmap(env.goal)(first), state.metrics["distance"]
 
 
-def mjx_runner(env: ManipulationEnv, act: Act, episodes: int, record: int = 0) -> Runner:
+def mjx_runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 0) -> Runner:
     """Plays ``episodes`` at once on MJX: one compiled program, reused from call to call.
 
     Args:
         record: how many of the episodes to keep qpos and goals of.
     """
 
+    agent = act if isinstance(act, Agent) else policy_agent(act)
+
     @jax.jit
     def run(params, keys: Key, key: Key):
         def step(carry, key):
-            state, totals, active = carry
-            after = jax.vmap(env.step)(state, act(params, state.obs, key))
-            carry = _accumulate(state, after, totals, active)
-            return carry, _frames(env, carry[0], record)
+            (state, totals, active), memory = carry
+            action, memory = agent.act(params, memory, state, key)
+            episode = _accumulate(state, jax.vmap(env.step)(state, action), totals, active)
+            return (episode, memory), _frames(env, episode[0], record)
 
-        (_, totals, _), frames = jax.lax.scan(step, _start(env, keys), jax.random.split(key, env.episode_length))
-        return totals, frames
+        start = _start(env, keys)
+        keys = jax.random.split(key, env.episode_length)
+        ((_, totals, _), memory), frames = jax.lax.scan(step, (start, agent.init(start[0])), keys)
+        return totals, frames, memory
 
     return lambda params, seed: _collect(*run(params, *_keys(seed, episodes)))
 
 
-def native_runner(env: ManipulationEnv, act: Act, episodes: int, record: int = 0) -> Runner:
+def native_runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 0) -> Runner:
     """Plays the same episodes with MuJoCo's C library; only the MDP's terms are compiled, which takes seconds."""
     physics = NativePhysics(env.physics_model, env.cfg.sim)
-    start = jax.jit(functools.partial(_start, env))
+    agent = act if isinstance(act, Agent) else policy_agent(act)
+    start, init = jax.jit(functools.partial(_start, env)), jax.jit(agent.init)
 
     @jax.jit
-    def decide(params, state, key):
-        action = act(params, state.obs, key)
-        return action, jax.vmap(env.targets)(state, action)
+    def decide(params, memory, state, key):
+        action, memory = agent.act(params, memory, state, key)
+        return action, jax.vmap(env.targets)(state, action), memory
 
     @jax.jit
     def finish(state, action, sim, totals, active):
@@ -129,14 +170,14 @@ def native_runner(env: ManipulationEnv, act: Act, episodes: int, record: int = 0
     def run(params, seed: int) -> Episodes:
         keys, key = _keys(seed, episodes)
         state, totals, active = start(keys)
+        memory = init(state)
         frames = []
         for k in jax.random.split(key, env.episode_length):
-            action, ctrl = decide(params, state, k)
+            action, ctrl, memory = decide(params, memory, state, k)
             sim = physics.step(state.pipeline_state, ctrl)
             state, totals, active = finish(state, action, sim, totals, active)
             frames.append(jax.tree.map(np.asarray, _frames(env, state, record)))
-        qpos, goals = (np.stack(x) for x in zip(*frames, strict=True))
-        return _collect(totals, (qpos, goals))
+        return _collect(totals, tuple(np.stack(x) for x in zip(*frames, strict=True)), memory)
 
     return run
 
@@ -148,7 +189,8 @@ def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
     return jax.random.split(k_reset, episodes), key
 
 
-def _collect(totals: dict, frames: tuple) -> Episodes:
+def _collect(totals: dict, frames: tuple, memory: Any) -> Episodes:
     totals = {name: np.asarray(value, np.float64) for name, value in totals.items()}
     returns, lengths = totals.pop("return"), totals.pop("length")
-    return Episodes(totals, returns, lengths, np.asarray(frames[0]), np.asarray(frames[1]))
+    qpos, goals, distance = (np.asarray(x) for x in frames)
+    return Episodes(totals, returns, lengths, qpos, goals, distance, memory)

@@ -1,23 +1,30 @@
 """Shared by all tests: type checks at run time, a compilation cache, and the few compiled functions that cost time."""
 
 import getpass
+import importlib.util
 import os
 import pathlib
+import sys
 import tempfile
+import typing
 
 import jaxtyping
 import pytest
 
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
-# ``types`` and ``ppo``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them with a batch axis.
+# ``types``, ``ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them
+# with a batch axis.
 _CHECKED = ("checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robots", "rollout")
-_CHECKED += ("scene", "tasks", "terms", "view")
+_CHECKED += ("scene", "tasks", "terms", "view", "control.controller", "control.gripper", "control.ik")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero import wrappers  # noqa: E402
+from mjx_nero.control import controller  # noqa: E402
+
+typing.runtime_checkable(controller.Controller)  # without it the checks could not tell who is one
+from mjx_nero import benchmark, cli, wrappers  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
@@ -81,3 +88,32 @@ class Finish:
 @pytest.fixture(scope="session")
 def finish(env) -> Finish:
     return Finish(env)
+
+
+def load(name: str):
+    """The ``main`` of a program of the root folder."""
+    path = pathlib.Path(__file__).resolve().parents[1] / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"program_{name}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main
+
+
+MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main}
+
+
+@pytest.fixture
+def call(monkeypatch, capfd, tmp_path):
+    """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "setup_jax", lambda: None)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(program, *argv):
+        monkeypatch.setattr(sys, "argv", [program, *map(str, argv)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli.run(MAINS[program])
+        return stop.value.code, *capfd.readouterr()
+
+    return run

@@ -5,11 +5,11 @@ import json
 
 import pytest
 
-from mjx_nero import UserError, config, env_cfg, list_envs, list_presets, make
+from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, make
 from mjx_nero.env import EnvCfg
 from mjx_nero.policy import NetworkCfg
 from mjx_nero.ppo import PRESETS
-from mjx_nero.robots import NERO
+from mjx_nero.robots import COBOTTA_PRO_900, NERO
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,13 +151,13 @@ def test_wrong_values(name, value, message):
 
 
 def test_task_overrides_by_dotted_name():
-    overrides = {"rewards.reaching_object.params.std": "0.2", "scene.cube_mass": 0.1, "robot.arm.speed": 3}
+    overrides = {"rewards.reaching_object.params.std": "0.2", "scene.cube_mass": 0.1, "robot.arm.speed": (3,) * 7}
     cfg = env_cfg("nero_lift", **overrides)
     assert cfg.rewards["reaching_object"].params == {"std": 0.2}
-    assert cfg.scene.cube_mass == 0.1 and cfg.robot.arm.speed == 3.0
+    assert cfg.scene.cube_mass == 0.1 and cfg.robot.arm.speed == (3.0,) * 7
     fresh = env_cfg("nero_lift")
     assert fresh.rewards["reaching_object"].params == {"std": 0.1}
-    assert fresh.scene.cube_mass == 0.03 and NERO.arm.speed == 1.5
+    assert fresh.scene.cube_mass == 0.03 and NERO.arm.speed == (1.5,) * 7
     with pytest.raises(UserError, match=r"'stdd' is not one of std \(did you mean 'std'\?\)"):
         env_cfg("nero_lift", **{"rewards.reaching_object.params.stdd": 1.0})
 
@@ -177,8 +177,34 @@ def test_unknown_names(call, message):
 
 
 def test_registry_lists():
-    assert "nero_lift" in list_envs()
+    assert list_envs() == tuple(
+        f"{robot}_{task}" for robot in ("nero", "cobotta") for task in ("lift", "follow_target", "pick_place")
+    )
     assert list_presets("nero_lift")[0] == "default" and "isaac" in list_presets("nero_lift")
+    assert list_presets("cobotta_follow_target") == ("default", "static")
+
+
+@pytest.mark.parametrize("name", list_envs())
+def test_every_environment_has_a_config_that_fits(name):
+    for preset in list_presets(name):
+        cfg = env_cfg(name, preset)
+        assert json.loads(json.dumps(config.to_dict(cfg)))["robot"]["name"] == cfg.robot.name
+        assert set(cfg.controllers) <= set(control.CONTROLLERS)
+        # Controllers give drive targets, and their fields are those of their configs.
+        assert cfg.action.absolute == bool(cfg.controllers)
+        for controller, fields in cfg.controllers.items():
+            config.override(control.CONTROLLERS[controller][1], fields)
+        env = make(name, preset, impl="jax")
+        assert env.action_size == env.physics_model.nu - (0 if cfg.action.absolute else 1)
+
+
+def test_drives_are_given_joint_by_joint():
+    for robot in (NERO, COBOTTA_PRO_900):
+        for drive in (robot.arm, robot.gripper):
+            fields = (drive.stiffness, drive.damping, drive.effort, drive.speed, drive.home)
+            assert {len(values) for values in fields} == {len(drive.joints)}
+        assert robot.arm.lead == tuple(d / k for d, k in zip(robot.arm.damping, robot.arm.stiffness, strict=True))
+        assert len(robot.gripper.open) == len(robot.gripper.close) == len(robot.gripper.joints)
 
 
 @pytest.mark.parametrize("preset", ["default", "isaac"])
@@ -235,8 +261,9 @@ def test_isaac_preset_is_the_recipe():
     assert cfg.command.params == {"x": (0.3, 0.35), "y": (-0.2, 0.2), "z": (0.2, 0.35)}
     (event,) = cfg.events.values()
     assert event.func.__name__ == "object_position_uniform"
-    assert event.params == {"x": (0.1, 0.2), "y": (-0.1, 0.2), "z": (0.0, 0.0)}
-    assert cfg.object_start == (0.2, 0.0, 0.015) and cfg.scene.cube_edge == 0.03
+    # The recipe's cubes: (0.2, 0, 0.015) and an offset of 0.1 to 0.2, -0.1 to 0.2, 0. Here the offset counts from the robot.
+    assert event.params == {"x": (0.3, 0.4), "y": (-0.1, 0.2), "z": (0.0, 0.0)}
+    assert cfg.object_start == (0.0, 0.0, 0.015) and cfg.scene.cube_edge == 0.03
     assert (cfg.sim.dt, cfg.sim.decimation, cfg.episode_length_s) == (0.01, 2, 5.0)
     assert cfg.action.scale == 0.5 and cfg.action.clip == 0.0
     done = {n: (t.func.__name__, t.params, t.time_out) for n, t in cfg.terminations.items()}
@@ -252,11 +279,11 @@ def test_drives_are_the_recipe():
     assert arm.joints == tuple(f"joint{i}" for i in range(1, 8))
     assert arm.stiffness == (200, 170, 120, 80, 50, 20, 10)
     assert arm.damping == (100, 60, 70, 24, 20, 10, 5)
-    assert (arm.effort, arm.speed) == (25, 1.5)
+    assert (arm.effort, arm.speed) == ((25,) * 7, (1.5,) * 7)
     assert arm.home == (0, 0, 0, 2.0, 0, 0, 0)
     assert gripper.joints == ("gripper_joint1", "gripper_joint2")
     assert gripper.stiffness == (800, 800) and gripper.damping == (20, 20)
-    assert (gripper.effort, gripper.speed) == (22, 1.5)
+    assert (gripper.effort, gripper.speed) == ((22, 22), (1.5, 1.5))
     assert gripper.home == gripper.open == (0.05, -0.05) and gripper.close == (0, -0.001)
     assert NERO.base_quat == (0, 0, 0, 1) and NERO.base_pos == (0, 0, 0)
     assert NERO.joints == arm.joints + gripper.joints and NERO.home == arm.home + gripper.home
@@ -270,7 +297,7 @@ def test_drives_reach_the_model(env):
         assert model.joint(actuator.trnid[0]).name == name
         assert actuator.gainprm[0] == drive.stiffness[k]
         assert tuple(actuator.biasprm[:3]) == (0, -drive.stiffness[k], -drive.damping[k])
-        assert tuple(actuator.forcerange) == (-drive.effort, drive.effort) and actuator.forcelimited[0]
+        assert tuple(actuator.forcerange) == (-drive.effort[k], drive.effort[k]) and actuator.forcelimited[0]
         assert tuple(actuator.ctrlrange) == tuple(model.joint(name).range) and actuator.ctrllimited[0]
     assert model.nu == 9 and model.opt.timestep == 0.01
 

@@ -1,4 +1,4 @@
-"""The environment: draws, actions, episode ends, metrics, sick physics, restarts."""
+"""The environment: draws, actions, episode ends, metrics, sick physics, restarts; goals that move, drive targets as actions."""
 
 import jax
 import jax.numpy as jnp
@@ -449,3 +449,180 @@ def test_both_models_have_the_same_state(env):
         for _ in range(20):
             mujoco.mj_step(m, d)
     np.testing.assert_allclose(data[0].qpos, data[1].qpos, atol=1e-12)
+
+
+# --- goals that move
+
+
+@pytest.fixture(scope="module")
+def follow():
+    """The Cobotta's moving target; no cube in the scene."""
+    env = make("cobotta_follow_target", impl="jax", corruption=False)
+    return type("Follow", (), {"env": env, "reset": jax.jit(env.reset), "finish": jax.jit(env.finish), "view": jax.jit(env.view)})
+
+
+def test_goal_runs_round_its_circle(follow):
+    state = follow.reset(jax.random.PRNGKey(0))
+    center, sim, dt, rounds = np.asarray(state.info["carry"].command), state.pipeline_state, follow.env.dt, []
+    for step in range(0, 201, 10):  # four seconds
+        view = follow.view(at_step(state, step))
+        phase = 2 * np.pi * 0.25 * step * dt
+        np.testing.assert_allclose(view.goal_pos_w, center + 0.1 * np.array([0, np.cos(phase), np.sin(phase)]), atol=1e-6)
+        velocity = 0.1 * 2 * np.pi * 0.25 * np.array([0, -np.sin(phase), np.cos(phase)])
+        np.testing.assert_allclose(view.goal_linvel_w, velocity, atol=1e-6)
+        np.testing.assert_array_equal(view.goal_quat_w, [0, 0, 1, 0])
+        np.testing.assert_array_equal(view.command, center)  # as drawn
+        np.testing.assert_allclose(follow.env.goal(at_step(state, step)), view.goal_pos_w, atol=1e-7)
+        rounds.append(np.asarray(view.goal_pos_w))
+    np.testing.assert_allclose(rounds[0], rounds[-1], atol=1e-6)
+    after = follow.finish(state, sim.ctrl, sim, jnp.zeros(()))  # and with the steps of the episode
+    assert (follow.view(after).goal_pos_w == follow.view(at_step(state, 1)).goal_pos_w).all()
+
+
+def test_velocity_of_the_goal_is_that_of_its_positions(follow):
+    state = follow.reset(jax.random.PRNGKey(1))
+    positions = np.array([follow.view(at_step(state, k)).goal_pos_w for k in range(40, 60)], np.float64)
+    velocities = np.array([follow.view(at_step(state, k)).goal_linvel_w for k in range(40, 60)], np.float64)
+    differences = (positions[2:] - positions[:-2]) / (2 * follow.env.dt)
+    np.testing.assert_allclose(velocities[1:-1], differences, atol=1e-4)
+
+
+def test_a_goal_without_motion_stays(env, start):
+    for step in (0, 100):
+        view = env.view(at_step(start, step))
+        np.testing.assert_array_equal(view.goal_pos_w, view.command)
+        np.testing.assert_array_equal(view.goal_linvel_w, [0, 0, 0])
+        np.testing.assert_array_equal(view.goal_quat_w, [1, 0, 0, 0])
+
+
+# --- actions that are drive targets
+
+
+def test_absolute_actions_keep_to_the_joint_ranges_alone(follow):
+    env, state = follow.env, follow.reset(jax.random.PRNGKey(0))
+    assert env.action_size == 8 == env.physics_model.nu
+    targets = jax.jit(env.targets)
+    low, high = np.float32([env.physics_model.joint(j).range for j in env.cfg.robot.joints]).T
+    np.testing.assert_array_equal(targets(state, jnp.full(8, 100.0)), high)
+    np.testing.assert_array_equal(targets(state, jnp.full(8, -100.0)), low)
+    some = jnp.array([0.5, -1.0, 2.0, -2.0, 1.0, 3.0, 0.6, -0.6])
+    np.testing.assert_array_equal(targets(state, some), some)  # at once: no speed limit
+
+
+# --- a scene without a cube
+
+
+def test_scene_without_a_cube(follow):
+    env, state = follow.env, follow.reset(jax.random.PRNGKey(2))
+    for model in (env.physics_model, env.mj_model):
+        assert "cube" not in [model.body(i).name for i in range(model.nbody)]
+        assert model.nq == model.nv == 12
+    assert env.mj_model.geom("goal").type[0] == mujoco.mjtGeom.mjGEOM_BOX
+    view = follow.view(at_step(state, 30))  # the goal itself is the object
+    np.testing.assert_array_equal(view.object_pos_w, view.goal_pos_w)
+    np.testing.assert_array_equal(view.object_quat_w, view.goal_quat_w)
+    np.testing.assert_array_equal(view.object_linvel_w, view.goal_linvel_w)
+    np.testing.assert_array_equal(view.object_angvel_local, np.zeros(3))
+    after = follow.finish(state, jnp.zeros(8), state.pipeline_state, jnp.zeros(()))
+    assert all_finite(after) and float(after.metrics["nan"]) == 0
+
+
+# --- linkages
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.2])
+def test_a_linkage_starts_closed(offset):
+    """The joints that follow others do so from the start, wherever the reset events put the leaders."""
+    from mjx_nero.mdp import events
+    from mjx_nero.terms import Term
+
+    joints = {"joints": Term(events.joints_offset_uniform, params={"offset": offset})}
+    env = make("cobotta_follow_target", impl="jax", events=joints)
+    qpos = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16)).pipeline_state.qpos
+    model = env.physics_model
+    assert model.neq == 5
+    leader = qpos[:, model.joint("finger_joint").qposadr[0]]
+    assert (np.ptp(leader) > 0.1) == (offset > 0)
+    signs = {"left_inner_finger": 1, "left_inner_knuckle": -1, "right_outer_knuckle": -1}
+    for name, sign in {**signs, "right_inner_knuckle": -1, "right_inner_finger": 1}.items():
+        np.testing.assert_array_equal(qpos[:, model.joint(f"{name}_joint").qposadr[0]], sign * leader)
+    data = mujoco.MjData(model)
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        assert np.abs(data.efc_pos[:5]).max() < 1e-6
+
+
+# --- the tutorial's tasks
+
+
+def test_observations_of_following(follow):
+    assert list(follow.env.cfg.observations["state"]) == [
+        "joint_positions",
+        "end_effector_position",
+        "end_effector_orientation",
+        "target_position",
+        "target_orientation",
+    ]
+    state = at_step(follow.reset(jax.random.PRNGKey(3)), 50)  # a quarter of a turn
+    after = follow.finish(at_step(state, 49), jnp.zeros(8), state.pipeline_state, jnp.zeros(()))
+    home, goal = follow.env.cfg.robot.home, state.info["carry"].command + jnp.array([0.0, 0.0, 0.1])
+    # home: the grasp point at (0.5, 0, 0.28), the flange 26 cm over it, straight down
+    want = np.concatenate([home, [0.5, 0.0, 0.54], [0, 0, 1, 0], goal, [0, 0, 1, 0]])
+    got = np.array(after.obs["state"])
+    got[11:15] *= np.sign(got[13])  # q and -q are one orientation
+    np.testing.assert_allclose(got, want, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def place():
+    """The Cobotta's pick-and-place task."""
+    env = make("cobotta_pick_place", impl="jax", corruption=False)
+    finish = jax.jit(env.finish)
+    return type("Place", (), {"env": env, "reset": jax.jit(env.reset), "finish": finish, "view": jax.jit(env.view)})
+
+
+def test_observations_of_pick_and_place(place):
+    assert list(place.env.cfg.observations["state"]) == [
+        "joint_positions",
+        "end_effector_position",
+        "end_effector_orientation",
+        "cube_position",
+        "cube_orientation",
+        "cube_target_position",
+    ]
+    state = place.reset(jax.random.PRNGKey(0))
+    view, at = place.view(state), place.env.physics_model.joint("cube").qposadr[0]
+    cube = state.pipeline_state.qpos[at : at + 3]
+    assert 0.3 <= cube[0] <= 0.6 and -0.3 <= cube[1] <= 0.3 and float(cube[2]) == pytest.approx(0.02575)
+    goal = state.info["carry"].command
+    assert -0.4 <= goal[0] <= -0.2 and 0.5 <= goal[1] <= 0.65 and float(goal[2]) == pytest.approx(0.02575)
+    want = np.concatenate([place.env.cfg.robot.home, [0.5, 0.0, 0.28], view.ee_quat_w, cube, [1, 0, 0, 0], goal])
+    np.testing.assert_allclose(state.obs["state"], want, atol=1e-3)
+    np.testing.assert_allclose(np.abs(view.ee_quat_w), [0, 0, 1, 0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("case", "offset", "speed", "success"),
+    [
+        ("placed", [0.006, 0.006, 0.0], 0.0, 1),
+        ("elsewhere", [0.008, 0.008, 0.0], 0.0, 0),
+        ("still moving", [0.0, 0.0, 0.0], 0.006, 0),
+        ("almost at rest", [0.0, 0.0, 0.0], 0.004, 1),
+        ("still in the grip", [0.0, 0.0, 0.0], 0.0, 0),
+    ],
+)
+def test_a_cube_is_placed_when_it_is_there_at_rest_and_let_go_of(place, case, offset, speed, success):
+    env, state = place.env, place.reset(jax.random.PRNGKey(1))
+    joint, sim, goal = env.physics_model.joint("cube"), state.pipeline_state, state.info["carry"].command
+    if case == "still in the grip":  # the goal where the gripper is
+        goal = place.view(state).ee_pos_w + jnp.array([0.0, 0.0, 0.04])
+    at, dof = joint.qposadr[0], joint.dofadr[0]
+    sim = sim.replace(qpos=sim.qpos.at[at : at + 3].set(goal + jnp.array(offset)), qvel=sim.qvel.at[dof].set(speed))
+    last = env.episode_length - 1
+    for hold, want in [(24, success), (23, 0)]:  # half a second, this step included
+        before = with_carry(at_step(state, last), hold=hold, command=goal)
+        after = place.finish(before, sim.ctrl, sim, jnp.zeros(()))
+        assert float(after.done) == 1 and float(after.info["truncation"]) == 1
+        assert float(after.metrics["success"]) == want
+    assert float(after.metrics["final_distance"]) == pytest.approx(np.linalg.norm(offset), abs=1e-5)

@@ -1,4 +1,4 @@
-"""The notebook runs from top to bottom and shows what it says."""
+"""The notebooks run from top to bottom and show what they say."""
 
 import os
 import pathlib
@@ -13,16 +13,13 @@ import mjx_nero
 from mjx_nero import render
 
 ROOT = pathlib.Path(__file__).parents[1]
-NOTEBOOK = ROOT / "notebooks" / "01_nero_lift.ipynb"
-STEPS = 12_288  # 8 iterations of PPO with the notebook's 64 environments
-PICTURES = {"drawn": 2, "plotted": 3}  # home pose and strip; reward terms, changed config and learning curve
+NERO_LIFT, COBOTTA_MOTION = (ROOT / "notebooks" / f"{name}.ipynb" for name in ("01_nero_lift", "02_cobotta_motion"))
+STEPS = 12_288  # 8 iterations of PPO with the first notebook's 64 environments
 
 
-@pytest.fixture(scope="module")
-def outputs(tmp_path_factory) -> list:
+def _run(path: pathlib.Path, folder: pathlib.Path) -> list:
     """All outputs of one run, on the CPU, whose kernel shares the tests' compilation cache."""
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    folder = tmp_path_factory.mktemp("notebook")
+    notebook = nbformat.read(path, as_version=4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MJX_NERO_NOTEBOOK_STEPS", str(STEPS))
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.jax_compilation_cache_dir))
@@ -32,6 +29,16 @@ def outputs(tmp_path_factory) -> list:
         client = nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": folder}})
         client.execute()  # raises at the first cell that fails
     return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory) -> list:
+    return _run(NERO_LIFT, tmp_path_factory.mktemp("nero_lift"))
+
+
+@pytest.fixture(scope="module")
+def motion_outputs(tmp_path_factory) -> list:
+    return _run(COBOTTA_MOTION, tmp_path_factory.mktemp("cobotta_motion"))
 
 
 def _text(outputs: list) -> str:
@@ -52,23 +59,56 @@ def _can_draw() -> bool:
         return False
 
 
-def test_notebook_ships_without_outputs():
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
+@pytest.mark.parametrize("path", [NERO_LIFT, COBOTTA_MOTION], ids=lambda path: path.stem)
+def test_notebook_ships_without_outputs(path):
+    notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(not cell.outputs and cell.execution_count is None for cell in code)
 
 
-def test_notebook_runs_without_errors(outputs):
+def _check(outputs: list, plotted: int, drawn: int) -> None:
+    """No errors, and every picture: ``plotted`` ones always, ``drawn`` ones where the machine can draw."""
     assert not [output for output in outputs if output.output_type == "error"]
     assert "Traceback" not in _text(outputs)
-
-
-def test_notebook_shows_every_picture(outputs):
     pictures = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
-    expected = PICTURES["plotted"] + (PICTURES["drawn"] if _can_draw() else 0)
-    assert len(pictures) == expected
-    assert len(set(pictures)) == expected
+    assert len(pictures) == len(set(pictures)) == plotted + (drawn if _can_draw() else 0)
+
+
+def test_nero_lift_runs_and_shows_every_picture(outputs):
+    _check(outputs, plotted=3, drawn=2)  # reward terms, changed config, learning curve; home pose, strip
+
+
+@pytest.mark.slow
+def test_cobotta_motion_runs_and_shows_every_picture(motion_outputs):
+    _check(motion_outputs, plotted=5, drawn=3)  # gripper, errors, RMPflow, following, phases; robot, two strips
+
+
+@pytest.mark.slow
+def test_gripper_and_kinematics_of_the_notebook(motion_outputs):
+    text = _text(motion_outputs)
+    assert abs(_figure(r"gap between the pads: (-?[\d.]+) to", text)) < 1
+    assert _figure(r"gap between the pads: -?[\d.]+ to ([\d.]+) mm", text) == pytest.approx(151.4, abs=1)
+    assert "solved: True" in text
+    assert _figure(r"success rate over 1000 poses: ([\d.]+)", text) >= 0.99
+
+
+@pytest.mark.slow
+def test_rmpflow_goes_round_the_ball_in_the_notebook(motion_outputs):
+    text = _text(motion_outputs)
+    for path in ("free", "with a ball"):
+        assert _figure(rf"{path}: at the end ([\d.]+) mm", text) < 1
+    assert _figure(r"free: .* least clearance (-?\d+) mm", text) < 0 < _figure(r"ball: .* least clearance (-?\d+) mm", text)
+
+
+@pytest.mark.slow
+def test_controllers_do_their_tasks_in_the_notebook(motion_outputs):
+    text = _text(motion_outputs)
+    for name in ("ik", "rmpflow"):
+        assert _figure(rf"{name}: ([\d.]+) mm from the target in the second half", text) < 20  # the task's threshold
+    assert _figure(r"success rate over 4 episodes: ([\d.]+)", text) == 1
+    assert _figure(r"from the goal at the end: ([\d.]+) mm", text) < 10
+    assert _figure(r"([\d,]+) control steps/s", text) > 100
 
 
 def test_shipped_policy_succeeds_in_the_notebook(outputs):

@@ -1,49 +1,17 @@
 """train.py, eval.py and the benchmark as a user calls them: results, files, and mistakes that end in one line."""
 
-import importlib.util
 import json
 import os
-import pathlib
 import shutil
 import signal
-import sys
 
 import imageio.v3 as imageio
 import jax
 import mujoco
 import pytest
 
-from mjx_nero import benchmark, checkpoint, cli, policy, render, training
+from mjx_nero import checkpoint, policy, render, training
 from mjx_nero.types import UserError
-
-ROOT = pathlib.Path(__file__).resolve().parents[1]
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(f"program_{name}", ROOT / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main
-
-
-MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main}
-
-
-@pytest.fixture
-def call(monkeypatch, capfd, tmp_path):
-    """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "setup_jax", lambda: None)
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def run(program, *argv):
-        monkeypatch.setattr(sys, "argv", [program, *map(str, argv)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as stop:
-            cli.run(MAINS[program])
-        return stop.value.code, *capfd.readouterr()
-
-    return run
 
 
 def can_draw():
@@ -115,7 +83,7 @@ def test_help_is_complete(call):
     code, out, _ = call("train", "--help")
     assert code == 0
     flags = ("--env", "--preset", "--num-envs", "--num-timesteps", "--seed", "--impl", "--out", "--restore", "--eval-every")
-    fields = ("--env.rewards.reaching_object.params.std 0.1", "--env.robot.arm.effort 25.0", "--ppo.discounting 0.98")
+    fields = ("--env.rewards.reaching_object.params.std 0.1", "--env.robot.arm.effort (25.0, ", "--ppo.discounting 0.98")
     assert all(text in out for text in (*flags, *fields))
 
 

@@ -91,8 +91,8 @@ def test_summary_by_hand():
         "overflow": np.array([0.0, 0, 3, 0]),
         "reward/a": np.array([1.0, 2, 3, 4]),
     }
-    qpos = np.zeros((250, 0, 16))
-    summary = rollout.Episodes(metrics, np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250]), qpos, qpos[..., :3]).summary()
+    returns, lengths, qpos = np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250]), np.zeros((250, 0, 16))
+    summary = rollout.Episodes(metrics, returns, lengths, qpos, qpos[..., :3], np.zeros((250, 4)), memory=()).summary()
     assert summary["success_rate"] == 0.5 and summary["grasp_rate"] == 0.75 and summary["dropped_rate"] == 0.25
     assert summary["time_to_grasp_mean"] == 2.0  # of those that grasped
     assert summary["final_distance_mean"] == pytest.approx(0.18) and summary["final_distance_median"] == pytest.approx(0.105)

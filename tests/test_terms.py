@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, terms
-from mjx_nero.mdp import actions, commands, curriculum, events, observations, rewards, terminations
+from mjx_nero.mdp import actions, commands, curriculum, events, observations, rewards, success, terminations
 from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.types import View
 
@@ -32,6 +32,8 @@ def view(**changes) -> View:
         "root_pos_w": [1.0, 2.0, 3.0],
         "command": [0.0, 0.0, 0.3],
         "goal_pos_w": [1.0, 2.0, 3.3],
+        "goal_quat_w": [0.0, 1.0, 0.0, 0.0],
+        "goal_linvel_w": [0.1, 0.2, 0.3],
         "action": [0.5, -1.0, 2.0],
         "last_action": [0.0, 1.0, 2.0],
         **changes,
@@ -65,6 +67,11 @@ REWARDS = [
     (rewards.held_at_goal, {"threshold": 0.09, "minimal_height": 0.025, "grasp_radius": 0.04}, at_height(0.03), 0.0),
     (rewards.held_at_goal, {"threshold": 0.11, "minimal_height": 0.025, "grasp_radius": 0.02}, at_height(0.03), 0.0),
     (rewards.held_at_goal, {"threshold": 0.11, "minimal_height": 0.035, "grasp_radius": 0.04}, at_height(0.03), 0.0),
+    # 10 cm from the goal whether lifted or not; the grasp point (0.03, 0.04, -0.12) from it: 13 cm
+    (rewards.goal_distance, {"std": 0.1}, view(), 1 - TANH_1),
+    (rewards.goal_distance, {"std": 0.2}, at_height(-1.0), 1 - TANH_HALF),
+    (rewards.ee_goal_distance, {"std": 0.13}, view(ee_pos_w=[1.03, 2.04, 3.42]), 1 - TANH_1),
+    (rewards.ee_goal_distance, {"std": 0.26}, view(ee_pos_w=[1.03, 2.04, 3.42]), 1 - TANH_HALF),
     (rewards.action_rate_l2, {}, view(), 0.25 + 4.0 + 0.0),
     (rewards.joint_vel_l2, {}, view(), 4.0 + 9.0),
 ]
@@ -89,6 +96,7 @@ def test_held_and_at_goal():
 
 
 OBSERVATIONS = [
+    (observations.joint_pos, [0.5, -0.25]),
     (observations.joint_pos_rel, [0.25, -0.5]),
     (observations.joint_vel_rel, [2, -3]),
     (observations.object_position, [0, 0, 0.2]),
@@ -100,6 +108,9 @@ OBSERVATIONS = [
     (observations.target_error, [0.25, 0.25]),
     (observations.object_velocity, [1, 2, 3, 4, 5, 6]),
     (observations.object_orientation, [0.5, 0.5, 0.5, 0.5]),
+    (observations.ee_orientation, [1, 0, 0, 0]),
+    (observations.goal_position, [0, 0, 0.3]),
+    (observations.goal_orientation, [0, 1, 0, 0]),
 ]
 
 
@@ -132,6 +143,67 @@ def test_every_observation_is_tested():
 )
 def test_terminations(func, params, changes, hit):
     assert bool(func(view(**changes), **params)) is hit
+
+
+PLACED = {"threshold": 0.01, "max_speed": 0.005, "clearance": 0.05}
+# 9 mm from the goal, 4.9 mm/s, 51 mm from the grasp point
+REST = {
+    "object_pos_w": [0.0, 0.0, 0.0],
+    "goal_pos_w": [0.0, 0.009, 0.0],
+    "object_linvel_w": [0.0049, 0.0, 0.0],
+    "ee_pos_w": [0.0, 0.0, 0.051],
+}
+
+
+@pytest.mark.parametrize(
+    ("func", "params", "changes", "hit"),
+    [
+        # 10 cm from the object to the goal, 13 cm from the grasp point
+        (success.object_at_goal, {"threshold": 0.101}, {}, True),
+        (success.object_at_goal, {"threshold": 0.099}, {}, False),
+        (success.ee_at_goal, {"threshold": 0.131}, {"ee_pos_w": [1.03, 2.04, 3.42]}, True),
+        (success.ee_at_goal, {"threshold": 0.129}, {"ee_pos_w": [1.03, 2.04, 3.42]}, False),
+        (success.object_placed, PLACED, REST, True),
+        (success.object_placed, PLACED, {**REST, "goal_pos_w": [0.0, 0.011, 0.0]}, False),  # elsewhere
+        (success.object_placed, PLACED, {**REST, "object_linvel_w": [0.003, 0.0, -0.0041]}, False),  # sliding
+        (success.object_placed, PLACED, {**REST, "ee_pos_w": [0.0, 0.0, 0.049]}, False),  # in the grip
+    ],
+)
+def test_success(func, params, changes, hit):
+    assert bool(func(view(**changes), **params)) is hit
+
+
+def test_distances_of_success():
+    assert float(success.object_distance(view())) == pytest.approx(0.1, abs=1e-6)
+    assert float(success.ee_distance(view(ee_pos_w=[1.03, 2.04, 3.42]))) == pytest.approx(0.13, abs=1e-6)
+
+
+def test_pose_is_a_place_in_its_box_and_one_orientation():
+    params = {"x": (0.4, 0.5), "y": (-0.1, 0.1), "z": (0.3, 0.3), "quat": (0.0, 0.0, 1.0, 0.0)}
+    pos, quat = jax.vmap(lambda k: commands.pose(k, **params))(jax.random.split(KEY, 500))
+    assert (quat == jnp.array([0.0, 0.0, 1.0, 0.0])).all()
+    np.testing.assert_allclose(pos.min(0), [0.4, -0.1, 0.3], atol=0.005)
+    np.testing.assert_allclose(pos.max(0), [0.5, 0.1, 0.3], atol=0.005)
+    box = {name: params[name] for name in "xyz"}
+    np.testing.assert_array_equal(commands.pose(KEY, **params)[0], commands.uniform_position(KEY, **box))
+
+
+@pytest.mark.parametrize(
+    ("time", "offset"),
+    [(0.0, [0, 0.1, 0]), (1.0, [0, 0, 0.1]), (2.0, [0, -0.1, 0]), (0.5, [0, 0.0707107, 0.0707107]), (4.0, [0, 0.1, 0])],
+)
+def test_circle(time, offset):
+    """A turn of 4 s in the yz plane that starts at +y and rises."""
+    at = commands.circle(jnp.array([0.5, 0.1, 0.4]), jnp.array(time), radius=0.1, frequency=0.25)
+    np.testing.assert_allclose(at, np.add([0.5, 0.1, 0.4], offset), atol=1e-6)
+
+
+def test_circle_of_no_radius_or_no_frequency_stays():
+    center = jnp.array([0.5, 0.1, 0.4])
+    np.testing.assert_array_equal(commands.circle(center, jnp.array(0.7), radius=0.0, frequency=0.25), center)
+    for time in (0.0, 0.7):
+        at = commands.circle(center, jnp.array(time), radius=0.1, frequency=0.0)
+        np.testing.assert_allclose(at, [0.5, 0.2, 0.4], atol=1e-7)
 
 
 def test_actions():
@@ -278,6 +350,11 @@ def test_any_of_several_terms_ends_the_episode():
             lambda: CommandTerm(commands.uniform_position, params={"x": (0, 1)}),
             "uniform_position takes the parameters x, y, z; given: x",
         ),
+        (
+            lambda: Term(success.ee_at_goal, params={"at": 1.0}),
+            "ee_at_goal takes the parameters threshold; given: at",
+        ),
+        (lambda: Term(commands.circle, params={"radius": 1.0}), "circle takes the parameters radius, frequency; given: radius"),
         (lambda: Term(curriculum.step_weight, params={"to": 1.0}), "step_weight takes the parameters to, num_steps; given: to"),
     ],
 )

@@ -1,1 +1,36 @@
 """Classical control: pure functions for one robot, vmapped for many."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_nero import config
+from mjx_nero.control.controller import Controller
+from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
+from mjx_nero.control.ik import IkCfg
+from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
+from mjx_nero.robots import RobotCfg
+from mjx_nero.types import UserError
+
+# name -> (class, its config); the class takes (robot, dt, config)
+CONTROLLERS: dict[str, tuple[Any, Any]] = {
+    "ik": (IkFollower, IkCfg()),
+    "rmpflow": (RmpFollower, RmpCfg()),
+    "pick_place": (PickPlace, PickPlaceCfg()),
+}
+
+
+def make(name: str, robot: RobotCfg, dt: float, overrides: Mapping[str, Any] | None = None) -> Controller:
+    """A controller by name.
+
+    Args:
+        name: one of ``CONTROLLERS``.
+        dt: control step [s].
+        overrides: fields of its config by dotted name.
+
+    Raises:
+        UserError: unknown name or field, or a value that the controller refuses.
+    """
+    if name not in CONTROLLERS:
+        raise UserError(f"unknown controller {name!r}: choose one of {', '.join(CONTROLLERS)}")
+    kind, default = CONTROLLERS[name]
+    return kind(robot, dt, config.override(default, overrides or {}))

@@ -63,8 +63,8 @@ class InverseKinematics:
 
     Levenberg-Marquardt steps with the geometric Jacobian, damped in proportion to the squared residual (Sugihara, "Solvability-
     unconcerned inverse kinematics by the Levenberg-Marquardt method", 2011) and projected onto the joint limits: a joint that
-    a step would push through its limit stays there and the others do the work. Turns of more than 2 pi are undone where the
-    limits allow it, towards ``q0``.
+    a step would push through its limit stays there and the others do the work. Whole turns away from ``q0`` are taken back where
+    the limits allow it.
 
     The methods are pure; compile them with ``jax.jit``. A target that is not finite, or a zero quaternion, gives ``q0`` (within
     the limits), no success and infinite errors.
@@ -104,16 +104,14 @@ class InverseKinematics:
         return jax.tree.map(lambda x: x[0], self.solve_batch(pos[None], quat[None], q0[None], key))
 
     def local(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"]) -> Solution:
-        """One pose from ``q0`` alone: for control loops, where the target is near and a jump to another solution is not wanted."""
-        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], None))
+        """One pose from ``q0`` alone: for control loops, whose targets are near and where a jump to another solution harms."""
+        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], jax.random.PRNGKey(0), 0))
 
-    def solve_batch(
-        self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key
-    ) -> Solution:
+    def solve_batch(self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key) -> Solution:
         """``solve`` for many poses at once. Quicker than ``vmap``: the starts go to the poses that are still unsolved."""
-        return self._solve(pos, quat, q0, key)
+        return self._solve(pos, quat, q0, key, self.cfg.restarts)
 
-    def _solve(self, pos: Array, quat: Array, q0: Array, key: Key | None) -> Solution:
+    def _solve(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int) -> Solution:
         # On a GPU the default precision of products is too coarse for kinematics.
         with jax.default_matmul_precision("highest"):
             norm = jnp.linalg.norm(quat, axis=-1)
@@ -121,10 +119,16 @@ class InverseKinematics:
             pos = jnp.where(valid[:, None], pos, 0.0)
             quat = jnp.where(valid[:, None], quat / norm[:, None], jnp.array([1.0, 0.0, 0.0, 0.0]))
             q0 = self._within(jnp.where(jnp.isfinite(q0), q0, self._center))
-            return self._search(pos, quat, q0, valid, key)
+            return self._search(pos, quat, q0, valid, key, restarts)
 
     def _search(
-        self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], valid: Bool[Array, " b"], key: Key | None
+        self,
+        pos: Float[Array, "b 3"],
+        quat: Float[Array, "b 4"],
+        q0: Float[Array, "b nj"],
+        valid: Bool[Array, " b"],
+        key: Key,
+        restarts: int,
     ) -> Solution:
         b = len(pos)
         nothing = Solution(q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
@@ -132,7 +136,7 @@ class InverseKinematics:
 
         def unsolved(carry):
             restart, found = carry
-            return (restart < self.cfg.restarts) & ~jnp.all(found.success | ~valid)
+            return (restart < restarts) & ~jnp.all(found.success | ~valid)
 
         def again(carry):
             restart, found = carry
@@ -142,13 +146,13 @@ class InverseKinematics:
             start = self._starts(jax.random.fold_in(key, restart), pos[target], quat[target])
             return restart + 1, self._descents(start, target, pos, quat, q0, solved, found)
 
-        if key is not None:
+        if restarts:
             _, found = jax.lax.while_loop(unsolved, again, (0, found))
         return jax.tree.map(lambda x, none: jnp.where(valid.reshape(b, *[1] * (x.ndim - 1)), x, none), found, nothing)
 
     def _starts(self, key: Key, pos: Float[Array, "n 3"], quat: Float[Array, "n 4"]) -> Float[Array, "n nj"]:
         shape = (len(pos), self.cfg.candidates, len(self._center))
-        q = self._center + self._half * jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+        q = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) * self._half + self._center
         distance = jax.vmap(jax.vmap(self._distance, (0, None, None)))(q, pos, quat)
         return q[jnp.arange(len(pos)), jnp.argmin(distance, axis=1)]
 
@@ -163,6 +167,7 @@ class InverseKinematics:
         found: Solution,
     ) -> Solution:
         """Runs all descents until every pose is solved or the budget is spent; keeps what is better than ``found``."""
+
         def going(carry):
             i, trial, _ = carry
             return (i <= self.cfg.iterations) & ~jnp.all(solved.at[target].max(trial.success))
@@ -177,7 +182,7 @@ class InverseKinematics:
         _, trial, _ = jax.lax.while_loop(going, step, (0, trial, start))
         # The same pose, with each joint as close to the warm start as whole turns bring it
         q = trial.q - 2 * jnp.pi * self._hinge * jnp.round((trial.q - q0[target]) / (2 * jnp.pi))
-        trial = trial.replace(q=jnp.where(q == self._within(q), q, trial.q))
+        trial = dataclasses.replace(trial, q=jnp.where(q == self._within(q), q, trial.q))
 
         rating, before = self._rating(trial, q0[target]), self._rating(found, q0)
         best = before.at[target].min(rating)[target]
@@ -198,7 +203,9 @@ class InverseKinematics:
         position, orientation = jnp.linalg.norm(linear), jnp.linalg.norm(angular)
         met = (position <= self.cfg.position_tolerance) & (orientation <= self.cfg.orientation_tolerance)
         weight = self.cfg.orientation_weight
-        error = jnp.concatenate([linear * jnp.minimum(1.0, self.cfg.max_distance / jnp.maximum(position, 1e-6)), weight * angular])
+        error = jnp.concatenate(
+            [linear * jnp.minimum(1.0, self.cfg.max_distance / jnp.maximum(position, 1e-6)), weight * angular]
+        )
         jacobian = jacobian * jnp.array([1.0, 1.0, 1.0, weight, weight, weight])[:, None]
         uphill = error @ jacobian
         held = ((q <= self.chain.lower) & (uphill < 0)) | ((q >= self.chain.upper) & (uphill > 0))

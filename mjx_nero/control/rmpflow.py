@@ -159,19 +159,19 @@ def along(direction: Float[Array, "*n 3"], curvature: Float[Array, "*n"], leaf: 
 def clearance(point, vel, pt1, pt2) -> tuple[Array, Array, Array, Array]:
     """Distance of a point to a segment [m], its gradient, its rate, its second derivative while the point moves straight on."""
     axis = pt2 - pt1
-    square = jnp.maximum(axis @ axis, 1e-12)
-    share = jnp.clip((point - pt1) @ axis / square, 0.0, 1.0)
+    square = jnp.maximum(_dot(axis, axis), 1e-12)
+    share = jnp.clip(_dot(point - pt1, axis) / square, 0.0, 1.0)
     offset = point - pt1 - share * axis
     distance = _length(offset)
     direction = offset / distance
-    rate = direction @ vel
-    slide = jnp.where((share > 0) & (share < 1), (axis @ vel) ** 2 / square, 0.0)  # along a cylinder nothing turns
-    return distance, direction, rate, jnp.maximum(vel @ vel - rate**2 - slide, 0.0) / distance
+    rate = _dot(direction, vel)
+    slide = jnp.where((share > 0) & (share < 1), _dot(axis, vel) ** 2 / square, 0.0)  # along a cylinder nothing turns
+    return distance, direction, rate, jnp.maximum(_dot(vel, vel) - rate**2 - slide, 0.0) / distance
 
 
 def pull_back(jac: Float[Array, "n 3 nj"], curvature: Float[Array, "n 3"], node: Rmp) -> Rmp:
     """The sum at the root of policies on ``n`` points; ``curvature`` = Jdot qd."""
-    weighted = jnp.einsum("nab,nbj->naj", node.metric, jac, precision="highest")  # a GPU's default would round to 10 bits
+    weighted = jnp.einsum("nab,nbj->naj", node.metric, jac, precision="highest")
     force = node.force - jnp.sum(node.metric * curvature[:, None, :], axis=-1)
     return Rmp(jnp.sum(jac * force[..., None], axis=(0, 1)), jnp.einsum("nai,naj->ij", jac, weighted, precision="highest"))
 
@@ -228,7 +228,8 @@ class RmpFlow:
         if not maximum_substep_size > 0:
             raise UserError(f"maximum_substep_size takes a time above 0 s, got {maximum_substep_size!r}")
         frame, folder = frame or robot.ee_site, ASSETS / robot.name / "rmpflow"
-        descriptor, config = descriptor or folder / "robot_descriptor.yaml", config or folder / "rmpflow_common.yaml"
+        descriptor = pathlib.Path(descriptor or folder / "robot_descriptor.yaml")
+        config = pathlib.Path(config or folder / "rmpflow_common.yaml")
         arm, self.config = cfg.load_pair(descriptor, config, robot.arm.joints)
         self.joints, self.default_q = arm.cspace, np.array(arm.default_q, np.float32)
         self._max_substep = maximum_substep_size
@@ -318,11 +319,8 @@ class RmpFlow:
 
     def _nodes(self, q, qd, count: int) -> tuple[Array, Array, Array, Array]:
         """Of the first ``count`` nodes: values and velocities [n, 3], Jdot qd [n, 3], J [n, 3, nj]."""
-        frame, vector, is_point = (
-            self._frame[:count],
-            jnp.asarray(self._vector[:count]),
-            jnp.asarray(self._is_point[:count, None]),
-        )
+        frame, vector = self._frame[:count], jnp.asarray(self._vector[:count])
+        is_point = jnp.asarray(self._is_point[:count, None])
 
         def moves(q):
             pos, quat, jac = self.chain.jacobians(q)
@@ -341,9 +339,9 @@ class RmpFlow:
             error, vel = target.position - x[0], xd[0] if target.velocity is None else xd[0] - target.velocity
             distance = _length(error)
             away = -error / distance
-            rate = away @ vel
+            rate = _dot(away, vel)
             # Closer than a millimetre the line to the target has no direction worth the name.
-            bend = jnp.maximum(vel @ vel - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
+            bend = jnp.maximum(_dot(vel, vel) - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
             pull, drag = target_rmp(p.target_rmp, error, vel), along(away, bend, damping_rmp(p.damping_rmp, rate))
             nodes[0] = jax.tree.map(lambda a, b: (a + b)[None], pull, drag)
         if target.orientation is not None:
@@ -370,15 +368,21 @@ class RmpFlow:
         p = self.config.rmp_params
         leaves = [cspace_target_rmp(p.cspace_target_rmp, q, qd, self.default_q)]
         leaves.append(joint_velocity_cap_rmp(p.joint_velocity_cap_rmp, qd))
-        for limit, jac in zip(self._limits, (self._per_range, -self._per_range), strict=True):
+        per_range = jnp.asarray(self._per_range)
+        for limit, jac in zip(self._limits, (per_range, -per_range), strict=True):
             leaf = joint_limit_rmp(p.joint_limit_rmp, jac * (q - limit), jac * qd)
             leaves.append(Rmp(jac * leaf.force, jac**2 * leaf.metric))
         return jax.tree.map(lambda *parts: sum(parts), *leaves)
 
 
+def _dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
+    """Inner product in full precision: ``@`` takes the default of the device, on a GPU 10 bits."""
+    return jnp.sum(a * b)
+
+
 def _length(vec: Float[Array, " n"]) -> Float[Array, ""]:
     """Euclidean norm, with a derivative also at zero."""
-    return jnp.sqrt(jnp.sum(vec * vec) + 1e-12)
+    return jnp.sqrt(_dot(vec, vec) + 1e-12)
 
 
 def _bell(x, width):

@@ -11,10 +11,11 @@ from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, T
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """What differs from robot to robot: the frame that follows, and where the target is [m]."""
+    """What differs from robot to robot: the frame that follows, and where the target is: a box about ``center`` [m]."""
 
     frame: str
     center: tuple[float, float, float]
+    spread: tuple[float, float, float]
     radius: float
     scene: SceneCfg
 
@@ -23,22 +24,29 @@ class Work:
 COBOTTA_WORK = Work(
     frame="flange",
     center=(0.5, 0.0, 0.5),
+    spread=(0.05, 0.15, 0.1),
     radius=0.1,
-    scene=SceneCfg(cube=False, cube_edge=0.0515, goal="cube", table_size=(1.2, 1.4), look_at=(0.2, 0.0, 0.4), view_distance=2.1),
+    scene=SceneCfg(cube=False, cube_edge=0.0515, goal="cube", table_size=(1.2, 1.4), look_at=(0.25, 0.0, 0.4), view_distance=1.7),
 )
-NERO_WORK = Work(frame="ee", center=(0.36, 0.0, 0.25), radius=0.06, scene=SceneCfg(cube=False, goal="cube"))
+NERO_WORK = Work(
+    frame="ee",
+    center=(0.32, 0.0, 0.17),  # with its wrist's range the arm points straight down up to about z = 0.25
+    spread=(0.02, 0.08, 0.02),
+    radius=0.05,
+    scene=SceneCfg(cube=False, goal="cube"),
+)
 
 
 def default(robot: RobotCfg, work: Work) -> EnvCfg:
     """The target runs round a vertical circle, four seconds a turn; success is to stay within 2 cm of it."""
-    x, y, z = ((c, c) for c in work.center)
+    x, y, z = ((c - s, c + s) for c, s in zip(work.center, work.spread, strict=True))
     return EnvCfg(
         # As a robot's own controller would: a weak drive that sags would never arrive.
         robot=dataclasses.replace(robot, ee_site=work.frame, gravity_compensation=True),
         scene=work.scene,
         episode_length_s=12.0,
         action=ActionCfg(absolute=True),
-        controllers=("rmpflow", "ik"),
+        controllers={"rmpflow": {}, "ik": {}},
         command=CommandTerm(commands.pose, params={"x": x, "y": y, "z": z, "quat": robot.down}, resample_s=12.0),
         motion=Term(commands.circle, params={"radius": work.radius, "frequency": 0.25}),
         success=SuccessCfg(

@@ -13,11 +13,13 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """What differs from robot to robot: where the cube starts and where it has to go [m], and how long that may take [s]."""
+    """What differs from robot to robot: where the cube starts, where it has to go, how high it travels [m], and how long that may
+    take [s]."""
 
     scene: SceneCfg
     cube: tuple[Range, Range]
     goal: tuple[Range, Range]
+    travel_height: float
     episode_length_s: float
 
 
@@ -29,17 +31,19 @@ COBOTTA_WORK = Work(
         goal="cube",
         table_center=(0.1, 0.15),
         table_size=(1.5, 1.5),
-        look_at=(0.05, 0.2, 0.3),
-        view_distance=2.2,
+        look_at=(0.15, 0.05, 0.27),
+        view_distance=1.85,
     ),
     cube=((0.3, 0.6), (-0.3, 0.3)),
     goal=((-0.4, -0.2), (0.5, 0.65)),
+    travel_height=0.2,
     episode_length_s=20.0,
 )
 NERO_WORK = Work(
     scene=SceneCfg(goal="cube"),
     cube=((0.3, 0.4), (-0.1, 0.0)),
     goal=((0.3, 0.4), (0.08, 0.2)),
+    travel_height=0.15,  # with its wrist's range the arm points straight down up to about z = 0.2 there
     episode_length_s=20.0,
 )
 
@@ -53,7 +57,7 @@ def default(robot: RobotCfg, work: Work) -> EnvCfg:
         episode_length_s=work.episode_length_s,
         object_start=(0.0, 0.0, rest),
         action=ActionCfg(absolute=True),
-        controllers=("pick_place",),
+        controllers={"pick_place": {"end_effector_initial_height": work.travel_height}},
         command=CommandTerm(
             commands.uniform_position,
             params={"x": work.goal[0], "y": work.goal[1], "z": (rest, rest)},

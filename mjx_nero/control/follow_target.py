@@ -1,0 +1,120 @@
+"""Follow a target with the end effector: by inverse kinematics at every step, or by RMPflow."""
+
+import dataclasses
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from mjx_nero.control.controller import Memory
+from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
+from mjx_nero.robots import RobotCfg
+from mjx_nero.types import UserError, View
+
+
+@dataclasses.dataclass(frozen=True)
+class RmpCfg:
+    """Files ("": the robot's own) and the longest integration step [s]."""
+
+    descriptor: str = ""
+    config: str = ""
+    maximum_substep_size: float = 0.00334
+
+
+@struct.dataclass
+class IkMemory:
+    """Between two steps of ``IkFollower``."""
+
+    q: Float[Array, " nj"]  # the set-point [rad]
+    step: Int[Array, ""]
+    failures: Int[Array, ""]  # steps without a solution
+
+
+class IkFollower:
+    """Solves the target's pose at every step and moves the set-point there at the drives' speed limits.
+
+    Without a solution the set-point stays where it is.
+
+    Args:
+        robot: its ``ee_site`` follows.
+        dt: control step [s].
+        cfg: of the solver.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg = IkCfg()):
+        self.ik, self.dt = InverseKinematics(robot, cfg=cfg), dt
+        self._max_step = np.array(robot.arm.speed, np.float32) * dt
+        self._lead = np.array(robot.arm.lead, np.float32)
+        self._n = len(robot.arm.joints)
+
+    def init(self, view: View) -> IkMemory:
+        """Starts where the arm is."""
+        zero = jnp.zeros((), jnp.int32)
+        return IkMemory(q=view.joint_pos[: self._n], step=zero, failures=zero)
+
+    def step(self, memory: IkMemory, view: View) -> tuple[IkMemory, Float[Array, " nu"]]:
+        """Targets of the arm's drives; the gripper's stay."""
+        key = jax.random.fold_in(jax.random.PRNGKey(0), memory.step)
+        found = self.ik.solve(view.goal_pos_w, view.goal_quat_w, memory.q, key)
+        goal = jnp.where(found.success, found.q, memory.q)
+        q = memory.q + jnp.clip(goal - memory.q, -self._max_step, self._max_step)
+        targets = q + self._lead * (q - memory.q) / self.dt
+        failures = memory.failures + ~found.success
+        return IkMemory(q, memory.step + 1, failures), jnp.concatenate([targets, view.ctrl[self._n :]])
+
+    def warning(self, memory: IkMemory) -> str:
+        """Says where the solver failed."""
+        failed = np.asarray(memory.failures)
+        if not failed.any():
+            return ""
+        return (
+            f"inverse kinematics found no solution in {failed.sum()} of {np.asarray(memory.step).sum()} steps "
+            f"({(failed > 0).sum()} of {failed.size} episodes): the arm did not move there"
+        )
+
+
+class RmpFollower:
+    """RMPflow towards the target, from the measured joint state at every step.
+
+    Args:
+        robot: its ``ee_site`` follows.
+        dt: control step [s].
+        cfg: files and integration.
+        obstacles: what to keep clear of.
+
+    Raises:
+        UserError: the robot has no RMPflow files, or they do not fit it.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg(), obstacles: Obstacles | None = None):
+        descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
+        self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
+        if set(self.flow.joints) != set(robot.arm.joints):
+            raise UserError(f"RMPflow moves {', '.join(self.flow.joints)}; the arm has {', '.join(robot.arm.joints)}")
+        self.dt, self._obstacles = dt, Obstacles.none() if obstacles is None else obstacles
+        self._order = np.array([robot.arm.joints.index(j) for j in self.flow.joints])
+        self._lead = np.array(robot.arm.lead, np.float32)
+        self._n = len(robot.arm.joints)
+
+    def init(self, view: View) -> Memory:
+        """Nothing to remember."""
+        return ()
+
+    def step(self, memory: Memory, view: View) -> tuple[Memory, Float[Array, " nu"]]:
+        """Targets of the arm's drives; the gripper's stay."""
+        target = Target(view.goal_pos_w, view.goal_quat_w, view.goal_linvel_w)
+        return memory, jnp.concatenate([self.arm(view, target), view.ctrl[self._n :]])
+
+    def arm(self, view: View, target: Target) -> Float[Array, " nj"]:
+        """Targets of the arm's drives on the way to ``target`` [rad]."""
+        at, speed = view.joint_pos[self._order], view.joint_vel[self._order]
+        q, qd = self.flow.step(at, speed, target, self._obstacles, self.dt)
+        return jnp.zeros(self._n).at[self._order].set(q + self._lead[self._order] * qd)
+
+    def warning(self, memory: Memory) -> str:
+        """Nothing."""
+        return ""

@@ -1,0 +1,78 @@
+"""Parallel gripper: drive targets that open, close or step it. Pure functions of the measured joint positions."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero import scene
+from mjx_nero.robots import RobotCfg
+from mjx_nero.types import UserError
+
+Positions = Float[Array, " n"]
+
+
+class ParallelGripper:
+    """The gripper of a robot, as Isaac Sim's class of this name works it.
+
+    With ``action_deltas``, ``open`` and ``close`` lead the *measured* positions by a constant step (+ opens, - closes), which a
+    position drive turns into a roughly constant force. Without, they ask for the opened and the closed positions. All targets
+    keep to the joints' ranges.
+
+    Args:
+        robot: whose gripper.
+        opened, closed: joint positions [rad or m]; None: the robot's own.
+        action_deltas: [rad or m], one a joint, or None.
+
+    Attributes:
+        joints: names, in the order of all positions.
+        opened, closed: [n].
+
+    Raises:
+        UserError: a list has not one value a joint.
+    """
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        opened: tuple[float, ...] | None = None,
+        closed: tuple[float, ...] | None = None,
+        action_deltas: tuple[float, ...] | None = None,
+    ):
+        cfg, model = robot.gripper, scene.robot_model(robot)
+        self.joints, self._gap, self._positions = cfg.joints, cfg.gap, cfg.positions
+        for name, values in (("opened", opened), ("closed", closed), ("action_deltas", action_deltas)):
+            if values is not None and len(values) != len(self.joints):
+                raise UserError(f"{name} takes one value for each of {', '.join(self.joints)}, got {values}")
+        self.opened = np.array(cfg.open if opened is None else opened, np.float32)
+        self.closed = np.array(cfg.close if closed is None else closed, np.float32)
+        self.deltas = None if action_deltas is None else np.array(action_deltas, np.float32)
+        self._range = np.array([model.joint(j).range for j in self.joints], np.float32).T
+        self._speed = np.array(cfg.speed, np.float32)
+
+    def open(self, positions: Positions) -> Positions:
+        """Targets that open, from measured ``positions``."""
+        return self.step(positions, self.deltas) if self.deltas is not None else self._clip(self.opened)
+
+    def close(self, positions: Positions) -> Positions:
+        """Targets that close, from measured ``positions``."""
+        return self.step(positions, -self.deltas) if self.deltas is not None else self._clip(self.closed)
+
+    def step(self, positions: Positions, deltas) -> Positions:
+        """Targets ``deltas`` away from the measured ``positions`` [rad or m]."""
+        return self._clip(positions + jnp.asarray(deltas, jnp.float32))
+
+    def forward(self, closing: Bool[Array, ""], positions: Positions, targets: Positions, dt: float) -> Positions:
+        """Targets a control step of ``dt`` seconds later: on from ``targets``, towards open or closed, at the drives' speed limit."""
+        wanted = jnp.where(closing, self.close(positions), self.open(positions))
+        return targets + jnp.clip(wanted - targets, -self._speed * dt, self._speed * dt)
+
+    def gap(self, positions: Positions) -> Float[Array, ""]:
+        """Distance between the pads [m]."""
+        return self._gap(positions)
+
+    def positions(self, gap: Float[Array, ""]) -> Positions:
+        """Joint positions that leave ``gap`` [m] between the pads, within the joints' ranges."""
+        return self._clip(self._positions(gap))
+
+    def _clip(self, positions) -> Positions:
+        return jnp.clip(jnp.asarray(positions, jnp.float32), *self._range)

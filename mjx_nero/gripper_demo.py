@@ -1,0 +1,167 @@
+"""The gripper opens and closes by small steps: python -m mjx_nero.gripper_demo --env cobotta_pick_place --out gripper.png
+
+In MuJoCo's C library, the arm at home. Every control step asks for the measured positions plus or minus a constant, so that the
+command keeps a constant lead until the joints' ranges end it. Nothing limits the drives' speed but their damping.
+"""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from mjx_nero import cli, kinematics, registry, render, scene
+from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.env import ManipulationEnv
+from mjx_nero.physics import NativePhysics
+from mjx_nero.types import UserError
+
+_SHARE = 0.08  # default step, of a joint's range: 0.1 rad for the RG6, as in Isaac Sim's tutorial
+_ARRIVED = 1e-3  # [m]: a gap this close to where it ends counts as there
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """What the gripper did, control step by control step; movements alternate, the first one closes.
+
+    Attributes:
+        time: [n] at the end of the step [s].
+        movement: [n] number of the movement, from 0; even ones close.
+        commanded: [n] gap between the pads that was asked for [m].
+        measured: [n] gap at the end of the step [m].
+        qpos: [n, nq].
+        start: gap before the first step [m].
+    """
+
+    time: np.ndarray
+    movement: np.ndarray
+    commanded: np.ndarray
+    measured: np.ndarray
+    qpos: np.ndarray
+    start: float
+
+
+def demo(env: ManipulationEnv, cycles: int = 2, delta: float | None = None, seconds: float = 1.5) -> Motion:
+    """Closes and opens the gripper ``cycles`` times.
+
+    Args:
+        env: its robot, scene and time step.
+        delta: how far the command leads the measured positions [rad or m]; None: 8% of each joint's range.
+        seconds: of one movement.
+
+    Raises:
+        UserError: ``delta`` or ``seconds`` is not above 0.
+    """
+    for name, value in (("delta", delta), ("seconds", seconds)):
+        if value is not None and not 0 < value < math.inf:
+            raise UserError(f"{name} takes a number above 0, got {value:g}")
+    robot, model = env.cfg.robot, env.physics_model
+    gripper, native = ParallelGripper(robot), NativePhysics(model, env.cfg.sim)
+    at = [int(model.joint(j).qposadr[0]) for j in gripper.joints]
+    width = np.array([np.ptp(model.joint(j).range) for j in gripper.joints])
+    closes = np.sign(gripper.closed - gripper.opened) * (_SHARE * width if delta is None else delta)
+    step, gap = jax.jit(gripper.step), jax.jit(jax.vmap(gripper.gap))
+
+    sim = jax.tree.map(lambda x: x[None], jax.jit(env.draw)(jax.random.PRNGKey(0))[0])
+    start = float(gap(sim.qpos[:, at])[0])
+    movement = np.repeat(np.arange(2 * cycles), max(1, round(seconds / env.dt)))
+    targets, qpos = [], []
+    for m in movement:
+        targets.append(step(sim.qpos[0, at], closes if m % 2 == 0 else -closes))
+        sim = native.step(sim, jnp.concatenate([jnp.array(robot.arm.home), targets[-1]])[None])
+        qpos.append(np.asarray(sim.qpos[0]))
+    commanded, measured = (np.asarray(gap(jnp.stack(list(q)))) for q in (targets, [q[at] for q in qpos]))
+    return Motion(env.dt * np.arange(1, len(movement) + 1), movement, commanded, measured, np.stack(qpos), start)
+
+
+def table(motion: Motion) -> Table:
+    """A line a movement."""
+    view = Table(title=r"gap between the pads \[mm]")  # rich takes a bare [word] for a style
+    for name in ("movement", "from", "to", "off the command", r"time \[s]"):
+        view.add_column(name, justify="left" if name == "movement" else "right")
+    begin, start = 0.0, motion.start
+    for m in range(motion.movement[-1] + 1):
+        part = motion.movement == m
+        measured, end = motion.measured[part], motion.commanded[part][-1]
+        there = np.flatnonzero(np.abs(measured - end) < _ARRIVED)
+        arrived = f"{motion.time[part][there[0]] - begin:.2f}" if len(there) else "not there"
+        gaps = (f"{1e3 * x:.2f}" for x in (start, measured[-1], abs(measured[-1] - end)))
+        view.add_row("opens" if m % 2 else "closes", *gaps, arrived)
+        begin, start = motion.time[part][-1], measured[-1]
+    return view
+
+
+def plot(motion: Motion, axes) -> None:
+    """Commanded and measured gap over time, on matplotlib axes."""
+    axes.plot(motion.time, 1e3 * motion.commanded, label="commanded", color="tab:gray", drawstyle="steps-pre")
+    axes.plot(motion.time, 1e3 * motion.measured, label="measured", color="tab:blue")
+    axes.set(xlabel="time [s]", ylabel="gap between the pads [mm]")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8)
+
+
+def close_up(env: ManipulationEnv) -> mujoco.MjModel:
+    """The scene with its cameras on the gripper at home."""
+    cfg, qpos = env.cfg, env.physics_model.qpos0.copy()
+    for joint, value in zip(cfg.robot.joints, cfg.robot.home, strict=True):
+        qpos[env.physics_model.joint(joint).qposadr[0]] = value
+    x, y, z = (float(v) for v in kinematics.site_pose_fn(env.physics_model, cfg.robot.ee_site)(jnp.asarray(qpos))[0])
+    return scene.build(cfg.robot, dataclasses.replace(cfg.scene, look_at=(x, y, z + 0.05), view_distance=0.7), cfg.sim)
+
+
+def _save_plot(motion: Motion, title: str, path: pathlib.Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    axes = figure.subplots()
+    plot(motion, axes)
+    axes.set_title(title, loc="left")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        figure.savefig(part, dpi=110)
+        part.replace(path)
+    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not know
+        part.unlink(missing_ok=True)
+        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    parser = cli.Parser(prog="python -m mjx_nero.gripper_demo", description="Opens and closes a gripper, and plots its gap.")
+    parser.add_argument("--env", default="cobotta_pick_place", help="environment, for its robot (default: %(default)s)")
+    parser.add_argument("--cycles", type=cli.positive, default=2, help="times to close and open (default: %(default)s)")
+    parser.add_argument(
+        "--delta",
+        type=float,
+        help="how far the command leads the measured positions, rad or m (default: 8%% of the joints' range)",
+    )
+    parser.add_argument("--seconds", type=float, default=1.5, help="of one movement (default: %(default)s)")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("gripper.png"), help="the plot (default: %(default)s)")
+    parser.add_argument("--video", type=pathlib.Path, help="MP4 of the gripper")
+    args, _ = parser.parse(argv)
+    for path in filter(None, (args.out, args.video)):
+        if path.is_dir():
+            raise UserError(f"{path} is a folder: give a file name")
+        if not path.parent.is_dir():
+            raise UserError(f"cannot write {path}: the folder {path.parent} does not exist")
+    cli.setup_jax()
+    env = registry.make(args.env, impl="jax")
+    motion = demo(env, args.cycles, args.delta, args.seconds)
+    console = Console()
+    console.print(table(motion))
+    _save_plot(motion, f"gripper of {env.cfg.robot.name}", args.out)
+    console.print(f"plot: {args.out}", highlight=False, soft_wrap=True)
+    if args.video:
+        nowhere = np.broadcast_to([0.0, 0.0, -1.0], (len(motion.qpos), 1, 3))  # the goal marker: under the table
+        render.write_episodes(args.video, close_up(env), motion.qpos[:, None], nowhere, env.dt)
+        console.print(f"video: {args.video}", highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    cli.run(main)
