@@ -1,4 +1,4 @@
-"""GPU-vectorised JAX library of robot-arm lift tasks."""
+"""GPU-vectorised JAX library of robot-arm tasks."""
 
 import contextlib
 import ctypes
@@ -31,5 +31,5 @@ from mjx_nero.env import EnvCfg, ManipulationEnv
 from mjx_nero.registry import env_cfg, list_envs, list_presets, make
 from mjx_nero.types import UserError
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "make"]

@@ -49,6 +49,7 @@ class Chain:
         self.upper = np.where(limited, model.jnt_range[ids, 1], np.inf).astype(np.float32)
         # A node is a listed joint, its frame at the joint's anchor: (index in q, parent node, fixed transform from it, axis, slide?)
         self._nodes: list[tuple[int, int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]] = []
+        self._qpos0 = np.array(model.qpos0[model.jnt_qposadr[ids]], np.float32)  # where a joint displaces nothing
         self._index = {j: i for i, j in enumerate(ids)}
         self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), np.array([1.0, 0, 0, 0])))}
         self._model = model
@@ -75,7 +76,6 @@ class Chain:
             if j in self._index:
                 self._nodes.append((self._index[j], node, _compose(fixed, (anchor, still)), m.jnt_axis[j].copy(), slide))
                 node, fixed = len(self._nodes) - 1, (-anchor, still)
-            # else: at qpos0, where a joint displaces nothing
         self._last[body] = node, fixed
         return node, fixed
 
@@ -91,9 +91,7 @@ class Chain:
         """Positions [m] and orientations (wxyz) of the frames in the world."""
         return self._frames(self._forward(q))
 
-    def jacobians(
-        self, q: Float[Array, " nj"]
-    ) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
+    def jacobians(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
         """``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
         nodes = self._forward(q)
         pos, quat = self._frames(nodes)
@@ -106,6 +104,7 @@ class Chain:
 
     def _forward(self, q: Float[Array, " nj"]) -> list[Pose]:
         nodes: list[Pose] = []
+        q = q - self._qpos0
         for i, parent, fixed, axis, slide in self._nodes:
             pos, quat = _attach(nodes, parent, fixed)
             along = jnp.asarray(axis, jnp.float32)

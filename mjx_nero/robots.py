@@ -32,7 +32,6 @@ class DriveCfg:
     speed: tuple[float, ...]
     home: tuple[float, ...]
 
-
     @property
     def lead(self) -> tuple[float, ...]:
         """Damping over stiffness [s]. A target this many seconds ahead of a moving set-point makes a drive that damps a joint's

@@ -6,7 +6,6 @@ import os
 import pathlib
 import sys
 import tempfile
-import typing
 
 import jaxtyping
 import pytest
@@ -21,9 +20,6 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero.control import controller  # noqa: E402
-
-typing.runtime_checkable(controller.Controller)  # without it the checks could not tell who is one
 from mjx_nero import benchmark, cli, wrappers  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from mjx_nero import evaluation
+from mjx_nero import evaluation, rollout
 
 HOME = np.array([0.5, 0.0, 0.54])  # of the Cobotta's flange
 
@@ -30,6 +30,15 @@ def play():
 
 def at(x: float, y: float, z: float) -> dict:
     return {f"command.params.{name}": (value, value) for name, value in zip("xyz", (x, y, z), strict=True)}
+
+
+def test_tracking_by_hand():
+    """Six steps of two episodes: the mean over the last two steps, mean and largest over the second half."""
+    distance = np.array([[9.0, 9.0], [9.0, 9.0], [9.0, 9.0], [4.0, 0.0], [1.0, 3.0], [1.0, 3.0]])
+    played = rollout.Episodes({}, *[np.zeros(0)] * 4, distance=distance, memory=())
+    want = {"position_error_mean": 2.0, "settled_error_mean": 2.0, "settled_error_max": 4.0}
+    assert evaluation.tracking(played, 2) == want
+    assert evaluation.tracking(played, 4)["position_error_mean"] == pytest.approx((9 + 9 + 4 + 0 + 1 + 3 + 1 + 3) / 8)
 
 
 # --- following
@@ -134,9 +143,15 @@ FOLLOW = ["--env", "cobotta_follow_target"]
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([*FOLLOW, "--controller", "pick_place"], "cobotta_follow_target takes the controllers rmpflow, ik"),
-        (["--env", "cobotta_pick_place", "--controller", "ik"], "cobotta_pick_place takes the controllers pick_place"),
-        (["--env", "cobotta_lift", "--controller", "ik"], "cobotta_lift has no controllers, only policies"),
+        (
+            [*FOLLOW, "--controller", "pick_place"],
+            "controller 'pick_place' cannot do cobotta_follow_target: choose one of rmpflow, ik",
+        ),
+        (
+            ["--env", "cobotta_pick_place", "--controller", "ik"],
+            "controller 'ik' cannot do cobotta_pick_place: choose one of pick_place",
+        ),
+        (["--env", "cobotta_lift", "--controller", "ik"], "cobotta_lift has no controller, only policies"),
         ([*FOLLOW, "--controller", "ik", "--policy", "p.safetensors"], "give --controller, or --agent or --policy"),
         ([*FOLLOW, "--controller", "ik", "--agent", "zero"], "give --controller, or --agent or --policy"),
         ([*FOLLOW, "--agent", "zero", "--control.restarts", "3"], "--control.* needs --controller"),

@@ -195,3 +195,11 @@ def test_what_a_chain_refuses(joints, frames, error, message):
     model = mujoco.MjModel.from_xml_string(CHAIN.replace('<joint type="ball"/>', '<joint name="swivel" type="ball"/>'))
     with pytest.raises(error, match=message):
         Chain(model, joints, frames)
+
+
+def test_joint_with_a_reference_position():
+    xml = """<mujoco><worldbody><body><joint name="a" axis="0 0 1" ref="0.5"/><geom size="0.1"/>
+    <site name="tip" pos="1 0 0"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml.replace("<worldbody>", "<compiler angle='radian'/><worldbody>"))
+    pos, _ = kinematics.Chain(model, ["a"], ["tip"]).poses(jnp.array([0.5 + np.pi / 2]))
+    np.testing.assert_allclose(pos[0], [0, 1, 0], atol=1e-6)

@@ -44,6 +44,31 @@ def test_records(env, episodes):
     assert (np.abs(episodes.qpos[:, :, 11] - 0.015) < 1e-3).all()  # the cubes lie on the table
     distance = np.linalg.norm(episodes.qpos[-1, :, 9:12] - episodes.goals[-1], axis=1)
     np.testing.assert_allclose(episodes.metrics["final_distance"][:3], distance, rtol=1e-5)
+    assert episodes.distance.shape == (250, N) and episodes.memory == ()
+    np.testing.assert_allclose(episodes.distance[-1], episodes.metrics["final_distance"], rtol=1e-6)
+
+
+class Counter:
+    """A controller that stays and counts its steps; its targets are where the drives already are."""
+
+    def init(self, view):
+        return jnp.zeros((), jnp.int32)
+
+    def step(self, memory, view):
+        return memory + 1, view.ctrl
+
+    def warning(self, memory):
+        return ""
+
+
+def test_controllers_play_every_environment_of_a_batch_with_a_memory_of_their_own():
+    env = make("cobotta_follow_target", "static", impl="jax", episode_length_s=0.2, corruption=False)
+    episodes = rollout.native_runner(env, rollout.controller_agent(env, Counter()), 3, record=3)(None, 0)
+    np.testing.assert_array_equal(episodes.memory, [10, 10, 10])
+    np.testing.assert_array_equal(episodes.lengths, [10, 10, 10])
+    np.testing.assert_allclose(episodes.qpos[:, :, :6], np.broadcast_to(env.cfg.robot.arm.home, (10, 3, 6)), atol=1e-4)
+    home = np.array([0.5, 0.0, 0.54])  # of the flange, which follows
+    np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.goals[-1] - home, axis=1), atol=1e-3)
 
 
 def test_same_seed_same_episodes(native, episodes):

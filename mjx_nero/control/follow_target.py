@@ -13,7 +13,7 @@ from mjx_nero.control.controller import Memory
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
 from mjx_nero.robots import RobotCfg
-from mjx_nero.types import UserError, View
+from mjx_nero.types import View
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +93,6 @@ class RmpFollower:
     def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg(), obstacles: Obstacles | None = None):
         descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
         self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
-        if set(self.flow.joints) != set(robot.arm.joints):
-            raise UserError(f"RMPflow moves {', '.join(self.flow.joints)}; the arm has {', '.join(robot.arm.joints)}")
         self.dt, self._obstacles = dt, Obstacles.none() if obstacles is None else obstacles
         self._order = np.array([robot.arm.joints.index(j) for j in self.flow.joints])
         self._lead = np.array(robot.arm.lead, np.float32)

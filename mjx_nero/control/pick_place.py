@@ -14,6 +14,8 @@ from mjx_nero.robots import RobotCfg
 from mjx_nero.types import UserError, View
 
 _FASTEST = 1.0  # [m/s]: a target that moves on faster has jumped
+# Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
+_GRIP_FILTER = 0.05
 PHASES = ("above pick", "down", "settle", "close", "up", "across", "down", "open", "up", "away")
 
 
@@ -100,7 +102,7 @@ class PickPlace:
         # Only while it is carried, and only what can still be a grip.
         carried = (phase >= 4) & (phase <= 6)
         slip = jnp.clip(view.ee_pos_w - view.object_pos_w, self._offset - 0.03, self._offset + 0.03)
-        grip = jnp.where(carried, slip, memory.grip)
+        grip = memory.grip + jnp.where(carried, _GRIP_FILTER, 0.0) * (slip - memory.grip)
         target = self._target(phase, share, pick, view.goal_pos_w, grip, view.root_pos_w)
         stays = (phase == 2) | (phase == 3) | (phase == 7) | self.is_done(memory)
         target = jnp.where(stays, memory.target, target)
