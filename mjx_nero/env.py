@@ -53,8 +53,8 @@ class SuccessCfg:
 class EnvCfg:
     """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
 
-    ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task, the usual one
-    first, with what their configs have to say of it (fields by dotted name).
+    ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task,
+    the usual one first, each with fields of its config by dotted name.
     """
 
     robot: RobotCfg

@@ -47,7 +47,7 @@ class Chain:
         limited = model.jnt_limited[ids].astype(bool)
         self.lower = np.where(limited, model.jnt_range[ids, 0], -np.inf).astype(np.float32)
         self.upper = np.where(limited, model.jnt_range[ids, 1], np.inf).astype(np.float32)
-        # A node is a listed joint, its frame at the joint's anchor: (index in q, parent node, fixed transform from it, axis, slide?)
+        # A node is a listed joint, its frame at the anchor: (index in q, parent node, fixed transform from it, axis, slide?)
         self._nodes: list[tuple[int, int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]] = []
         self._qpos0 = np.array(model.qpos0[model.jnt_qposadr[ids]], np.float32)  # where a joint displaces nothing
         self._index = {j: i for i, j in enumerate(ids)}

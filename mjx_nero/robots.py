@@ -137,7 +137,7 @@ NERO = RobotCfg(
 )
 
 # Stiffness and damping: critical damping at home, from measured step responses (assets/cobotta_pro_900/README.md). Speeds: a
-# collaborative half of the published ones. Home: the grasp point at (0.5, 0, 0.28), gripper straight down, fingers opening along y.
+# collaborative half of the published ones. Home: the grasp point at (0.5, 0, 0.28), straight down, fingers opening along y.
 COBOTTA_PRO_900 = RobotCfg(
     name="cobotta_pro_900",
     down=(0.0, 0.0, 1.0, 0.0),

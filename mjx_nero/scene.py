@@ -13,7 +13,9 @@ class SceneCfg:
     """Table, cube and goal marker. Lengths in m, mass in kg.
 
     ``cube`` False leaves the cube out. ``goal`` is the marker's shape, ``sphere`` or ``cube`` (of the cube's size). The cameras
-    look at ``look_at`` from ``view_distance``. The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
+    look at ``look_at`` from ``view_distance``.
+
+    The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
     termination that counts a cube beyond them as fallen.
     """
 

@@ -45,8 +45,8 @@ class IkFollower:
         cfg: of the solver.
     """
 
-    def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg = IkCfg()):
-        self.ik, self.dt = InverseKinematics(robot, cfg=cfg), dt
+    def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg | None = None):
+        self.ik, self.dt = InverseKinematics(robot, cfg=cfg or IkCfg()), dt
         self._max_step = np.array(robot.arm.speed, np.float32) * dt
         self._lead = np.array(robot.arm.lead, np.float32)
         self._n = len(robot.arm.joints)

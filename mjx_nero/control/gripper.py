@@ -62,7 +62,7 @@ class ParallelGripper:
         return self._clip(positions + jnp.asarray(deltas, jnp.float32))
 
     def forward(self, closing: Bool[Array, ""], positions: Positions, targets: Positions, dt: float) -> Positions:
-        """Targets a control step of ``dt`` seconds later: on from ``targets``, towards open or closed, at the drives' speed limit."""
+        """Targets a control step of ``dt`` seconds on from ``targets``: towards open or closed, at the drives' speed limit."""
         wanted = jnp.where(closing, self.close(positions), self.open(positions))
         return targets + jnp.clip(wanted - targets, -self._speed * dt, self._speed * dt)
 

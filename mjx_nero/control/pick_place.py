@@ -31,8 +31,8 @@ class PickPlaceCfg:
         rmpflow: of the arm's motion.
     """
 
-    # The tutorial's 4,807 steps take 80 s, most of them waiting. These take 18 s at 50 Hz: the arc to the tutorial's goal turns the
-    # base by up to 2.6 rad, which RMPflow's cap of 1 rad/s allows in phase 5's 5 s.
+    # The tutorial's 4,807 steps take 80 s. These take 17 s at 50 Hz: the arc to the tutorial's goal turns the base by up to
+    # 2.6 rad, which RMPflow's cap of 1 rad/s allows in the 5 s of phase 5.
     events_dt: tuple[float, ...] = (0.01, 0.0125, 0.05, 0.02, 0.0125, 0.004, 0.01, 0.025, 0.0125, 0.02)
     end_effector_initial_height: float = 0.2
     end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -61,8 +61,9 @@ class PickPlace:
     | height | travel | down | stays | stays | up | travel | down | stays | up | travel |
     | fingers | open | open | open | close | closed | closed | closed | open | open | open |
 
-    Time alone changes phase. Beside the tutorial's: the height of the travel, the arc, and that the cube's own place in the grip is
-    seen and made up for while it is carried, since it slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
+    Time alone changes phase. Not as in the tutorial: the height of the travel (0.6 m is out of reach over its goal), the arc, a
+    velocity target beside the position, and that the cube's own place in the grip is seen and made up for while it is carried,
+    since it slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
 
     Args:
         robot: what picks, gripper straight down.

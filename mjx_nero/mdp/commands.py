@@ -22,6 +22,6 @@ def pose(key: Key, *, x: Range, y: Range, z: Range, quat: tuple[float, float, fl
 
 
 def circle(position: Float[Array, "3"], time: Float[Array, ""], *, radius: float, frequency: float) -> Float[Array, "3"]:
-    """A path: a vertical circle about ``position`` in the world's yz plane [m], ``frequency`` turns a second; a zero of both stays."""
+    """A path: a vertical circle about ``position`` in the world's yz plane [m], ``frequency`` turns a second."""
     phase = 2 * jnp.pi * frequency * time
     return position + radius * jnp.stack([jnp.zeros_like(phase), jnp.cos(phase), jnp.sin(phase)])

@@ -1,4 +1,4 @@
-"""Follow target: the end effector keeps to a target cube. The Isaac Sim tutorial's first task, for controllers and for learning."""
+"""Follow target: the end effector keeps to a target cube. The Isaac Sim tutorial's first task."""
 
 import dataclasses
 
