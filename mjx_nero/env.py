@@ -189,6 +189,12 @@ class ManipulationEnv(Env):
         carry = state.info["carry"]
         return self._viewer(state.pipeline_state, carry, carry.action)
 
+    def named_observations(self, state: State) -> dict[str, dict[str, Array]]:
+        """Each term of each observation group by its name, without noise."""
+        view = self.view(state)
+        groups = self.cfg.observations.items()
+        return {group: {name: term.func(view, **term.params) for name, term in members.items()} for group, members in groups}
+
     def goal(self, state: State) -> Float[Array, "3"]:
         """Where the goal is now, world frame [m]."""
         return self._viewer.goal(state.info["carry"])[0]

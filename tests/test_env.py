@@ -556,6 +556,14 @@ def test_a_linkage_starts_closed(offset):
 # --- the tutorial's tasks
 
 
+def test_observations_by_name(follow):
+    state = follow.reset(jax.random.PRNGKey(0))
+    named = follow.env.named_observations(state)
+    assert list(named) == ["state"] and list(named["state"]) == list(follow.env.cfg.observations["state"])
+    np.testing.assert_array_equal(jnp.concatenate(list(named["state"].values())), state.obs["state"])
+    np.testing.assert_array_equal(named["state"]["target_orientation"], [0, 0, 1, 0])
+
+
 def test_observations_of_following(follow):
     assert list(follow.env.cfg.observations["state"]) == [
         "joint_positions",

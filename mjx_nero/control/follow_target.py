@@ -94,7 +94,6 @@ class RmpFollower:
         descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
         self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
         self.dt, self._obstacles = dt, Obstacles.none() if obstacles is None else obstacles
-        self._order = np.array([robot.arm.joints.index(j) for j in self.flow.joints])
         self._lead = np.array(robot.arm.lead, np.float32)
         self._n = len(robot.arm.joints)
 
@@ -109,9 +108,8 @@ class RmpFollower:
 
     def arm(self, view: View, target: Target) -> Float[Array, " nj"]:
         """Targets of the arm's drives on the way to ``target`` [rad]."""
-        at, speed = view.joint_pos[self._order], view.joint_vel[self._order]
-        q, qd = self.flow.step(at, speed, target, self._obstacles, self.dt)
-        return jnp.zeros(self._n).at[self._order].set(q + self._lead[self._order] * qd)
+        q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, self._obstacles, self.dt)
+        return q + self._lead * qd
 
     def warning(self, memory: Memory) -> str:
         """Nothing."""

@@ -26,7 +26,8 @@ class PickPlaceCfg:
     Attributes:
         events_dt: the share of each phase that one control step takes; a phase has ceil(1 / share) steps.
         end_effector_initial_height: of the grasp point above the cube's table, while it travels.
-        end_effector_offset: of the grasp point from the cube's centre.
+        end_effector_offset: of the grasp point from the cube's centre. The tutorial's 0.25 m counts from the flange and would
+            press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
         arc: travel from pick to place about the robot's axis; False: on a straight line.
         rmpflow: of the arm's motion.
     """

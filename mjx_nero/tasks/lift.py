@@ -35,7 +35,7 @@ class Work:
         return {**self.lifted, "grasp_radius": 0.04}
 
 
-# The Isaac Lab recipe's numbers.
+# The Isaac Lab recipe's numbers; the cube's region is the recipe's start (0.2, 0) plus its offsets.
 NERO_WORK = Work(
     scene=SceneCfg(cube_edge=0.03, cube_mass=0.03),
     cube=((0.3, 0.4), (-0.1, 0.2)),
