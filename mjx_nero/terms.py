@@ -52,6 +52,9 @@ class DoneTerm(Term):
     time_out: bool = dataclasses.field(default=False, kw_only=True)
 
 
+ONCE = 1e6  # [s], as ``CommandTerm.resample_s``: longer than any episode, so the goal is drawn at the reset alone
+
+
 @dataclasses.dataclass(frozen=True)
 class CommandTerm(Term):
     """Draws the goal at every reset and every ``resample_s`` seconds."""

@@ -590,6 +590,14 @@ def place():
     return type("Place", (), {"env": env, "reset": jax.jit(env.reset), "finish": finish, "view": jax.jit(env.view)})
 
 
+def test_the_goal_of_a_long_episode_stays():
+    env = make("cobotta_pick_place", impl="jax", episode_length_s=100.0)
+    state = at_step(jax.jit(env.reset)(jax.random.PRNGKey(0)), 999)  # 20 s: a whole episode of the default length
+    after = jax.jit(env.finish)(state, state.pipeline_state.ctrl, state.pipeline_state, jnp.zeros(()))
+    assert int(after.info["carry"].step) == 1000 and float(after.done) == 0
+    np.testing.assert_array_equal(after.info["carry"].command, state.info["carry"].command)
+
+
 def test_observations_of_pick_and_place(place):
     assert list(place.env.cfg.observations["state"]) == [
         "joint_positions",

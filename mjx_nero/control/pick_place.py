@@ -32,8 +32,8 @@ class PickPlaceCfg:
         rmpflow: of the arm's motion.
     """
 
-    # The tutorial's 4,807 steps take 80 s. These take 17 s at 50 Hz: the arc to the tutorial's goal turns the base by up to
-    # 2.6 rad, which RMPflow's cap of 1 rad/s allows in the 5 s of phase 5.
+    # The tutorial's shares work, too, but take 96 s at 50 Hz. These take 17 s: the arc to the tutorial's goal turns the base by
+    # up to 2.6 rad, which RMPflow's cap of 1 rad/s allows in the 5 s of phase 5.
     events_dt: tuple[float, ...] = (0.01, 0.0125, 0.05, 0.02, 0.0125, 0.004, 0.01, 0.025, 0.0125, 0.02)
     end_effector_initial_height: float = 0.2
     end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)

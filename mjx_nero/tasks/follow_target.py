@@ -6,7 +6,7 @@ from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
 from mjx_nero.mdp import commands, observations, rewards, success, terminations
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg
-from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ def default(robot: RobotCfg, work: Work) -> EnvCfg:
         episode_length_s=12.0,
         action=ActionCfg(absolute=True),
         controllers={"rmpflow": {}, "ik": {}},
-        command=CommandTerm(commands.pose, params={"x": x, "y": y, "z": z, "quat": robot.down}, resample_s=12.0),
+        command=CommandTerm(commands.pose, params={"x": x, "y": y, "z": z, "quat": robot.down}, resample_s=ONCE),
         motion=Term(commands.circle, params={"radius": work.radius, "frequency": 0.25}),
         success=SuccessCfg(
             condition=Term(success.ee_at_goal, params={"threshold": 0.02}),

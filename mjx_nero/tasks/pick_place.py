@@ -6,7 +6,7 @@ from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg
-from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 
 Range = tuple[float, float]
 
@@ -61,7 +61,7 @@ def default(robot: RobotCfg, work: Work) -> EnvCfg:
         command=CommandTerm(
             commands.uniform_position,
             params={"x": work.goal[0], "y": work.goal[1], "z": (rest, rest)},
-            resample_s=work.episode_length_s,
+            resample_s=ONCE,
         ),
         success=SuccessCfg(
             condition=Term(success.object_placed, params={"threshold": 0.01, "max_speed": 0.005, "clearance": 0.05}),
