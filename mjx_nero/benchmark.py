@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import cli, evaluation, ppo, registry, rollout, scene, wrappers
+from mjx_nero import cli, evaluation, ppo, registry, rollout, run_folder, scene, wrappers
 from mjx_nero.control import ik
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import IMPLS, resolve_impl
@@ -81,7 +81,7 @@ def measure_control(env: ManipulationEnv, env_name: str, repeats: int) -> dict[s
     begun = time.perf_counter()
     run(None, 0)
     compile_s = time.perf_counter() - begun
-    seconds, played = _timed(lambda _, seed: (None, run(None, seed)), None, range(1, repeats + 1))
+    seconds, played = _timed(_stateless(run), None, [(None, seed) for seed in range(1, repeats + 1)])
     nans, overflows = (sum(float(p.metrics[key].sum()) for p in played) for key in ("nan", "overflow"))
     rates = [env.num_envs * env.episode_length / s for s in seconds]
     success = statistics.mean(float(p.metrics["success"].mean()) for p in played)
@@ -252,8 +252,8 @@ def main(argv: Sequence[str]) -> None:
     args, _ = parser.parse(argv)
     sizes, batches = _sizes("--num-envs", args.num_envs), _sizes("--batch", args.batch)
     impls, whats = _list(args.impl, "impl", IMPLS), _list(args.what, "what", ("step", "ppo", "control", "ik"))
-    if args.json and not args.json.parent.is_dir():
-        raise UserError(f"cannot write {args.json}: the folder {args.json.parent} does not exist")
+    if args.json:
+        run_folder.check_writable(args.json)
     cli.setup_jax()
     cfg = registry.env_cfg(args.env, args.preset)
     env_rows: list[dict[str, Any]] = []

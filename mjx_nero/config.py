@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import difflib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from mjx_nero.types import UserError
@@ -50,14 +50,18 @@ def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
     return cfg
 
 
+def hint(name: str, valid: Iterable[str]) -> str:
+    """The nearest valid name, for the end of a message; empty if none is near."""
+    near = difflib.get_close_matches(name, list(valid), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
 def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
     head, *rest = path
     children = _children(node)
     if children is None or head not in children:
         valid = list(children or ())
-        near = difflib.get_close_matches(head, valid, n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise UserError(f"no field {name!r}: {head!r} is not one of {', '.join(valid) or 'no fields'}{hint}")
+        raise UserError(f"no field {name!r}: {head!r} is not one of {', '.join(valid) or 'no fields'}{hint(head, valid)}")
     old = children[head]
     if rest:
         new = _replace(old, rest, value, name)

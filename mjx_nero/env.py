@@ -192,8 +192,7 @@ class ManipulationEnv(Env):
     def named_observations(self, state: State) -> dict[str, dict[str, Array]]:
         """Each term of each observation group by its name, without noise."""
         view = self.view(state)
-        groups = self.cfg.observations.items()
-        return {group: {name: term.func(view, **term.params) for name, term in members.items()} for group, members in groups}
+        return {name: terms.by_name(group, view) for name, group in self.cfg.observations.items()}
 
     def goal(self, state: State) -> Float[Array, "3"]:
         """Where the goal is now, world frame [m]."""

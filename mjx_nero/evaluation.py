@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import pathlib
 import sys
 import time
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import config, control, policy, registry, render, rollout
+from mjx_nero import config, control, policy, registry, render, rollout, run_folder
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.types import UserError
 
@@ -99,7 +98,7 @@ def evaluate(
     else:
         act, params = agent(agent_name or "policy", env, env_name, policy_path)
     for path in filter(None, (video, out)):
-        _check_writable(path)
+        run_folder.check_writable(path)
     runner = rollout.mjx_runner if backend == "mjx" else rollout.native_runner
     started = time.perf_counter()
     played = runner(env, act, episodes, record=min(3, episodes) if video else 0)(params, seed)
@@ -175,10 +174,3 @@ def table(result: dict[str, Any]) -> Table:
     view.add_row("NaN, overflows", f"{result['nan_count']}, {result['overflow_count']}")
     view.add_row("time", f"{result['seconds']:.1f} s, compilation included")
     return view
-
-
-def _check_writable(path: pathlib.Path) -> None:
-    if path.is_dir():
-        raise UserError(f"{path} is a folder: give a file name")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import cli, kinematics, registry, render, scene
+from mjx_nero import cli, kinematics, registry, render, run_folder, scene
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import NativePhysics
@@ -108,10 +108,9 @@ def plot(motion: Motion, axes) -> None:
 
 def close_up(env: ManipulationEnv) -> mujoco.MjModel:
     """The scene with its cameras on the gripper at home."""
-    cfg, qpos = env.cfg, env.physics_model.qpos0.copy()
-    for joint, value in zip(cfg.robot.joints, cfg.robot.home, strict=True):
-        qpos[env.physics_model.joint(joint).qposadr[0]] = value
-    x, y, z = (float(v) for v in kinematics.site_pose_fn(env.physics_model, cfg.robot.ee_site)(jnp.asarray(qpos))[0])
+    cfg, arm = env.cfg, env.cfg.robot.arm
+    (ee,), _ = kinematics.Chain(env.physics_model, arm.joints, [cfg.robot.ee_site]).poses(jnp.array(arm.home))
+    x, y, z = (float(v) for v in ee)
     return scene.build(cfg.robot, dataclasses.replace(cfg.scene, look_at=(x, y, z + 0.05), view_distance=0.7), cfg.sim)
 
 
@@ -146,10 +145,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--video", type=pathlib.Path, help="MP4 of the gripper")
     args, _ = parser.parse(argv)
     for path in filter(None, (args.out, args.video)):
-        if path.is_dir():
-            raise UserError(f"{path} is a folder: give a file name")
-        if not path.parent.is_dir():
-            raise UserError(f"cannot write {path}: the folder {path.parent} does not exist")
+        run_folder.check_writable(path)
     cli.setup_jax()
     env = registry.make(args.env, impl="jax")
     motion = demo(env, args.cycles, args.delta, args.seconds)

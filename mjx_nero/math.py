@@ -57,3 +57,23 @@ def rotation_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solves ``a x = b`` for a small positive definite matrix by Cholesky's factors.
+
+    Unrolled: for thousands of tiny systems side by side, plain arithmetic that the compiler fuses is many times quicker than a
+    batched call of a linear algebra library.
+    """
+    n = len(b)
+    low: list[list[Array]] = [[] for _ in range(n)]
+    y: list[Array] = []
+    for i in range(n):
+        for j in range(i):
+            low[i].append((a[i, j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
+        low[i].append(jnp.sqrt(a[i, i] - sum(x * x for x in low[i])))
+        y.append((b[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i])
+    x: list[Array] = [b[0]] * n
+    for i in reversed(range(n)):
+        x[i] = (y[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
+    return jnp.stack(x)

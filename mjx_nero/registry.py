@@ -1,7 +1,6 @@
 """Environments by name."""
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 from mjx_nero import config
@@ -72,10 +71,5 @@ def make(env: str, preset: str = "default", impl: str = "auto", num_envs: int = 
 
 def _pick(table: dict, name: str, what: str) -> Any:
     if name not in table:
-        raise UserError(f"unknown {what} {name!r}{_hint(name, table)}: choose one of {', '.join(table)}")
+        raise UserError(f"unknown {what} {name!r}{config.hint(name, table)}: choose one of {', '.join(table)}")
     return table[name]
-
-
-def _hint(name: str, valid: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(valid), n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.metadata as metadata
 import json
+import os
 import pathlib
 import sys
 from typing import Any
@@ -72,6 +73,18 @@ class RunFolder:
             self._tensorboard.close()
         if self.rows:
             plot_curve(self.rows, self.path / "curve.png")
+
+
+def check_writable(path: pathlib.Path) -> None:
+    """Before long work: a file that is to be written at its end.
+
+    Raises:
+        UserError: it is a folder, or its folder does not exist or is not writable.
+    """
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give a file name")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")
 
 
 def versions() -> dict[str, str]:

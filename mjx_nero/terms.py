@@ -80,13 +80,18 @@ def rewards(
     return out
 
 
+def by_name(group: Mapping[str, ObservationTerm], view: View) -> dict[str, Float[Array, " n"]]:
+    """The terms of an observation group, without noise."""
+    return {name: term.func(view, **term.params) for name, term in group.items()}
+
+
 def observe(
     groups: Mapping[str, Mapping[str, ObservationTerm]], view: View, key: Key, corruption: bool
 ) -> dict[str, Float[Array, " n"]]:
     """Each group's terms, concatenated in the order of the config."""
     out = {}
     for i, (name, group) in enumerate(groups.items()):
-        values = [term.func(view, **term.params) for term in group.values()]
+        values = list(by_name(group, view).values())
         out[name] = jnp.concatenate(values)
         if corruption and any(term.noise for term in group.values()):
             # One draw for the group: many small ones would cost more time than the terms themselves.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from mjx_nero.control.controller import Memory
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
+from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.robots import RobotCfg
 from mjx_nero.types import View
 
@@ -61,7 +62,7 @@ class IkFollower:
         key = jax.random.fold_in(jax.random.PRNGKey(0), memory.step)
         found = self.ik.solve(view.goal_pos_w, view.goal_quat_w, memory.q, key)
         goal = jnp.where(found.success, found.q, memory.q)
-        q = memory.q + jnp.clip(goal - memory.q, -self._max_step, self._max_step)
+        q = rate_limit(goal, memory.q, step=jnp.asarray(self._max_step))
         targets = q + self._lead * (q - memory.q) / self.dt
         failures = memory.failures + ~found.success
         return IkMemory(q, memory.step + 1, failures), jnp.concatenate([targets, view.ctrl[self._n :]])

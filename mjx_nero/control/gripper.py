@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero import scene
+from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.robots import RobotCfg
 from mjx_nero.types import UserError
 
@@ -64,7 +65,7 @@ class ParallelGripper:
     def forward(self, closing: Bool[Array, ""], positions: Positions, targets: Positions, dt: float) -> Positions:
         """Targets a control step of ``dt`` seconds on from ``targets``: towards open or closed, at the drives' speed limit."""
         wanted = jnp.where(closing, self.close(positions), self.open(positions))
-        return targets + jnp.clip(wanted - targets, -self._speed * dt, self._speed * dt)
+        return rate_limit(wanted, targets, step=jnp.asarray(self._speed * dt))
 
     def gap(self, positions: Positions) -> Float[Array, ""]:
         """Distance between the pads [m]."""

@@ -211,7 +211,7 @@ class InverseKinematics:
         held = ((q <= self.chain.lower) & (uphill < 0)) | ((q >= self.chain.upper) & (uphill > 0))
         jacobian = jnp.where(held, 0.0, jacobian)
         normal = jacobian @ jacobian.T + (self.cfg.damping * (error @ error) + _MIN_DAMPING) * jnp.eye(6)
-        return Solution(q, met, position, orientation), self._within(q + _solve_spd(normal, error) @ jacobian)
+        return Solution(q, met, position, orientation), self._within(q + math.solve_spd(normal, error) @ jacobian)
 
     def _distance(self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]) -> Float[Array, ""]:
         at, turn = (x[0] for x in self.chain.poses(q))
@@ -227,23 +227,3 @@ def _residual(
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """From a pose to its target: the way [m] and the rotation vector [rad], in the world."""
     return pos - at, math.quat_log(math.quat_mul(quat, math.quat_conj(turn)))
-
-
-def _solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solves ``a x = b`` for a small positive definite matrix by Cholesky's factors.
-
-    Unrolled: for thousands of tiny systems side by side, plain arithmetic that the compiler fuses is many times quicker than a
-    batched call of a linear algebra library.
-    """
-    n = len(b)
-    low: list[list[Array]] = [[] for _ in range(n)]
-    y: list[Array] = []
-    for i in range(n):
-        for j in range(i):
-            low[i].append((a[i, j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
-        low[i].append(jnp.sqrt(a[i, i] - sum(x * x for x in low[i])))
-        y.append((b[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i])
-    x: list[Array] = [b[0]] * n
-    for i in reversed(range(n)):
-        x[i] = (y[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
-    return jnp.stack(x)

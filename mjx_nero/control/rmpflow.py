@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from mjx_nero import scene
 from mjx_nero.control import rmpflow_config as cfg
 from mjx_nero.kinematics import Chain
-from mjx_nero.math import rotate, rotation_matrix
+from mjx_nero.math import rotate, rotation_matrix, solve_spd
 from mjx_nero.robots import ASSETS, RobotCfg
 from mjx_nero.types import UserError
 
@@ -177,24 +177,11 @@ def pull_back(jac: Float[Array, "n 3 nj"], curvature: Float[Array, "n 3"], node:
 
 
 def resolve(p: cfg.ResolveCfg, root: Rmp) -> Float[Array, " nj"]:
-    """The acceleration that the root asks for [rad/s^2], scaled down to the largest norm allowed (assumed: no source says how).
-
-    Cholesky's decomposition, unrolled: for matrices this small, GPU libraries take longer to start than to solve.
-    """
-    metric, n = root.metric, root.force.shape[0]
+    """The acceleration that the root asks for [rad/s^2], scaled down to the largest norm allowed (assumed: nothing says how)."""
+    metric = root.metric
     # As large as the metric's rounding: keeps the root solvable where no leaf cares.
     ridge = 1e-6 + float(jnp.finfo(metric.dtype).eps) * jnp.trace(metric)
-    low = [[metric[i, j] for j in range(i + 1)] for i in range(n)]
-    x = [root.force[i] for i in range(n)]
-    for j in range(n):
-        low[j][j] = jnp.sqrt(low[j][j] + ridge - sum(low[j][k] ** 2 for k in range(j)))
-        for i in range(j + 1, n):
-            low[i][j] = (low[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j]
-    for i in range(n):
-        x[i] = (x[i] - sum(low[i][k] * x[k] for k in range(i))) / low[i][i]
-    for i in reversed(range(n)):
-        x[i] = (x[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
-    accel = jnp.stack(x)
+    accel = solve_spd(metric + ridge * jnp.eye(len(root.force)), root.force)
     return accel * jnp.minimum(1.0, p.max_acceleration_norm / _length(accel))
 
 

@@ -5,7 +5,6 @@ symbols of ``mjx_nero.control.rmpflow``'s formulas are these keys. Lengths in m,
 """
 
 import dataclasses
-import difflib
 import pathlib
 import re
 import typing
@@ -14,6 +13,7 @@ from typing import Annotated, Any, TypeVar
 
 import yaml
 
+from mjx_nero import config
 from mjx_nero.types import UserError
 
 Cfg = TypeVar("Cfg")
@@ -272,9 +272,7 @@ def load_pair(descriptor: pathlib.Path, config: pathlib.Path, arm: Iterable[str]
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     """Message: there is no such ``kind``, with a close match and all valid names."""
     valid = list(valid)
-    near = difflib.get_close_matches(str(name), valid, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return f"no {kind} {str(name)!r}{hint}; valid: {', '.join(valid)}"
+    return f"no {kind} {str(name)!r}{config.hint(str(name), valid)}; valid: {', '.join(valid)}"
 
 
 # YAML 1.1 wants a dot and a signed exponent in a float, so that ``1e-3``, as people and the tutorial write it, is a string.

@@ -3,11 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjx_nero.mdp import success
 from mjx_nero.types import View
-
-
-def _goal_distance(view: View) -> Float[Array, ""]:
-    return jnp.linalg.norm(view.goal_pos_w - view.object_pos_w)
 
 
 def _ee_distance(view: View) -> Float[Array, ""]:
@@ -22,11 +19,6 @@ def held(view: View, *, minimal_height: float, grasp_radius: float) -> Bool[Arra
     return (view.object_pos_w[2] > minimal_height) & (_ee_distance(view) < grasp_radius)
 
 
-def at_goal(view: View, *, threshold: float) -> Bool[Array, ""]:
-    """The object's centre is within ``threshold`` [m] of the commanded point."""
-    return _goal_distance(view) < threshold
-
-
 def object_ee_distance(view: View, *, std: float) -> Float[Array, ""]:
     """1 - tanh(d / std), d the distance from the grasp point to the object [m]. Isaac Lab's lift task."""
     return 1.0 - jnp.tanh(_ee_distance(view) / std)
@@ -39,17 +31,17 @@ def object_is_lifted(view: View, *, minimal_height: float) -> Float[Array, ""]:
 
 def object_goal_distance(view: View, *, std: float, minimal_height: float) -> Float[Array, ""]:
     """1 - tanh(distance to the commanded point / std), while lifted. Isaac Lab's lift task."""
-    return object_is_lifted(view, minimal_height=minimal_height) * (1.0 - jnp.tanh(_goal_distance(view) / std))
+    return object_is_lifted(view, minimal_height=minimal_height) * (1.0 - jnp.tanh(success.object_distance(view) / std))
 
 
 def goal_distance(view: View, *, std: float) -> Float[Array, ""]:
     """1 - tanh(distance of the object to the goal / std)."""
-    return 1.0 - jnp.tanh(_goal_distance(view) / std)
+    return 1.0 - jnp.tanh(success.object_distance(view) / std)
 
 
 def ee_goal_distance(view: View, *, std: float) -> Float[Array, ""]:
     """1 - tanh(distance of the end effector to the goal / std)."""
-    return 1.0 - jnp.tanh(jnp.linalg.norm(view.goal_pos_w - view.ee_pos_w) / std)
+    return 1.0 - jnp.tanh(success.ee_distance(view) / std)
 
 
 def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
@@ -60,13 +52,13 @@ def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) ->
 def held_goal_distance(view: View, *, std: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
     """1 - tanh(distance to the commanded point / std), while held."""
     gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
-    return gate * (1.0 - jnp.tanh(_goal_distance(view) / std))
+    return gate * (1.0 - jnp.tanh(success.object_distance(view) / std))
 
 
 def held_at_goal(view: View, *, threshold: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
     """1 while the object is held within ``threshold`` [m] of the commanded point."""
     gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
-    return (gate & at_goal(view, threshold=threshold)).astype(jnp.float32)
+    return (gate & success.object_at_goal(view, threshold=threshold)).astype(jnp.float32)
 
 
 def action_rate_l2(view: View) -> Float[Array, ""]:
