@@ -12,6 +12,7 @@ def main(argv):
         "--env", default="nero_lift", help=f"environment: {', '.join(registry.list_envs())} (default: %(default)s)"
     )
     parser.add_argument("--preset", default="default", help="of the environment's presets (default: %(default)s)")
+    parser.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
     parser.add_argument("--agent", choices=evaluation.AGENTS, help="who acts (default: the task's controller, else the policy)")
     parser.add_argument("--controller", choices=tuple(control.CONTROLLERS), help="a controller instead of an agent")
     parser.add_argument("--policy", type=pathlib.Path, help="policy file (default: the one that ships for the environment)")
@@ -31,7 +32,7 @@ def main(argv):
     if "-h" in argv or "--help" in argv:
         chosen, _ = parser.parse([a for a in argv if a not in ("-h", "--help")], prefixes=("env", "control"))
         parser.epilog = cli.fields_help(
-            {"env": registry.env_cfg(chosen.env, chosen.preset)}
+            {"env": registry.env_cfg(chosen.env, chosen.preset, chosen.robot)}
             | ({"control": control.CONTROLLERS[chosen.controller][1]} if chosen.controller else {})
         )
     args, dotted = parser.parse(argv, prefixes=("env", "control"))
@@ -39,6 +40,7 @@ def main(argv):
     evaluation.evaluate(
         args.env,
         preset=args.preset,
+        robot=args.robot,
         agent_name=args.agent,
         policy_path=args.policy,
         episodes=args.episodes,

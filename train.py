@@ -3,7 +3,7 @@
 import pathlib
 import sys
 
-from mjx_nero import cli, ppo, registry, training
+from mjx_nero import cli, registry, training
 from mjx_nero.physics import IMPLS
 
 
@@ -15,6 +15,7 @@ def main(argv):
         "--env", default="nero_lift", help=f"environment: {', '.join(registry.list_envs())} (default: %(default)s)"
     )
     parser.add_argument("--preset", default="default", help="of the environment's presets (default: %(default)s)")
+    parser.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
     parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 4096 on a GPU, 256 on a CPU)")
     parser.add_argument(
         "--num-timesteps", type=cli.positive, help="env steps in all (default: 60 M on a GPU, 4 minutes' worth on a CPU)"
@@ -35,14 +36,15 @@ def main(argv):
     parser.add_argument("--no-video", dest="video", action="store_false", help="do not render the trained policy")
     if "-h" in argv or "--help" in argv:
         chosen, _ = parser.parse([a for a in argv if a not in ("-h", "--help")], prefixes=("env", "ppo"))
-        parser.epilog = cli.fields_help({"env": registry.env_cfg(chosen.env, chosen.preset), "ppo": ppo.preset(chosen.preset)})
+        cfg = registry.env_cfg(chosen.env, chosen.preset, chosen.robot)
+        parser.epilog = cli.fields_help({"env": cfg, "ppo": training.learner_cfg(cfg, chosen.preset)})
     args, dotted = parser.parse(argv, prefixes=("env", "ppo"))
     sizes = {k: v for k, v in (("num_envs", args.num_envs), ("num_timesteps", args.num_timesteps)) if v}
     run = training.resolve(
         args.env,
         args.preset,
+        args.robot,
         dotted["env"],
-        ppo.preset(args.preset),
         {**sizes, **dotted["ppo"]},
         impl=args.impl,
         seed=args.seed,

@@ -28,8 +28,8 @@ with contextlib.redirect_stdout(io.StringIO()):  # without Warp, which only GPUs
     import mujoco.mjx  # noqa: F401
 
 from mjx_nero.env import EnvCfg, ManipulationEnv
-from mjx_nero.registry import env_cfg, list_envs, list_presets, make
+from mjx_nero.registry import env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.types import UserError
 
-__version__ = "0.2.0"
-__all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "make"]
+__version__ = "0.3.0"
+__all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make"]

@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mjx_nero import cli, evaluation, ppo, registry, rollout, run_folder, scene, wrappers
+from mjx_nero import cli, evaluation, ppo, registry, rollout, run_folder, scene, training, wrappers
 from mjx_nero.control import ik
 from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import IMPLS, resolve_impl
@@ -57,7 +57,9 @@ def measure_step(env: ManipulationEnv, steps: int, repeats: int) -> dict[str, An
 
 def measure_ppo(env: ManipulationEnv, preset: str, iterations: int, repeats: int) -> dict[str, Any]:
     """PPO end to end: rollouts, updates, auto-resets; ``iterations`` a compiled call."""
-    learner = ppo.Learner(wrappers.for_training(env), dataclasses.replace(ppo.preset(preset), num_envs=env.num_envs))
+    learner = ppo.Learner(
+        wrappers.for_training(env), dataclasses.replace(training.learner_cfg(env.cfg, preset), num_envs=env.num_envs)
+    )
     begun = time.perf_counter()
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     compiled = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, iterations).compile()

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -27,14 +27,16 @@ _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it 
 
 @dataclasses.dataclass(frozen=True)
 class ActionCfg:
-    """One action a arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes).
+    """One action an arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes).
 
-    ``clip`` bounds every action to +-clip before use; 0 leaves them alone. ``absolute`` takes the drives' position targets
+    ``gripper`` False leaves the gripper at home, without an action. ``clip`` bounds every action to +-clip before use; 0 leaves
+    them alone. ``absolute`` takes the drives' position targets
     themselves [rad or m], one a drive, and leaves their speed to whoever gives them: for controllers.
     """
 
     scale: float = 0.5
     clip: float = 0.0
+    gripper: bool = True
     absolute: bool = False
 
 
@@ -54,7 +56,8 @@ class EnvCfg:
     """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
 
     ``motion`` moves the goal: a path of ``mdp.commands``. ``controllers`` are those of ``mjx_nero.control`` that can do the task,
-    the usual one first, each with fields of its config by dotted name.
+    the usual one first, each with fields of its config by dotted name. ``training`` are fields of the learner's config that suit
+    the task, likewise.
     """
 
     robot: RobotCfg
@@ -73,11 +76,16 @@ class EnvCfg:
     corruption: bool = True  # observation noise: on to train, off to play
     motion: Term | None = None
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         unknown = set(self.curriculum) - set(self.rewards)
         if unknown:
             raise UserError(f"curriculum names {', '.join(unknown)}: not one of the rewards {', '.join(self.rewards)}")
+
+
+Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, the default first
+Envs = dict[str, tuple[RobotCfg | None, Presets]]  # by name, with the robot each is meant for
 
 
 class ManipulationEnv(Env):
@@ -110,6 +118,7 @@ class ManipulationEnv(Env):
         self._qpos0[ids] = cfg.robot.home
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
         self._max_ctrl_step = np.array(cfg.robot.arm.speed + cfg.robot.gripper.speed, np.float32) * self.dt
+        self._acts_on_gripper = cfg.action.gripper and bool(cfg.robot.gripper.joints)
         self._hold_steps = round(cfg.success.hold_s / self.dt)
         self._resample_steps = round(cfg.command.resample_s / self.dt)
 
@@ -126,8 +135,9 @@ class ManipulationEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """One a arm joint and one for the gripper, or one a drive."""
-        return len(self.cfg.robot.joints) if self.cfg.action.absolute else len(self.cfg.robot.arm.joints) + 1
+        """One an arm joint and one for the gripper, or one a drive."""
+        robot = self.cfg.robot
+        return len(robot.joints) if self.cfg.action.absolute else len(robot.arm.joints) + self._acts_on_gripper
 
     @functools.cached_property
     def observation_size(self) -> dict[str, tuple[int, ...]]:
@@ -194,9 +204,10 @@ class ManipulationEnv(Env):
         view = self.view(state)
         return {name: terms.by_name(group, view) for name, group in self.cfg.observations.items()}
 
-    def goal(self, state: State) -> Float[Array, "3"]:
-        """Where the goal is now, world frame [m]."""
-        return self._viewer.goal(state.info["carry"])[0]
+    def goal(self, state: State) -> Float[Array, "7"]:
+        """Where the goal is now: position [m] and orientation (wxyz) in the world frame."""
+        carry = state.info["carry"]
+        return jnp.concatenate([self._viewer.goal(carry)[0], carry.command_quat])
 
     def observe(self, sim: Sim, carry: Carry, key: Key) -> dict[str, Float[Array, " n"]]:
         """The observation groups; ``key`` draws their noise."""
@@ -232,8 +243,11 @@ class ManipulationEnv(Env):
         action, robot = self._clip(action), self.cfg.robot
         if self.cfg.action.absolute:
             return jnp.clip(action, *self._range)
-        arm = actions.joint_targets(action[:-1], scale=self.cfg.action.scale, offset=jnp.asarray(robot.arm.home))
-        gripper = actions.binary_gripper(action[-1], open=jnp.asarray(robot.gripper.open), close=jnp.asarray(robot.gripper.close))
+        joints, gripper = action[: len(robot.arm.joints)], jnp.asarray(robot.gripper.home)
+        arm = actions.joint_targets(joints, scale=self.cfg.action.scale, offset=jnp.asarray(robot.arm.home))
+        if self._acts_on_gripper:
+            open, close = jnp.asarray(robot.gripper.open), jnp.asarray(robot.gripper.close)
+            gripper = actions.binary_gripper(action[-1], open=open, close=close)
         target = jnp.clip(jnp.concatenate([arm, gripper]), *self._range)
         return actions.rate_limit(target, state.pipeline_state.ctrl, step=jnp.asarray(self._max_ctrl_step))
 

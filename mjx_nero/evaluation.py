@@ -54,6 +54,7 @@ def controller(name: str, env: ManipulationEnv, env_name: str, overrides: dict[s
 def evaluate(
     env_name: str,
     preset: str = "default",
+    robot: str | None = None,
     agent_name: str | None = None,
     policy_path: pathlib.Path | None = None,
     episodes: int = 64,
@@ -69,6 +70,7 @@ def evaluate(
     """Plays ``episodes`` episodes side by side, prints the result, writes JSON and video where asked.
 
     Args:
+        robot: another than the environment's own, by name or folder.
         agent_name: one of ``AGENTS``; None: the controller, where one is named or the task has its own and no policy is given.
         backend: ``mjx``, ``mujoco`` (the C library on the CPU), or ``auto``: mjx on an accelerator, mujoco else.
         out: JSON file.
@@ -79,7 +81,7 @@ def evaluate(
     Raises:
         UserError: unknown names, agent and controller together, a policy that does not fit, files that cannot be written.
     """
-    cfg = dataclasses.replace(registry.env_cfg(env_name, preset), corruption=False)
+    cfg = dataclasses.replace(registry.env_cfg(env_name, preset, robot), corruption=False)
     cfg = config.override(cfg, overrides or {})
     if backend == "auto":
         backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
@@ -126,9 +128,8 @@ def evaluate(
     if result.get("warning"):
         print(f"warning: {result['warning']}", file=sys.stderr)
     if out:
-        part = out.with_name(f".{out.name}.part")
-        part.write_text(json.dumps(result, indent=2) + "\n")
-        part.replace(out)
+        with run_folder.whole(out) as part:
+            part.write_text(json.dumps(result, indent=2) + "\n")
     if video:
         try:
             render.write_episodes(video, env.mj_model, played.qpos, played.goals, env.dt)

@@ -32,6 +32,12 @@ def axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array,
     return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])
 
 
+def quat_from_euler(roll: Float[Array, ""], pitch: Float[Array, ""], yaw: Float[Array, ""]) -> Float[Array, "4"]:
+    """Turns about the fixed axes x, y, z, in this order [rad]: URDF's and Isaac Lab's roll, pitch, yaw."""
+    x, y, z = jnp.eye(3)
+    return quat_mul(axis_angle(z, yaw), quat_mul(axis_angle(y, pitch), axis_angle(x, roll)))
+
+
 def quat_conj(quat: Float[Array, "4"]) -> Float[Array, "4"]:
     """The inverse rotation."""
     return quat * jnp.array([1.0, -1.0, -1.0, -1.0])

@@ -99,6 +99,7 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, cfg: NetworkCfg) 
         "kind": "policy",
         "env": env_name,
         "preset": preset,
+        "robot": env.cfg.robot.name,
         "observation_size": sizes,
         "observations": terms,
         "action_size": env.action_size,
@@ -138,6 +139,11 @@ def load_for(env: ManipulationEnv, env_name: str, path: pathlib.Path | str | Non
     policy = load(path)
     if policy.meta["env"] != env_name:
         raise UserError(f"{path} is a policy of {policy.meta['env']}, not of {env_name}: pass --env {policy.meta['env']}")
+    robot = env.cfg.robot.name
+    if policy.meta.get("robot", robot) != robot:
+        raise UserError(
+            f"{path} is a policy for {policy.meta['robot']}, not for {robot}: pass the --robot that it was trained with"
+        )
     terms = {group: list(members) for group, members in env.cfg.observations.items()}
     sizes = {name: list(size) for name, size in env.observation_size.items()}
     if (policy.meta["observations"]["state"], policy.meta["observation_size"]["state"]) != (terms["state"], sizes["state"]):

@@ -51,16 +51,11 @@ class PpoCfg:
     network: NetworkCfg = NetworkCfg()
 
 
-PRESETS = {
+PRESETS = {  # by the environment's preset
     "default": PpoCfg(),
     # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
     "isaac": PpoCfg(num_minibatches=4, learning_rate=1e-4, desired_kl=0.01, entropy_cost=0.006),
 }
-
-
-def preset(name: str) -> PpoCfg:
-    """The hyperparameters that go with an environment's preset."""
-    return PRESETS.get(name, PRESETS["default"])
 
 
 @struct.dataclass

@@ -1,32 +1,20 @@
-"""Environments by name."""
+"""Robots and environments by name. Every module of ``arms`` brings its own."""
 
-from collections.abc import Callable
+import importlib
+import pathlib
+import pkgutil
 from typing import Any
 
-from mjx_nero import config
-from mjx_nero.env import EnvCfg, ManipulationEnv
-from mjx_nero.robots import COBOTTA_PRO_900, NERO
-from mjx_nero.tasks import follow_target, lift, pick_place
+from mjx_nero import arms, config, robot_file
+from mjx_nero.env import EnvCfg, Envs, ManipulationEnv
+from mjx_nero.robots import RobotCfg
+from mjx_nero.tasks import reach
 from mjx_nero.types import UserError
 
-# name -> preset -> factory of a fresh config; the default preset first
-_ENVS: dict[str, dict[str, Callable[[], EnvCfg]]] = {
-    "nero_lift": {
-        "default": lambda: lift.default(NERO, lift.NERO_WORK),
-        "isaac": lambda: lift.isaac(NERO, lift.NERO_WORK),
-    },
-    "nero_follow_target": {
-        "default": lambda: follow_target.default(NERO, follow_target.NERO_WORK),
-        "static": lambda: follow_target.static(NERO, follow_target.NERO_WORK),
-    },
-    "nero_pick_place": {"default": lambda: pick_place.default(NERO, pick_place.NERO_WORK)},
-    "cobotta_lift": {"default": lambda: lift.default(COBOTTA_PRO_900, lift.COBOTTA_WORK)},
-    "cobotta_follow_target": {
-        "default": lambda: follow_target.default(COBOTTA_PRO_900, follow_target.COBOTTA_WORK),
-        "static": lambda: follow_target.static(COBOTTA_PRO_900, follow_target.COBOTTA_WORK),
-    },
-    "cobotta_pick_place": {"default": lambda: pick_place.default(COBOTTA_PRO_900, pick_place.COBOTTA_WORK)},
-}
+_ARMS = [importlib.import_module(f"{arms.__name__}.{found.name}") for found in pkgutil.iter_modules(arms.__path__)]
+_ROBOTS: dict[str, RobotCfg] = {arm.ROBOT.name: arm.ROBOT for arm in _ARMS}
+_ENVS: Envs = {name: entry for arm in _ARMS for name, entry in arm.ENVS.items()}
+_ENVS["reach"] = (None, reach.presets())  # for any robot that says where it can work
 
 
 def list_envs() -> tuple[str, ...]:
@@ -36,24 +24,51 @@ def list_envs() -> tuple[str, ...]:
 
 def list_presets(env: str) -> tuple[str, ...]:
     """Presets of an environment, the default first."""
-    return tuple(_pick(_ENVS, env, "env"))
+    return tuple(_pick(_ENVS, env, "env")[1])
 
 
-def env_cfg(env: str, preset: str = "default", **overrides: Any) -> EnvCfg:
+def list_robots() -> tuple[str, ...]:
+    """Names of the package's own robots."""
+    return tuple(_ROBOTS)
+
+
+def robot(name: str | pathlib.Path) -> RobotCfg:
+    """A robot: one of the package's by name, or an imported one by its folder.
+
+    Raises:
+        UserError: unknown name, or no folder of a robot.
+    """
+    return _find_robot(name)
+
+
+def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.Path | None = None, **overrides: Any) -> EnvCfg:
     """The config of an environment.
 
     Args:
         env: one of ``list_envs()``.
         preset: one of ``list_presets(env)``.
+        robot: another than the environment's own: a config, a name or the folder of an imported one.
         overrides: fields by dotted name, as in ``**{"rewards.reaching_object.weight": 2.0}``.
 
     Raises:
-        UserError: unknown name, preset or field, or a value of the wrong type.
+        UserError: unknown name, preset, robot or field, or a value of the wrong type.
     """
-    return config.override(_pick(_pick(_ENVS, env, "env"), preset, f"preset of {env}")(), overrides)
+    own, presets = _pick(_ENVS, env, "env")
+    chosen = own if robot is None else robot if isinstance(robot, RobotCfg) else _find_robot(robot)
+    factory = _pick(presets, preset, f"preset of {env}")
+    if chosen is None:
+        raise UserError(f"{env} is for any robot: pass one (--robot, a folder that import-urdf made, or {', '.join(_ROBOTS)})")
+    return config.override(factory(chosen), overrides)
 
 
-def make(env: str, preset: str = "default", impl: str = "auto", num_envs: int = 1, **overrides: Any) -> ManipulationEnv:
+def make(
+    env: str,
+    preset: str = "default",
+    impl: str = "auto",
+    num_envs: int = 1,
+    robot: RobotCfg | str | pathlib.Path | None = None,
+    **overrides: Any,
+) -> ManipulationEnv:
     """Makes an environment.
 
     Args:
@@ -61,15 +76,25 @@ def make(env: str, preset: str = "default", impl: str = "auto", num_envs: int = 
         preset: one of ``list_presets(env)``.
         impl: physics, ``auto``, ``jax`` or ``warp``.
         num_envs: how many copies will be stepped together (sizes Warp's buffers).
+        robot: another than the environment's own: a config, a name or the folder of an imported one.
         overrides: config fields by dotted name.
 
     Raises:
-        UserError: unknown name, preset, impl or field, or a value of the wrong type.
+        UserError: unknown name, preset, impl, robot or field, or a value of the wrong type.
     """
-    return ManipulationEnv(env_cfg(env, preset, **overrides), impl=impl, num_envs=num_envs)
+    return ManipulationEnv(env_cfg(env, preset, robot, **overrides), impl=impl, num_envs=num_envs)
 
 
-def _pick(table: dict, name: str, what: str) -> Any:
+def _find_robot(name: str | pathlib.Path) -> RobotCfg:
+    if str(name) in _ROBOTS:
+        return _ROBOTS[str(name)]
+    if pathlib.Path(name).is_dir():
+        return robot_file.read(pathlib.Path(name))
+    near = config.hint(str(name), _ROBOTS)
+    raise UserError(f"no robot {str(name)!r}{near}: choose one of {', '.join(_ROBOTS)}, or give the folder of an imported one")
+
+
+def _pick(table: Any, name: str, what: str) -> Any:
     if name not in table:
         raise UserError(f"unknown {what} {name!r}{config.hint(name, table)}: choose one of {', '.join(table)}")
     return table[name]

@@ -41,10 +41,10 @@ class Renderer:
 
         Args:
             qpos: [nq].
-            goal: where the goal marker stands in the world [m], [3].
+            goal: where the goal marker stands in the world [m] and how it is turned (wxyz), [7]; or [3], unturned.
         """
         self._data.qpos[:] = qpos
-        self._data.mocap_pos[0] = goal
+        self._data.mocap_pos[0], self._data.mocap_quat[0] = goal[:3], goal[3:] if len(goal) == 7 else (1, 0, 0, 0)
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
@@ -54,7 +54,7 @@ def frames(model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, every: in
     """Frames of recorded episodes, one after another.
 
     Args:
-        qpos: [steps, episodes, nq]; goals: [steps, episodes, 3], as in ``rollout.Episodes``.
+        qpos: [steps, episodes, nq]; goals: [steps, episodes, 7 or 3], as in ``rollout.Episodes``.
         every: draw each ``every``-th step.
         kwargs: of ``Renderer``.
     """

@@ -60,7 +60,7 @@ class Episodes:
         returns: [n].
         lengths: [n] control steps.
         qpos: [steps, k, nq] of the first k environments, where asked for.
-        goals: [steps, k, 3], the goals in the world frame [m].
+        goals: [steps, k, 7], position [m] and orientation (wxyz) of the goals in the world frame.
         distance: [steps, n], what the task's success is about [m]; an ended episode's stays.
         memory: the agent's, after the last step.
     """

@@ -12,7 +12,9 @@ from mjx_nero.robots import RobotCfg
 class SceneCfg:
     """Table, cube and goal marker. Lengths in m, mass in kg.
 
-    ``cube`` False leaves the cube out. ``goal`` is the marker's shape, ``sphere`` or ``cube`` (of the cube's size). The cameras
+    ``table`` False makes the table a picture alone: nothing meets it, and without contacts the physics is several times faster.
+    ``cube`` False leaves the cube out. ``goal`` is the marker's shape, ``sphere``, ``frame``
+    (a sphere with axes) or ``cube`` (of the cube's size). The cameras
     look at ``look_at`` from ``view_distance``.
 
     The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
@@ -21,6 +23,7 @@ class SceneCfg:
 
     table_center: tuple[float, float] = (0.3, 0.0)
     table_size: tuple[float, float] = (1.0, 1.2)
+    table: bool = True
     cube: bool = True
     cube_edge: float = 0.03
     cube_mass: float = 0.03
@@ -64,7 +67,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
 
     # Contact bits: the table meets bit 1, the cube bit 2; robot geoms have no type, so never meet one another.
     world = spec.worldbody
-    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0, group=3)
+    if scene.table:
+        world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0, group=3)
     for drive in (robot.arm, robot.gripper):
         _add_drives(spec, drive)
 
@@ -117,6 +121,10 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal) -> None:
     box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.cube_edge / 2
     shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
     goal.add_geom(name="goal", type=shape, size=extent, rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
+    if scene.goal == "frame":
+        for axis, rgba in zip(np.eye(3), ([0.85, 0.2, 0.2, 1], [0.2, 0.7, 0.25, 1], [0.2, 0.35, 0.9, 1]), strict=True):
+            ends = [0, 0, 0, *(0.06 * axis)]
+            goal.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.003, 0, 0], fromto=ends, rgba=rgba, **hidden)
     world = spec.worldbody
     x, y = scene.table_center
     size = [scene.table_size[0] / 2, scene.table_size[1] / 2, 0.02]

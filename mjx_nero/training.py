@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mjx_nero import checkpoint, config, policy, registry, render, rollout, wrappers
-from mjx_nero.env import ManipulationEnv
-from mjx_nero.ppo import Learner, PpoCfg, TrainState
+from mjx_nero.env import EnvCfg, ManipulationEnv
+from mjx_nero.ppo import PRESETS, Learner, PpoCfg, TrainState
 from mjx_nero.run_folder import RunFolder
 from mjx_nero.types import UserError
 
@@ -320,11 +320,21 @@ def command_line(argv: list[str]) -> str:
     return shlex.join(["python", "train.py", *kept])
 
 
-def resolve(env: str, preset: str, env_fields: dict[str, Any], ppo: PpoCfg, ppo_fields: dict[str, Any], **rest: Any) -> RunCfg:
+def resolve(
+    env: str, preset: str, robot: str | None, env_fields: dict[str, Any], ppo_fields: dict[str, Any], **rest: Any
+) -> RunCfg:
     """A run's config from names and dotted fields.
+
+    Args:
+        robot: another than the environment's own, by name or folder.
 
     Raises:
         UserError: unknown names or fields, wrong types.
     """
-    cfg = registry.env_cfg(env, preset, **env_fields)
-    return RunCfg(env_name=env, preset=preset, env=cfg, ppo=config.override(ppo, ppo_fields), **rest)
+    cfg = registry.env_cfg(env, preset, robot, **env_fields)
+    return RunCfg(env_name=env, preset=preset, env=cfg, ppo=config.override(learner_cfg(cfg, preset), ppo_fields), **rest)
+
+
+def learner_cfg(cfg: EnvCfg, preset: str) -> PpoCfg:
+    """The hyperparameters that go with a preset, and those that the task asks for."""
+    return config.override(PRESETS.get(preset, PpoCfg()), cfg.training)

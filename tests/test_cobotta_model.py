@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.robots import COBOTTA_PRO_900
+from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.scene import robot_model
 
 # Joints of the URDF: parent link, child link, origin (m), yaw (rad; roll and pitch are zero throughout), axis, limits.

@@ -5,11 +5,11 @@ import json
 
 import pytest
 
-from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, make
+from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, list_robots, make, registry
+from mjx_nero.arms.nero import NERO
 from mjx_nero.env import EnvCfg
 from mjx_nero.policy import NetworkCfg
 from mjx_nero.ppo import PRESETS
-from mjx_nero.robots import COBOTTA_PRO_900, NERO
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,9 +165,9 @@ def test_task_overrides_by_dotted_name():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: env_cfg("nero_lif"), r"unknown env 'nero_lif' \(did you mean 'nero_lift'\?\): choose one of nero_lift"),
+        (lambda: env_cfg("nero_lif"), r"unknown env 'nero_lif' \(did you mean 'nero_lift'\?\): choose one of cobotta_lift"),
         (lambda: env_cfg("nero_lift", "isac"), r"unknown preset of nero_lift 'isac' \(did you mean 'isaac'\?\): choose one of"),
-        (lambda: list_presets("x"), r"unknown env 'x': choose one of nero_lift"),
+        (lambda: list_presets("x"), r"unknown env 'x': choose one of cobotta_lift"),
         (lambda: make("nero_lift", impl="cuda"), r"unknown impl 'cuda': choose one of auto, jax, warp"),
     ],
 )
@@ -177,14 +177,15 @@ def test_unknown_names(call, message):
 
 
 def test_registry_lists():
-    assert list_envs() == tuple(
-        f"{robot}_{task}" for robot in ("nero", "cobotta") for task in ("lift", "follow_target", "pick_place")
-    )
+    everywhere = {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in ("lift", "reach")}
+    controlled = {f"{robot}_{task}" for robot in ("nero", "cobotta") for task in ("follow_target", "pick_place")}
+    assert set(list_envs()) == everywhere | controlled | {"reach"}
+    assert set(list_robots()) == {"nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101"}
     assert list_presets("nero_lift")[0] == "default" and "isaac" in list_presets("nero_lift")
     assert list_presets("cobotta_follow_target") == ("default", "static")
 
 
-@pytest.mark.parametrize("name", list_envs())
+@pytest.mark.parametrize("name", [name for name in list_envs() if name != "reach"])
 def test_every_environment_has_a_config_that_fits(name):
     for preset in list_presets(name):
         cfg = env_cfg(name, preset)
@@ -194,12 +195,12 @@ def test_every_environment_has_a_config_that_fits(name):
         assert cfg.action.absolute == bool(cfg.controllers)
         for controller, fields in cfg.controllers.items():
             config.override(control.CONTROLLERS[controller][1], fields)
-        env = make(name, preset, impl="jax")
-        assert env.action_size == env.physics_model.nu - (0 if cfg.action.absolute else 1)
+        env, arm = make(name, preset, impl="jax"), len(cfg.robot.arm.joints)
+        assert env.action_size == (env.physics_model.nu if cfg.action.absolute else arm + cfg.action.gripper)
 
 
 def test_drives_are_given_joint_by_joint():
-    for robot in (NERO, COBOTTA_PRO_900):
+    for robot in map(registry.robot, list_robots()):
         for drive in (robot.arm, robot.gripper):
             fields = (drive.stiffness, drive.damping, drive.effort, drive.speed, drive.home)
             assert {len(values) for values in fields} == {len(drive.joints)}

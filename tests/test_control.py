@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, control, make, scene
+from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.arms.nero import NERO
 from mjx_nero.control import pick_place
 from mjx_nero.control.follow_target import IkFollower, RmpFollower
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PHASES, PickPlace, PickPlaceCfg, PickPlaceMemory
-from mjx_nero.robots import COBOTTA_PRO_900, NERO
 from mjx_nero.types import View
 
 DT = 0.02

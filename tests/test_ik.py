@@ -8,7 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero import benchmark, robots, scene
+from mjx_nero import benchmark, scene
+from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.arms.nero import NERO
 from mjx_nero.control import ik
 
 N = 500  # every test of the batched solver has this batch: it is compiled once a robot
@@ -60,7 +62,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return result
 
 
-@pytest.fixture(scope="module", params=[robots.NERO, robots.COBOTTA_PRO_900], ids=lambda robot: robot.name)
+@pytest.fixture(scope="module", params=[NERO, COBOTTA_PRO_900], ids=lambda robot: robot.name)
 def arm(request) -> Arm:
     return Arm(request.param)
 
@@ -175,7 +177,7 @@ def test_local_never_restarts(arm):
 
 @pytest.mark.slow
 def test_one_pose_as_in_a_batch():
-    arm = Arm(robots.NERO)
+    arm = Arm(NERO)
     pos, quat = arm.poses(arm.random(9))
     many = arm.solve(pos, quat, arm.home, jax.random.PRNGKey(0))
     solve = jax.jit(arm.solver.solve)
@@ -198,7 +200,7 @@ def test_closed_form_of_the_cobotta_with_the_gripper_straight_down():
     pos = jnp.array(np.stack([x, y, z], axis=1), jnp.float32)
     quat = jnp.array(np.stack([0 * psi, -np.sin(psi / 2), np.cos(psi / 2), 0 * psi], axis=1), jnp.float32)
 
-    solver = ik.InverseKinematics(robots.COBOTTA_PRO_900, "flange", ik.IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-5))
+    solver = ik.InverseKinematics(COBOTTA_PRO_900, "flange", ik.IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-5))
     at, turn = jax.vmap(solver.chain.poses)(jnp.array(exact, jnp.float32))
     np.testing.assert_allclose(at[:, 0], pos, rtol=0, atol=2e-6)
     np.testing.assert_allclose(np.abs(np.sum(turn[:, 0] * quat, axis=1)), 1.0, rtol=0, atol=1e-6)
@@ -210,12 +212,12 @@ def test_closed_form_of_the_cobotta_with_the_gripper_straight_down():
 
 def test_unknown_frame():
     with pytest.raises(KeyError, match="nowhere"):
-        ik.InverseKinematics(robots.NERO, "nowhere")
+        ik.InverseKinematics(NERO, "nowhere")
 
 
 @pytest.mark.slow
 def test_benchmark():
-    (ours, *_) = benchmark.measure_ik(robots.NERO, [N], 1)
+    (ours, *_) = benchmark.measure_ik(NERO, [N], 1)
     assert (ours["solver"], ours["batch"], ours["poses"]) == ("mjx_nero", N, N)
     assert ours["success"] >= 0.99 and ours["error_mm"] < 1.0 and ours["error_mrad"] < 10.0
     assert ours["solves_per_s"] == pytest.approx(N / ours["ms_per_batch"] * 1e3, rel=0.01)
@@ -229,5 +231,5 @@ def test_benchmark_with_mink(arm):
 
 def test_benchmark_without_mink(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mink", None)
-    assert benchmark.measure_mink(robots.NERO, np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])) == []
+    assert benchmark.measure_mink(NERO, np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])) == []
     assert capsys.readouterr().out.count("\n") == 1

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mjx_nero import kinematics
+from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.arms.nero import NERO
 from mjx_nero.kinematics import Chain
-from mjx_nero.robots import COBOTTA_PRO_900, NERO
 from mjx_nero.scene import robot_model
 
 # Turned and shifted bodies; a slide and a hinge with an anchor off the body's origin in one body, two more hinges in another.

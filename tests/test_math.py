@@ -41,6 +41,22 @@ def test_rotate(quat, vec, turned):
     np.testing.assert_allclose(math.rotate(quat, jnp.array(vec)), turned, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("angles", "vec", "turned"),
+    [
+        ((np.pi / 2, 0, 0), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
+        ((0, np.pi / 2, 0), [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]),  # level, along +x
+        ((0, 0, np.pi / 2), [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        ((np.pi / 2, 0, np.pi / 2), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),  # about x first: y -> z, which yaw leaves
+        ((np.pi / 2, 0, np.pi / 2), [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        ((np.pi, -np.pi / 6, 0), [0.0, 0.0, 1.0], [0.5, 0.0, -(3**0.5) / 2]),  # down, tilted forward by 30 degrees
+    ],
+)
+def test_quat_from_euler(angles, vec, turned):
+    quat = math.quat_from_euler(*(jnp.float32(a) for a in angles))
+    np.testing.assert_allclose(math.rotate(quat, jnp.array(vec)), turned, atol=1e-6)
+
+
 def test_product_turns_by_the_right_factor_first():
     # x -> Z90 -> y -> X90 -> z
     np.testing.assert_allclose(math.rotate(math.quat_mul(X90, Z90), jnp.array([1.0, 0.0, 0.0])), [0, 0, 1], atol=1e-6)

@@ -11,9 +11,11 @@ import pytest
 import yaml
 
 from mjx_nero import scene
+from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.arms.nero import NERO
 from mjx_nero.control import rmpflow, rmpflow_config
 from mjx_nero.control.rmpflow import Obstacles, Rmp, RmpFlow, Target
-from mjx_nero.robots import ASSETS, COBOTTA_PRO_900, NERO
+from mjx_nero.robots import ASSETS
 from mjx_nero.types import UserError
 
 DT = 1 / 60

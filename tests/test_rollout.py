@@ -38,11 +38,11 @@ def test_idle_episodes(env, episodes):
 
 
 def test_records(env, episodes):
-    assert episodes.qpos.shape == (250, 3, 16) and episodes.goals.shape == (250, 3, 3)
+    assert episodes.qpos.shape == (250, 3, 16) and episodes.goals.shape == (250, 3, 7)
     assert np.isfinite(episodes.qpos).all()
     assert (episodes.goals == episodes.goals[0]).all()
     assert (np.abs(episodes.qpos[:, :, 11] - 0.015) < 1e-3).all()  # the cubes lie on the table
-    distance = np.linalg.norm(episodes.qpos[-1, :, 9:12] - episodes.goals[-1], axis=1)
+    distance = np.linalg.norm(episodes.qpos[-1, :, 9:12] - episodes.goals[-1, :, :3], axis=1)
     np.testing.assert_allclose(episodes.metrics["final_distance"][:3], distance, rtol=1e-5)
     assert episodes.distance.shape == (250, N) and episodes.memory == ()
     np.testing.assert_allclose(episodes.distance[-1], episodes.metrics["final_distance"], rtol=1e-6)
@@ -68,7 +68,7 @@ def test_controllers_play_every_environment_of_a_batch_with_a_memory_of_their_ow
     np.testing.assert_array_equal(episodes.lengths, [10, 10, 10])
     np.testing.assert_allclose(episodes.qpos[:, :, :6], np.broadcast_to(env.cfg.robot.arm.home, (10, 3, 6)), atol=1e-4)
     home = np.array([0.5, 0.0, 0.54])  # of the flange, which follows
-    np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.goals[-1] - home, axis=1), atol=1e-3)
+    np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.goals[-1, :, :3] - home, axis=1), atol=1e-3)
 
 
 def test_same_seed_same_episodes(native, episodes):

@@ -47,6 +47,9 @@ def at_height(z: float) -> View:
     return view(object_pos_w=[1.0, 2.0, z], ee_pos_w=[1.0, 2.0, z + 0.03], goal_pos_w=[1.0, 2.0, z + 0.1])
 
 
+# 13 cm and a right angle from the goal
+QUARTER = {"ee_pos_w": [1.03, 2.04, 3.42], "goal_quat_w": [0.5**0.5, 0.0, 0.0, 0.5**0.5]}
+
 REWARDS = [
     (rewards.object_ee_distance, {"std": 0.05}, view(), 1 - TANH_1),
     (rewards.object_ee_distance, {"std": 0.1}, view(), 1 - TANH_HALF),
@@ -72,6 +75,11 @@ REWARDS = [
     (rewards.goal_distance, {"std": 0.2}, at_height(-1.0), 1 - TANH_HALF),
     (rewards.ee_goal_distance, {"std": 0.13}, view(ee_pos_w=[1.03, 2.04, 3.42]), 1 - TANH_1),
     (rewards.ee_goal_distance, {"std": 0.26}, view(ee_pos_w=[1.03, 2.04, 3.42]), 1 - TANH_HALF),
+    (rewards.ee_position_error, {}, view(ee_pos_w=[1.03, 2.04, 3.42]), 0.13),
+    # half a turn about x from the goal; a quarter about z, whichever of its two quaternions it is given by
+    (rewards.ee_orientation_error, {}, view(), math.pi),
+    (rewards.ee_orientation_error, {}, view(goal_quat_w=[-(0.5**0.5), 0.0, 0.0, -(0.5**0.5)]), math.pi / 2),
+    (rewards.ee_goal_pose, {"std": 0.26, "angle_std": math.pi / 2}, view(**QUARTER), (1 - TANH_HALF) * (1 - TANH_1)),
     (rewards.action_rate_l2, {}, view(), 0.25 + 4.0 + 0.0),
     (rewards.joint_vel_l2, {}, view(), 4.0 + 9.0),
 ]
@@ -101,6 +109,9 @@ OBSERVATIONS = [
     (observations.joint_vel_rel, [2, -3]),
     (observations.object_position, [0, 0, 0.2]),
     (observations.command, [0, 0, 0.3]),
+    (observations.pose_command, [0, 0, 0.3, 0, 1, 0, 0]),
+    (observations.ee_to_goal, [-0.03, -0.04, 0.1]),
+    (observations.ee_turn_to_goal, [math.pi, 0, 0]),
     (observations.last_action, [0.5, -1, 2]),
     (observations.ee_position, [0.03, 0.04, 0.2]),
     (observations.ee_to_object, [-0.03, -0.04, 0]),
@@ -163,6 +174,9 @@ REST = {
         (success.object_at_goal, {"threshold": 0.099}, {}, False),
         (success.ee_at_goal, {"threshold": 0.131}, {"ee_pos_w": [1.03, 2.04, 3.42]}, True),
         (success.ee_at_goal, {"threshold": 0.129}, {"ee_pos_w": [1.03, 2.04, 3.42]}, False),
+        (success.ee_at_pose, {"threshold": 0.131, "angle": 1.58}, QUARTER, True),
+        (success.ee_at_pose, {"threshold": 0.129, "angle": 1.58}, QUARTER, False),
+        (success.ee_at_pose, {"threshold": 0.131, "angle": 1.57}, QUARTER, False),
         (success.object_placed, PLACED, REST, True),
         (success.object_placed, PLACED, {**REST, "goal_pos_w": [0.0, 0.011, 0.0]}, False),  # elsewhere
         (success.object_placed, PLACED, {**REST, "object_linvel_w": [0.003, 0.0, -0.0041]}, False),  # sliding
@@ -216,6 +230,25 @@ def test_actions():
         jnp.array([1.0, -1.0, 0.51, 0.5]), jnp.array([0.5, 0.5, 0.5, 0.5]), step=jnp.array([0.03, 0.03, 0.03, 0.03])
     )
     np.testing.assert_allclose(ctrl, [0.53, 0.47, 0.51, 0.5], atol=1e-7)
+
+
+def test_uniform_pose_fills_its_ranges():
+    ranges = {"x": (0.1, 0.3), "y": (-0.2, 0.0), "z": (0.5, 0.5), "roll": (0.0, 0.0), "pitch": (0.0, 0.0), "yaw": (-1.0, 2.0)}
+    pos, quat = jax.vmap(lambda key: commands.uniform_pose(key, **ranges))(jax.random.split(KEY, 2000))
+    assert ((pos >= jnp.array([0.1, -0.2, 0.5])) & (pos <= jnp.array([0.3, 0.0, 0.5]))).all()
+    yaw = 2 * np.arctan2(quat[:, 3], quat[:, 0])
+    assert yaw.min() == pytest.approx(-1, abs=0.01) and yaw.max() == pytest.approx(2, abs=0.01)
+    np.testing.assert_allclose(quat[:, 1:3], 0, atol=1e-6)
+    np.testing.assert_allclose(pos.mean(axis=0), [0.2, -0.1, 0.5], atol=0.005)
+
+
+def test_joints_are_scaled_one_by_one():
+    joints, start = jnp.array([1.0, -2.0, 0.0]), jnp.array([1.0, 2.0, 3.0])
+    moved, cubes = jax.vmap(lambda k: events.joints_by_scale(k, joints, start, low=0.5, high=1.5))(jax.random.split(KEY, 2000))
+    np.testing.assert_array_equal(cubes, np.tile(start, (2000, 1)))
+    np.testing.assert_allclose(moved.min(axis=0), [0.5, -3.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(moved.max(axis=0), [1.5, -1.0, 0.0], atol=0.01)
+    assert abs(np.corrcoef(moved[:, 0], moved[:, 1])[0, 1]) < 0.1
 
 
 def test_uniform_position_fills_its_box():

@@ -68,12 +68,21 @@ class ParallelGripper:
         return rate_limit(wanted, targets, step=jnp.asarray(self._speed * dt))
 
     def gap(self, positions: Positions) -> Float[Array, ""]:
-        """Distance between the pads [m]."""
-        return self._gap(positions)
+        """Distance between the pads [m].
+
+        Raises:
+            UserError: nobody said how far these joints open it.
+        """
+        return self._known(self._gap)(positions)
 
     def positions(self, gap: Float[Array, ""]) -> Positions:
-        """Joint positions that leave ``gap`` [m] between the pads, within the joints' ranges."""
-        return self._clip(self._positions(gap))
+        """Joint positions that leave ``gap`` [m] between the pads, within the joints' ranges. Raises as ``gap``."""
+        return self._clip(self._known(self._positions)(gap))
+
+    def _known(self, function):
+        if function is None:
+            raise UserError(f"the gap of a gripper with the joints {', '.join(self.joints) or 'none'} is unknown")
+        return function
 
     def _clip(self, positions) -> Positions:
         return jnp.clip(jnp.asarray(positions, jnp.float32), *self._range)

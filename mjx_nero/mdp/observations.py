@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjx_nero import math
 from mjx_nero.types import View
 
 
@@ -29,6 +30,11 @@ def object_position(view: View) -> Float[Array, "3"]:
 def command(view: View) -> Float[Array, "3"]:
     """Commanded point in the robot's root frame [m]."""
     return view.command
+
+
+def pose_command(view: View) -> Float[Array, "7"]:
+    """Commanded position [m] and orientation (wxyz) in the robot's root frame. Isaac Lab's ``generated_commands``."""
+    return jnp.concatenate([view.command, view.goal_quat_w])
 
 
 def last_action(view: View) -> Float[Array, " na"]:
@@ -64,6 +70,16 @@ def object_velocity(view: View) -> Float[Array, "6"]:
 def object_orientation(view: View) -> Float[Array, "4"]:
     """Orientation of the object, wxyz."""
     return view.object_quat_w
+
+
+def ee_to_goal(view: View) -> Float[Array, "3"]:
+    """From the end effector to the goal [m]."""
+    return view.goal_pos_w - view.ee_pos_w
+
+
+def ee_turn_to_goal(view: View) -> Float[Array, "3"]:
+    """The rotation vector that turns the end effector to the goal's orientation, in its own frame [rad]."""
+    return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), view.goal_quat_w))
 
 
 def ee_orientation(view: View) -> Float[Array, "4"]:

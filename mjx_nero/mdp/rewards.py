@@ -44,6 +44,24 @@ def ee_goal_distance(view: View, *, std: float) -> Float[Array, ""]:
     return 1.0 - jnp.tanh(success.ee_distance(view) / std)
 
 
+def ee_position_error(view: View) -> Float[Array, ""]:
+    """Distance of the end effector to the goal [m]. Isaac Lab's ``position_command_error``."""
+    return success.ee_distance(view)
+
+
+def ee_orientation_error(view: View) -> Float[Array, ""]:
+    """Angle from the end effector's orientation to the goal's [rad]. Isaac Lab's ``orientation_command_error``."""
+    return success.ee_angle(view)
+
+
+def ee_goal_pose(view: View, *, std: float, angle_std: float) -> Float[Array, ""]:
+    """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), from the end effector to the goal.
+
+    As a sum, a turn that is right in the wrong place would hold the arm there.
+    """
+    return ee_goal_distance(view, std=std) * (1.0 - jnp.tanh(success.ee_angle(view) / angle_std))
+
+
 def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
     """1 while the object is held (see ``held``)."""
     return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius).astype(jnp.float32)

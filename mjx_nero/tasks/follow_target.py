@@ -1,8 +1,9 @@
 """Follow target: the end effector keeps to a target cube. The Isaac Sim tutorial's first task."""
 
 import dataclasses
+import functools
 
-from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
+from mjx_nero.env import ActionCfg, EnvCfg, Presets, SuccessCfg
 from mjx_nero.mdp import commands, observations, rewards, success, terminations
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg
@@ -18,23 +19,6 @@ class Work:
     spread: tuple[float, float, float]
     radius: float
     scene: SceneCfg
-
-
-# The tutorial's frame and target.
-COBOTTA_WORK = Work(
-    frame="flange",
-    center=(0.5, 0.0, 0.5),
-    spread=(0.05, 0.15, 0.1),
-    radius=0.1,
-    scene=SceneCfg(cube=False, cube_edge=0.0515, goal="cube", table_size=(1.2, 1.4), look_at=(0.25, 0.0, 0.4), view_distance=1.7),
-)
-NERO_WORK = Work(
-    frame="ee",
-    center=(0.32, 0.0, 0.17),  # with its wrist's range the arm points straight down up to about z = 0.25
-    spread=(0.02, 0.08, 0.02),
-    radius=0.05,
-    scene=SceneCfg(cube=False, goal="cube"),
-)
 
 
 def default(robot: RobotCfg, work: Work) -> EnvCfg:
@@ -83,3 +67,8 @@ def static(robot: RobotCfg, work: Work) -> EnvCfg:
             distance=Term(success.ee_distance),
         ),
     )
+
+
+def presets(work: Work) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {"default": functools.partial(default, work=work), "static": functools.partial(static, work=work)}

@@ -1,14 +1,13 @@
 """Pick and place: a cube from where it lies to where it belongs. The Isaac Sim tutorial's second task."""
 
 import dataclasses
+import functools
 
-from mjx_nero.env import ActionCfg, EnvCfg, SuccessCfg
+from mjx_nero.env import ActionCfg, EnvCfg, Presets, SuccessCfg
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
-from mjx_nero.robots import RobotCfg
+from mjx_nero.robots import Range, RobotCfg
 from mjx_nero.scene import SceneCfg
 from mjx_nero.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
-
-Range = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,31 +20,6 @@ class Work:
     goal: tuple[Range, Range]
     travel_height: float
     episode_length_s: float
-
-
-# Around the tutorial's goal, (-0.3, 0.6).
-COBOTTA_WORK = Work(
-    scene=SceneCfg(
-        cube_edge=0.0515,
-        cube_mass=0.1,
-        goal="cube",
-        table_center=(0.1, 0.15),
-        table_size=(1.5, 1.5),
-        look_at=(0.15, 0.05, 0.27),
-        view_distance=1.85,
-    ),
-    cube=((0.3, 0.6), (-0.3, 0.3)),
-    goal=((-0.4, -0.2), (0.5, 0.65)),
-    travel_height=0.2,
-    episode_length_s=20.0,
-)
-NERO_WORK = Work(
-    scene=SceneCfg(goal="cube"),
-    cube=((0.3, 0.4), (-0.1, 0.0)),
-    goal=((0.3, 0.4), (0.08, 0.2)),
-    travel_height=0.15,  # with its wrist's range the arm points straight down up to about z = 0.2 there
-    episode_length_s=20.0,
-)
 
 
 def default(robot: RobotCfg, work: Work) -> EnvCfg:
@@ -97,3 +71,8 @@ def default(robot: RobotCfg, work: Work) -> EnvCfg:
             ),
         },
     )
+
+
+def presets(work: Work) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {"default": functools.partial(default, work=work)}

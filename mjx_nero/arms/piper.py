@@ -1,0 +1,54 @@
+"""AgileX Piper: six joints and the Nero's gripper."""
+
+import math
+
+from mjx_nero.env import Envs
+from mjx_nero.robots import DriveCfg, GripperCfg, RobotCfg
+from mjx_nero.scene import SceneCfg
+from mjx_nero.tasks import lift, reach
+
+# Drives: the Isaac Lab recipe's, but for the speed: at its 10 rad/s every change of an action drives the joints into their effort
+# limits. Home: the grasp point at (0.3, 0, 0.22), 25 degrees from straight down (assets/piper/README.md).
+ROBOT = PIPER = RobotCfg(
+    name="piper",
+    down=(0.0, 0.0, 1.0, 0.0),
+    gravity_compensation=True,
+    workspace=((0.3, 0.4), (-0.2, 0.2), (0.2, 0.4)),
+    arm=DriveCfg(
+        joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
+        stiffness=(200.0, 200.0, 150.0, 150.0, 80.0, 80.0),
+        damping=(40.0, 40.0, 30.0, 15.0, 8.0, 8.0),
+        effort=(15.0,) * 6,
+        speed=(2.0,) * 6,
+        home=(0.0, 1.29, -1.161, 0.0, 1.1, 0.0),
+    ),
+    gripper=GripperCfg(
+        joints=("gripper_joint1", "gripper_joint2"),
+        stiffness=(800.0, 800.0),
+        damping=(20.0, 20.0),
+        effort=(22.0, 22.0),
+        speed=(1.5, 1.5),
+        home=(0.05, -0.05),
+        open=(0.05, -0.05),
+        close=(0.0, -0.001),
+    ),
+)
+
+LIFT = lift.Work(  # Nero's regions
+    scene=SceneCfg(cube_edge=0.03, cube_mass=0.03),
+    cube=((0.3, 0.4), (-0.1, 0.2)),
+    goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
+    calm=-0.1,
+)
+# The recipe's box: the gripper level, pointing along +x.
+REACH = reach.Work(
+    position=((0.3, 0.4), (0.1, 0.15), (0.3, 0.3)),
+    orientation=(reach.STILL, (math.pi / 2, math.pi / 2), reach.STILL),
+    decimation=1,
+    episode_length_s=6.0,
+)
+
+ENVS: Envs = {
+    "piper_lift": (PIPER, lift.presets(LIFT)),
+    "piper_reach": (PIPER, reach.presets(REACH)),
+}
