@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
+from rich.console import Console
+
 from mjx_nero import config
 from mjx_nero.types import UserError
 
@@ -60,6 +62,14 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     sys.exit(code)
+
+
+def console() -> Console:
+    """For tables: as wide as the terminal, and wide enough for names where there is none."""
+    console = Console()
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = 160  # a pipe has no width of its own, and rich would take 80
+    return console
 
 
 def setup_jax() -> None:

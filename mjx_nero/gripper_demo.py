@@ -121,13 +121,8 @@ def _save_plot(motion: Motion, title: str, path: pathlib.Path) -> None:
     axes = figure.subplots()
     plot(motion, axes)
     axes.set_title(title, loc="left")
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
+    with run_folder.whole(path) as part:
         figure.savefig(part, dpi=110)
-        part.replace(path)
-    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not know
-        part.unlink(missing_ok=True)
-        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def main(argv: Sequence[str]) -> None:
