@@ -1,0 +1,131 @@
+"""Drives of an imported robot: gains from a file, or worked out from the inertia that each joint moves."""
+
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+
+from mjx_nero import config
+from mjx_nero.types import UserError
+from mjx_nero.urdf import files
+from mjx_nero.urdf.fingers import Hand
+from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf.tree import Body, Joint
+
+FREQUENCY = 20.0  # [rad/s] natural frequency of the arm's drives: a tenth of what 100 physics steps a second can follow
+STRETCH = 0.05  # [rad, m] position error at which a drive gives its full effort, at the least
+SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
+SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
+FORCE = 60.0  # [N] most that a finger gives
+FINGER = 0.3  # [kg] rotor inertia of a sliding finger, or at the end of a turning one (why: assets/nero/nero.xml)
+_COLUMNS = ("stiffness", "damping", "effort", "speed")
+Rows = dict[str, dict[str, float]]
+
+
+def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
+    """``joint -> {stiffness, damping, effort, speed}``, the last two optional, from a YAML file.
+
+    Raises:
+        UserError: no such file, no YAML, an unknown joint or column, or a value that is not above 0 (damping: below 0).
+    """
+    try:
+        raw = yaml.safe_load(files.read(path, 1_000_000))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise UserError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(raw, Mapping) or not raw:
+        raise UserError(f"{path} takes joint: {{stiffness: .., damping: ..}} for each joint, got {type(raw).__name__}")
+    out: Rows = {}
+    for name, row in raw.items():
+        if name not in joints:
+            raise UserError(f"{path} names joint {name!r}{config.hint(str(name), joints)}: choose from {', '.join(joints)}")
+        if not isinstance(row, Mapping) or not {"stiffness", "damping"} <= set(row) or not set(row) <= set(_COLUMNS):
+            raise UserError(f"{path}: {name} takes stiffness and damping, and at will effort and speed; got {str(row)[:80]}")
+        for column, value in row.items():
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or value < 0 or value == 0 and column != "damping":
+                raise UserError(f"{path}: {name}.{column} has to be a number above 0, got {str(value)[:80]}")
+        out[str(name)] = {column: float(value) for column, value in row.items()}
+    return out
+
+
+def carried(model: mujoco.MjModel) -> dict[str, float]:
+    """The most inertia [kg m2, kg] that each joint moves, rotors apart, over 64 random poses."""
+    rng, data = np.random.default_rng(0), mujoco.MjData(model)
+    model.dof_armature[:] = 0.0
+    full, most = np.zeros((model.nv, model.nv)), np.zeros(model.nv)
+    for _ in range(64):
+        data.qpos[:] = rng.uniform(model.jnt_range[:, 0], model.jnt_range[:, 1])
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        most = np.maximum(most, np.diag(full))
+    return {model.joint(i).name: float(most[model.jnt_dofadr[i]]) for i in range(model.njnt)}
+
+
+def armature(joint: Joint, inertia: float, lever: float | None) -> float:
+    """Rotor inertia [kg m2, kg], which URDFs lack.
+
+    Of an arm's joint 5% of the inertia that it moves, within 0.01 to 1 kg m2, so that stiff drives stay well conditioned on light
+    wrists; of a gripper's joint ``FINGER`` at the fingers' end.
+
+    Args:
+        inertia: of ``carried``.
+        lever: of a gripper's joint, the distance of its end from the axis [m].
+    """
+    if joint.type == "prismatic":
+        return FINGER if lever is not None else float(np.clip(0.05 * inertia, FINGER, 10.0))
+    if lever is not None:
+        return float(np.clip(FINGER * lever**2, 1e-4, 0.1))
+    return float(np.clip(0.05 * inertia, 0.01, 1.0))
+
+
+def rows(
+    parts: Mapping[str, Body],
+    hand: Hand,
+    inertia: Mapping[str, float],
+    rotors: Mapping[str, float],
+    levers: Mapping[str, float],
+    given: Rows,
+    notes: Notes,
+) -> Rows:
+    """Stiffness, damping, effort and speed of every driven joint: as given, else by rule.
+
+    Effort and speed are the URDF's limits, the latter at most ``SPEED``. An arm's drive has the natural frequency ``FREQUENCY``
+    with the most inertia that the joint moves, or less if it would reach its full effort within ``STRETCH``; a finger's gives its
+    full effort (at most ``FORCE`` at its end) at ``SQUEEZE``. Damping is critical.
+    """
+    out: Rows = {}
+    for body in parts.values():
+        joint = body.joint
+        if joint is None or joint.mimic:
+            continue
+        total = inertia[joint.name] + rotors[joint.name]
+        finger = joint.name in hand.joints
+        lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
+        effort, speed = joint.effort, min(joint.velocity or 1.5, SPEED)
+        if finger:
+            effort = min(effort or FORCE / 3 * lever, FORCE * lever)
+            stiffness = effort * lever / SQUEEZE if joint.type != "prismatic" else effort / SQUEEZE
+            if joint.effort and joint.effort > effort:
+                notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
+        else:
+            stiffness = FREQUENCY**2 * total
+            if effort is None:
+                effort = stiffness * 0.5
+                notes.add("guessed", "joint", joint.name, f"effort {effort:.3g}: the drive's at half a radian or metre")
+            elif effort / total < 2.0:
+                text = f"effort {effort:g} moves its load at no more than {effort / total:.2g} rad/s2 or m/s2: check it"
+                notes.add("warning", "joint", joint.name, text)
+            stiffness = min(stiffness, effort / STRETCH)
+        row = {"stiffness": stiffness, "damping": 2 * math.sqrt(stiffness * total), "effort": effort, "speed": speed}
+        if joint.name in given:
+            row |= given[joint.name]
+        else:
+            notes.add(
+                "guessed", "joint", joint.name, f"stiffness {stiffness:.4g} and damping {row['damping']:.4g}, by its inertia"
+            )
+        out[joint.name] = {column: float(f"{value:.6g}") for column, value in row.items()}
+    return out

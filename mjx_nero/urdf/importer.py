@@ -1,0 +1,210 @@
+"""A URDF to a model folder: ``model.xml``, ``meshes/``, ``robot.yaml`` and ``report.json``."""
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_nero.robots import DriveCfg, GripperCfg, RobotCfg
+from mjx_nero.types import UserError
+from mjx_nero.urdf import collide, drives, files, inertia, mjcf, output, reach
+from mjx_nero.urdf import hand as hands
+from mjx_nero.urdf import read as reader
+from mjx_nero.urdf.looks import Drawn, Looks
+from mjx_nero.urdf.notes import Notes, Report
+from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
+from mjx_nero.urdf.tree import poses as body_poses
+
+
+def import_urdf(
+    path: pathlib.Path | str,
+    out: pathlib.Path | str,
+    packages: Mapping[str, pathlib.Path] | None = None,
+    gains: pathlib.Path | None = None,
+    *,
+    gripper: Sequence[str] | None = None,
+    ee: str | None = None,
+    home: Mapping[str, float] | None = None,
+    strict: bool = False,
+    force: bool = False,
+) -> Report:
+    """Makes a model folder of a URDF (or xacro file), for ``mjx_nero.make(..., robot=out)``.
+
+    The folder appears whole or not at all. Meshes are read from the URDF's own folder (``files.Roots`` says which others) and
+    from ``packages``, from nowhere else. In place of a missing mesh the link's other one is drawn or fitted, or a stand-in, with
+    a warning.
+
+    Args:
+        path: URDF of a robot that stands on a fixed base.
+        out: folder to make; empty, absent, or with ``force`` an earlier import.
+        packages: name -> folder of ``package://name/...``.
+        gains: YAML file, joint -> stiffness, damping and at will effort and speed; the rest is worked out (``drives.rows``).
+        gripper: joints that drive the gripper, in place of the guess (``hand.find``); empty for none.
+        ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
+        home: positions of some joints [rad, m], in place of the guess (``reach.first_home``).
+        strict: warnings become an error.
+
+    Raises:
+        UserError: the input cannot be used; one line that says what is wrong and what to do.
+    """
+    path, out = pathlib.Path(path), pathlib.Path(out)
+    output.check(out, force)
+    notes = Notes()
+    roots = files.Roots(path, packages or {})
+    tree, mount = reader.read(path, roots, notes)
+    parts = bodies(tree)
+    looks = Looks(tree, parts, files.Meshes(roots), notes)
+    seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
+    filled = {n: dataclasses.replace(link, mass=inertia.filled(link.mass, seen[n], n, notes)) for n, link in tree.links.items()}
+    read_mass = sum(link.mass.mass for link in tree.links.values())
+    tree = dataclasses.replace(tree, links=filled)
+    parts = bodies(tree)
+    masses = {n: inertia.body_mass(b, notes) if b.joint else b.mass for n, b in parts.items()}
+
+    hand = hands.find(tree, parts, looks.of, gripper, ee, notes)
+    joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
+    start = reach.first_home(parts, hand, home or {})
+    cloud = reach.Cloud(parts, hand, mount, start)
+    collisions = collide.collisions(tree, parts, looks, hand, cloud, notes)
+    hit = [(link, shape) for link, items in collisions.items() for _, shape, bits in items if bits]
+    at_home = reach.clear_home(hand, cloud, start, home or {}, hit, tree.name, notes)
+    box = reach.workspace(cloud, tree.name, notes)
+
+    site = _free("ee", [link for b in parts.values() for link in b.links])
+    rest = {n: float(q[0]) for n, q in positions(parts, {n: np.array([v]) for n, v in at_home.items()}, 1).items()}
+
+    def model(drawn: Mapping[str, list[Drawn]], rotors: Mapping[str, float]) -> str:
+        return mjcf.document(tree.name, parts, masses, drawn, collisions, (site, hand.link, hand.site), rotors, rest)
+
+    draft = model(dict.fromkeys(tree.links, []), dict.fromkeys(joints, 0.0))
+    moved = drives.carried(_compiled(draft))
+    levers = _levers(parts, hand)
+    rotors = {n: drives.armature(j, moved[n], levers.get(n)) for n, j in joints.items()}
+    for name, value in rotors.items():
+        notes.add("guessed", "joint", name, f"rotor inertia (armature) {value:.3g}: URDFs have none")
+    driven = {n: j for n, j in joints.items() if not j.mimic}
+    given = {} if gains is None else drives.load_gains(pathlib.Path(gains), driven)
+    rows = drives.rows(parts, hand, moved, rotors, levers, given, notes)
+    arm = [n for n in driven if n not in hand.joints]
+    robot = RobotCfg(
+        name=tree.name,
+        arm=DriveCfg(**_columns(arm, rows, at_home)),
+        gripper=GripperCfg(**_columns(hand.joints, rows, at_home), open=hand.open, close=hand.close),
+        ee_site=site,
+        base_link=tree.root,
+        base_pos=_floats(mount[:3, 3]),
+        base_quat=_floats(_quat(mount)),
+        down=reach.down(cloud, hand, box),
+        gravity_compensation=True,
+        workspace=box,
+        folder=str(out),
+    )
+    text = model({name: look.drawn for name, look in looks.of.items()}, rotors)
+    report = Report(
+        source=path.name,
+        folder=out,
+        robot=robot,
+        links=_link_rows(tree, parts, looks, collisions),
+        joints=_joint_rows(tree, rotors, rows, at_home),
+        mass=float(sum(m.mass for m in masses.values())),
+        mass_read=float(read_mass),
+        contacts=collide.contacts(collisions),
+        notes=notes,
+    )
+    if strict and report.warnings:
+        more = f" (and {len(report.warnings) - 1} more)" if len(report.warnings) > 1 else ""
+        raise UserError(f"--strict: {report.warnings[0]}{more}")
+    output.write(out, text, looks.stl, robot, report, force)
+    return report
+
+
+def _compiled(text: str) -> mujoco.MjModel:
+    try:
+        return mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        raise UserError(f"MuJoCo refuses the model: {' '.join(str(error).split())}") from None
+
+
+def _levers(parts: dict[str, Body], hand: hands.Hand) -> dict[str, float]:
+    """Of the gripper's joints: how far from its axis a joint moves the fingers' pads [m]; of slides 1."""
+    inside = [parts[n] for n in hand.inside]
+    at = {n: p[0] for n, p in body_poses(parts, {j: np.array([v]) for j, v in zip(hand.joints, hand.close, strict=True)}).items()}
+    ends = [at[f] @ np.append(hand.pads[f].pose[:3, 3], 1.0) for f in hand.fingers]
+    out = {}
+    for body in inside:
+        assert body.joint is not None
+        if body.joint.type == "prismatic":
+            out[body.joint.name] = 1.0
+            continue
+        axis = at[body.name][:3, :3] @ body.joint.axis
+        arms = [float(np.linalg.norm(np.cross(end[:3] - at[body.name][:3, 3], axis))) for end in ends]
+        out[body.joint.name] = float(np.clip(min(arms), 0.02, 0.3)) if arms else 0.1
+    return out
+
+
+def _columns(joints: Sequence[str], rows: drives.Rows, home: Mapping[str, float]) -> dict[str, Any]:
+    columns = {c: tuple(rows[j][c] for j in joints) for c in ("stiffness", "damping", "effort", "speed")}
+    return {"joints": tuple(joints), **columns, "home": tuple(home[j] for j in joints)}
+
+
+def _link_rows(tree: Tree, parts: dict[str, Body], looks: Looks, collisions: collide.Collisions) -> dict[str, dict[str, Any]]:
+    body_of = {link: body.name for body in parts.values() for link in body.links}
+    rows: dict[str, dict[str, Any]] = {}
+    for name, link in tree.links.items():
+        shapes = [
+            {
+                "name": label,
+                "kind": shape.kind,
+                "size": [round(s, 5) for s in shape.size],
+                "covered": shape.covered,
+                "fill": shape.fill,
+                "meets": [what for bit, what in ((mjcf.TABLE, "table"), (mjcf.CUBE, "cube")) if bits & bit],
+            }
+            for label, shape, bits in collisions[name]
+        ]
+        rows[name] = {
+            "body": body_of[name],
+            "mass": link.mass.mass,
+            "visuals": len(link.visuals),
+            "collisions": len(link.collisions),
+            "covered": collide.covered(looks.of[name], [shape for _, shape, _ in collisions[name]]),
+            "meshes": sorted({d.mesh for d in looks.of[name].drawn if d.mesh}),
+            "shapes": shapes,
+        }
+    return rows
+
+
+def _joint_rows(
+    tree: Tree, rotors: Mapping[str, float], rows: drives.Rows, home: Mapping[str, float]
+) -> dict[str, dict[str, Any]]:
+    out: dict[str, dict[str, Any]] = {}
+    for name, joint in tree.joints.items():
+        out[name] = {"type": joint.type, "parent": joint.parent, "child": joint.child}
+        if not joint.moves:
+            out[name]["merged"] = True
+            continue
+        out[name] |= {"limits": [joint.lower, joint.upper], "effort": joint.effort, "velocity": joint.velocity}
+        out[name] |= {"damping": joint.damping, "frictionloss": joint.friction, "armature": rotors[name]}
+        if joint.mimic:
+            out[name]["mimic"] = dict(zip(("joint", "multiplier", "offset"), joint.mimic, strict=True))
+        else:
+            out[name] |= {"drive": rows[name], "home": home[name]}
+    return out
+
+
+def _free(name: str, taken: Sequence[str]) -> str:
+    return name if name not in taken else _free(f"{name}_site", taken)
+
+
+def _quat(pose: Pose) -> Float[np.ndarray, "4"]:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).reshape(-1))
+    return quat
+
+
+def _floats(values: np.ndarray) -> Any:
+    return tuple(float(v) + 0.0 for v in values)

@@ -1,0 +1,112 @@
+"""Masses and inertia tensors as a URDF gives them, made physical."""
+
+import numpy as np
+import yourdfpy
+
+from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf.tree import Body, Mass, Matrix, Points, Vec
+
+PLACEHOLDER = 1e-4  # [kg] lighter links are placeholders: exporters write 1e-6 or 1e-9 for parts that nobody weighed
+LIGHTEST = 1e-3  # [kg] what a moving body is given at least: little enough to leave a robot's mass alone
+LIGHTEST_RADIUS = 0.01  # [m] ... spread like a ball of this size at least
+DENSITY = 1000.0  # [kg/m3]
+MAX_MASS = 1e6  # [kg]
+
+
+def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
+    """Mass and tensor of a link, in the link's frame, with the tensor turned from the inertial frame to the link's.
+
+    What is no number, negative or beyond reason becomes 0, and is repaired as ``repaired`` does. A tensor that no mass
+    distribution can have (one of its second moments ``tr(I)/2 - I`` negative) gets the nearest that one can: the negative
+    moments are set to 1% of the largest.
+    """
+    origin = np.eye(4) if inertial.origin is None else inertial.origin
+    mass = 0.0 if inertial.mass is None else float(inertial.mass)
+    if not 0 <= mass <= MAX_MASS:
+        notes.add("warning", "link", name, f"the mass is {mass:g} kg: taken as 0")
+        mass = 0.0
+    tensor = np.zeros((3, 3)) if inertial.inertia is None else np.array(inertial.inertia, float)
+    if not (np.isfinite(tensor).all() and np.abs(tensor).max() <= MAX_MASS):
+        notes.add("warning", "link", name, "the inertia is not finite: taken as 0")
+        tensor = np.zeros((3, 3))
+    if mass == 0 and tensor.any():
+        notes.add("warning", "link", name, "an inertia without mass: left out")
+        tensor = np.zeros((3, 3))
+    if tensor.any():
+        values, axes = np.linalg.eigh(tensor)
+        moments = values.sum() / 2 - values
+        largest = moments.max()
+        if largest <= 0:
+            notes.add("repaired", "link", name, f"principal inertias {_list(values)} are not positive: taken as 0")
+            tensor = np.zeros((3, 3))
+        elif moments.min() < -1e-6 * largest:
+            moments = np.maximum(moments, 0.01 * largest)
+            tensor = axes @ np.diag(moments.sum() - moments) @ axes.T
+            notes.add(
+                "repaired",
+                "link",
+                name,
+                f"no body has the principal inertias {_list(values)}: now {_list(np.linalg.eigvalsh(tensor))}",
+            )
+    return Mass(mass, np.zeros(3), tensor).moved(origin)
+
+
+def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
+    """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero.
+
+    Also notes what is suspicious and leaves it alone: a placeholder's mass, mass that would have to lie outside the shape.
+    """
+    if mass.mass == 0:
+        return mass
+    if mass.mass < PLACEHOLDER:
+        notes.add("note", "link", name, f"{mass.mass:g} kg looks like a placeholder")
+    if mass.inertia.any():
+        if points is not None and mass.mass >= PLACEHOLDER:
+            _compare(mass, points, name, notes)
+        return mass
+    if points is None:
+        tensor = _ball(mass.mass, max(LIGHTEST_RADIUS, (mass.mass / DENSITY / 4.19) ** (1 / 3)))
+        what = f"a ball of {DENSITY:g} kg/m3"
+    else:
+        moments = np.maximum(np.ptp(points, axis=0), 1e-3) ** 2 * mass.mass / 12
+        tensor, what = np.diag(moments.sum() - moments), "a box around its shape"
+    if mass.mass >= PLACEHOLDER:
+        notes.add("repaired", "link", name, f"the inertia was zero: now that of {what}")
+    return Mass(mass.mass, mass.com, tensor)
+
+
+def body_mass(body: Body, notes: Notes) -> Mass:
+    """Of a moving body: at least ``LIGHTEST``, and a tensor that MuJoCo takes."""
+    mass, com, tensor = body.mass.mass, body.mass.com, body.mass.inertia
+    if mass < LIGHTEST:
+        notes.add("repaired", "link", body.name, f"moves with {mass:g} kg: given {LIGHTEST:g} kg; weigh it")
+        mass = LIGHTEST
+        if np.linalg.eigvalsh(tensor)[0] < _ball(mass, LIGHTEST_RADIUS)[0, 0]:
+            tensor = _ball(mass, LIGHTEST_RADIUS)
+    smallest = _ball(mass, 1e-3)
+    if np.linalg.eigvalsh(tensor)[0] < smallest[0, 0]:  # a rod without thickness, or a point
+        tensor = tensor + smallest
+    return Mass(mass, com, tensor)
+
+
+def _ball(mass: float, radius: float) -> Matrix:
+    return 0.4 * mass * radius**2 * np.eye(3)
+
+
+def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
+    """Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis."""
+    lower, upper = points.min(0), points.max(0)
+    slack = 0.02 * np.ptp(points, axis=0).max()
+    if ((mass.com < lower - slack) | (mass.com > upper + slack)).any():
+        notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
+        return
+    moments = np.trace(mass.inertia) / 2 - np.diag(mass.inertia)
+    bound = mass.mass * (upper + slack - mass.com) * (mass.com - lower + slack)
+    ratio = float((moments / bound).max())
+    if ratio > 1:
+        text = f"the inertia needs mass outside the link: {ratio:.1f} times the most that fits its shape (kept)"
+        notes.add("note", "link", name, text)
+
+
+def _list(values: Vec) -> str:
+    return "(" + ", ".join(f"{v:.3g}" for v in values) + ") kg m2"

@@ -1,0 +1,130 @@
+"""``model.xml``: the robot as an MJCF, in the conventions of the package's own models."""
+
+from collections.abc import Iterable, Mapping
+
+import mujoco
+import numpy as np
+from lxml import etree
+
+from mjx_nero.urdf import fit
+from mjx_nero.urdf.looks import Drawn
+from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
+
+TABLE, CUBE = 1, 2  # contact bits of the scenes
+_PAD = {  # as in assets/nero/nero.xml, which says why
+    "condim": "4",
+    "priority": "1",
+    "friction": "1 0.02 0.001",
+    "solref": "0.02 1",
+    "solimp": "0.95 0.98 0.001",
+}
+_HEAD = " Made by python -m mjx_nero import-urdf; report.json tells what was changed and guessed. Robot only: scenes add drives. "
+
+
+def document(
+    title: str,
+    parts: Mapping[str, Body],
+    masses: Mapping[str, Mass],
+    drawn: Mapping[str, list[Drawn]],
+    collisions: Mapping[str, list[tuple[str, fit.Primitive, int]]],
+    site: tuple[str, str, Pose],
+    armature: Mapping[str, float],
+    rest: Mapping[str, float],
+) -> str:
+    """The XML text.
+
+    Args:
+        title: of the model.
+        parts: bodies, parents first; joints and links keep their names, and links that were merged remain as sites.
+        masses: body -> mass in its frame.
+        drawn: link -> visual geoms in its frame.
+        collisions: link -> (name, shape in its frame, contact bits that it answers to).
+        site: name of the grasp point, link, and pose in that [4, 4].
+        armature: joint -> rotor inertia [kg m2 or kg].
+        rest: joint -> position in the home pose [rad, m]. Joints that follow others have it as their reference, so that they
+            start where their source's home puts them.
+    """
+    root = etree.Element("mujoco", model=title)
+    root.append(etree.Comment(_HEAD))
+    etree.SubElement(root, "compiler", angle="radian", autolimits="true", meshdir="meshes")
+    asset = etree.SubElement(root, "asset")
+    for mesh in dict.fromkeys(d.mesh for items in drawn.values() for d in items if d.mesh):
+        etree.SubElement(asset, "mesh", name=mesh, file=f"{mesh}.stl")
+    elements = {"": etree.SubElement(root, "worldbody")}
+    for body in parts.values():
+        # MuJoCo displaces a joint from its reference: the body's frame is given there, and poses stay the URDF's.
+        frame = body.frame
+        if body.joint and body.joint.mimic:
+            frame = frame @ body.joint.motion(np.array([rest[body.joint.name]]))[0]
+        element = etree.SubElement(elements[body.parent], "body", name=body.name, **_pose(frame))
+        elements[body.name] = element
+        mass = masses[body.name]
+        if mass.mass > 0:
+            moments, axes = np.linalg.eigh(mass.inertia)
+            axes = axes * np.sign(np.linalg.det(axes))
+            # Rounding leaves the largest moment of a flat body a hair above the sum of the others, which MuJoCo refuses.
+            moments[2] = min(moments[2], moments[0] + moments[1])
+            place = _pose(fit.pose(axes, mass.com))
+            figures = {"mass": repr(float(mass.mass)), "diaginertia": _text(moments), "pos": "0 0 0", **place}
+            etree.SubElement(element, "inertial", **figures)
+        if body.joint:
+            _joint(element, body.joint, armature[body.joint.name], rest)
+        for link, at in body.links.items():
+            for item in drawn[link]:
+                _drawn(element, item, at)
+            for label, shape, bits in collisions[link]:
+                geom = {"name": label, "type": shape.kind, "size": _text(shape.size), **_pose(at @ shape.pose)}
+                geom |= {"group": "3", "contype": "0", "conaffinity": str(bits), "mass": "0", "rgba": "0.9 0.3 0.2 0.5"}
+                etree.SubElement(element, "geom", **geom, **(_PAD if bits & CUBE else {}))
+            if link != body.name:
+                etree.SubElement(element, "site", name=link, group="5", size="0.002", **_pose(at))
+            if link == site[1]:
+                look = {"size": "0.004", "group": "4", "rgba": "0.1 0.8 0.3 0.3"}
+                etree.SubElement(element, "site", name=site[0], **look, **_pose(at @ site[2]))
+    mimics = {b.joint.name: b.joint.mimic for b in parts.values() if b.joint and b.joint.mimic}
+    if mimics:
+        equality = etree.SubElement(root, "equality")
+        for name, (source, multiplier, offset) in mimics.items():
+            both = {"joint1": name} | ({"joint2": source} if source else {})
+            terms = (
+                offset - rest[name],
+                multiplier if source else 0.0,
+                0.0,
+                0.0,
+                0.0,
+            )  # from reference to reference; a source's is 0
+            etree.SubElement(equality, "joint", **both, polycoef=_text(terms), solref="0.02 1", solimp="0.95 0.99 0.001")
+    return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _joint(element: etree._Element, joint: Joint, armature: float, rest: Mapping[str, float]) -> None:
+    row = {"name": joint.name, "type": "slide" if joint.type == "prismatic" else "hinge", "axis": _text(joint.axis)}
+    row |= {"range": _text((joint.lower, joint.upper)), "armature": repr(float(armature))}
+    if joint.mimic:
+        row["ref"] = repr(float(rest[joint.name]))
+    if joint.type == "continuous":
+        row["limited"] = "false"
+    if joint.damping:
+        row["damping"] = repr(joint.damping)
+    if joint.friction:
+        row["frictionloss"] = repr(joint.friction)
+    etree.SubElement(element, "joint", **row)
+
+
+def _drawn(element: etree._Element, item: Drawn, at: Pose) -> None:
+    shape = {"mesh": item.mesh} if item.mesh else {"size": _text(item.size)}
+    look = {"group": "2", "contype": "0", "conaffinity": "0", "mass": "0", "rgba": _text(item.rgba)}
+    etree.SubElement(element, "geom", type=item.kind, **shape, **look, **_pose(at @ item.pose))
+
+
+def _pose(pose: Pose) -> dict[str, str]:
+    """``pos`` and ``quat``, left out where they are zero."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).reshape(-1))
+    out = {} if not pose[:3, 3].any() else {"pos": _text(pose[:3, 3])}
+    return out if np.array_equal(np.abs(quat), [1, 0, 0, 0]) else {**out, "quat": _text(quat)}
+
+
+def _text(numbers: Iterable[float]) -> str:
+    """All digits: poses agree with the URDF's."""
+    return " ".join(repr(float(v)) for v in numbers)

@@ -1,0 +1,76 @@
+"""What the importer tells its user: a note for everything that it changed, guessed or could not use."""
+
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+from mjx_nero.robots import RobotCfg
+
+KINDS = ("warning", "repaired", "guessed", "note")
+
+
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """``kind``: one of ``KINDS``. ``where``: ``link``, ``joint`` or ``robot``, then the name."""
+
+    kind: str
+    where: str
+    name: str
+    text: str
+
+
+class Notes(list[Note]):
+    """Notes in the order in which they came up."""
+
+    def add(self, kind: str, where: str, name: str, text: str) -> None:
+        note = Note(kind, where, name, text)
+        if note not in self:
+            self.append(note)
+
+    def of(self, where: str, name: str) -> list[str]:
+        return [f"{n.kind}: {n.text}" for n in self if (n.where, n.name) == (where, name)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What an import did; ``report.json`` holds the same.
+
+    Attributes:
+        folder: the model folder.
+        robot: config, as ``robot.yaml`` has it.
+        links: name -> what was read of it, its body in the model and its collision shapes with their coverage.
+        joints: name -> what was read of it and what the model has.
+        mass: of the model [kg]; ``mass_read``: sum over the URDF's links.
+        contacts: most contacts that the robot can make with the table, and with the table and one cube.
+    """
+
+    source: str
+    folder: pathlib.Path
+    robot: RobotCfg
+    links: dict[str, dict[str, Any]]
+    joints: dict[str, dict[str, Any]]
+    mass: float
+    mass_read: float
+    contacts: dict[str, int]
+    notes: Notes
+
+    @property
+    def warnings(self) -> list[str]:
+        """One line each: what could not be used, and what stands in for it."""
+        return [f"{n.where} {n.name}: {n.text}" for n in self.notes if n.kind == "warning"]
+
+    def json(self) -> str:
+        """The content of ``report.json``."""
+        content = {
+            "source": self.source,
+            "robot": self.robot.name,
+            "mass": self.mass,
+            "mass_read": self.mass_read,
+            "contacts": self.contacts,
+            "warnings": self.warnings,
+            "notes": self.notes.of("robot", self.robot.name),
+            "links": {name: {**row, "notes": self.notes.of("link", name)} for name, row in self.links.items()},
+            "joints": {name: {**row, "notes": self.notes.of("joint", name)} for name, row in self.joints.items()},
+        }
+        return json.dumps(content, indent=2) + "\n"
