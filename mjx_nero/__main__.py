@@ -8,8 +8,12 @@ from mjx_nero.types import UserError
 
 # command -> (module, function of the arguments, what it does)
 COMMANDS = {
-    "list-envs": ("mjx_nero.inspection", "list_envs_main", "the environments: task, robot, sizes"),
-    "inspect": ("mjx_nero.inspection", "main", "a robot, a model folder or an environment: joints, gains, contacts, budgets"),
+    "list-envs": ("mjx_nero.inspection.command", "list_envs_main", "the environments: task, robot, sizes"),
+    "inspect": (
+        "mjx_nero.inspection.command",
+        "main",
+        "a robot, a model folder or an environment: joints, gains, contacts",
+    ),
     "import-urdf": ("mjx_nero.urdf.command", "main", "a model folder from a URDF"),
     "tune-gains": ("mjx_nero.tuning", "main", "stiffness and damping from step responses"),
 }

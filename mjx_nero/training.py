@@ -47,14 +47,14 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
         ppo = dataclasses.replace(ppo, num_envs=ppo.num_envs or 4096, num_timesteps=ppo.num_timesteps or 60_000_000)
         return dataclasses.replace(run, ppo=ppo), ""
     short = not ppo.num_timesteps
-    ppo = dataclasses.replace(ppo, num_envs=ppo.num_envs or 256, num_timesteps=ppo.num_timesteps or 2_000_000)
+    ppo = dataclasses.replace(ppo, num_envs=ppo.num_envs or 128, num_timesteps=ppo.num_timesteps or 2_000_000)
     run = dataclasses.replace(run, ppo=ppo, eval_episodes=min(run.eval_episodes, 64))
     if not short:
         return run, ""
     run = dataclasses.replace(run, max_minutes=run.max_minutes or 4.0)
     note = (
-        f"no GPU: {ppo.num_envs} environments for {run.max_minutes:g} minutes, enough for first signs of learning; "
-        "a GPU trains 4,096 environments for 60 M steps, to success, in under two minutes"
+        f"no GPU: {ppo.num_envs} environments for {run.max_minutes:g} minutes, enough to learn to reach, and for first signs of "
+        "lifting; a GPU trains 4,096 environments for 60 M steps, to success, in about two minutes"
     )
     return run, note
 

@@ -13,14 +13,15 @@ import pytest
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
 # ``types``, ``ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them
 # with a batch axis.
-_CHECKED = ("checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robots", "rollout")
-_CHECKED += ("scene", "tasks", "terms", "view", "control.controller", "control.gripper", "control.ik")
+_CHECKED = ("arms", "checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robot_file")
+_CHECKED += ("robots", "rollout", "scene", "tasks", "terms", "urdf", "view")
+_CHECKED += ("control.controller", "control.gripper", "control.ik")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero import benchmark, cli, wrappers  # noqa: E402
+from mjx_nero import __main__, benchmark, cli, wrappers  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
@@ -95,7 +96,7 @@ def load(name: str):
     return module.main
 
 
-MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main}
+MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main, "mjx_nero": __main__.main}
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 
 import mjx_nero
 from mjx_nero import cli, inspection, registry, robot_file
+from mjx_nero.inspection import command
 from mjx_nero.robots import GripperCfg
 from mjx_nero.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
@@ -185,7 +186,7 @@ def call(monkeypatch, capfd, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("COLUMNS", raising=False)
 
-    def run(*argv, main=inspection.main):
+    def run(*argv, main=command.main):
         monkeypatch.setattr(sys, "argv", ["inspect", *argv])
         capfd.readouterr()
         with pytest.raises(SystemExit) as stop:
@@ -230,10 +231,10 @@ def test_program_takes_the_folder_of_an_imported_robot(call, tmp_path):
 
 
 def test_list_envs(call, monkeypatch):
-    code, out, err = call(main=inspection.list_envs_main)
+    code, out, err = call(main=command.list_envs_main)
     assert (code, err) == (0, "") and "state 47, privileged_state 57" in out
     monkeypatch.setenv("COLUMNS", "80")  # names stay whole however narrow the terminal
-    for text in (out, call(main=inspection.list_envs_main)[1]):
+    for text in (out, call(main=command.list_envs_main)[1]):
         assert {row.split()[0] for row in text.splitlines() if row.strip()} >= set(registry.list_envs())
 
 

@@ -1,5 +1,6 @@
 """The notebooks run from top to bottom and show what they say."""
 
+import math
 import os
 import pathlib
 import re
@@ -13,15 +14,17 @@ import mjx_nero
 from mjx_nero import render
 
 ROOT = pathlib.Path(__file__).parents[1]
-NERO_LIFT, COBOTTA_MOTION = (ROOT / "notebooks" / f"{name}.ipynb" for name in ("01_nero_lift", "02_cobotta_motion"))
+NOTEBOOKS = tuple(ROOT / "notebooks" / f"{name}.ipynb" for name in ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm"))
+NERO_LIFT, COBOTTA_MOTION, OWN_ARM = NOTEBOOKS
 STEPS = 12_288  # 8 iterations of PPO with the first notebook's 64 environments
+ARM_STEPS = 245_760  # 80 with the third's 128: most reaches succeed
 
 
-def _run(path: pathlib.Path, folder: pathlib.Path) -> list:
+def _run(path: pathlib.Path, folder: pathlib.Path, steps: int = STEPS) -> list:
     """All outputs of one run, on the CPU, whose kernel shares the tests' compilation cache."""
     notebook = nbformat.read(path, as_version=4)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MJX_NERO_NOTEBOOK_STEPS", str(STEPS))
+        patch.setenv("MJX_NERO_NOTEBOOK_STEPS", str(steps))
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.jax_compilation_cache_dir))
         patch.setenv("JAX_PLATFORMS", "cpu")
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))))
@@ -39,6 +42,11 @@ def outputs(tmp_path_factory) -> list:
 @pytest.fixture(scope="module")
 def motion_outputs(tmp_path_factory) -> list:
     return _run(COBOTTA_MOTION, tmp_path_factory.mktemp("cobotta_motion"))
+
+
+@pytest.fixture(scope="module")
+def arm_outputs(tmp_path_factory) -> list:
+    return _run(OWN_ARM, tmp_path_factory.mktemp("own_arm"), ARM_STEPS)
 
 
 def _text(outputs: list) -> str:
@@ -59,7 +67,7 @@ def _can_draw() -> bool:
         return False
 
 
-@pytest.mark.parametrize("path", [NERO_LIFT, COBOTTA_MOTION], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_ships_without_outputs(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
@@ -132,3 +140,53 @@ def test_notebook_trains_its_budget(outputs):
     text = _text(outputs)
     assert _figure(r"([\d,]+) env-steps/s", text) > 0
     assert _figure(r"([\d,]+) env steps in \d+ s, success", text) == STEPS
+
+
+@pytest.mark.slow
+def test_own_arm_runs_and_shows_every_picture(arm_outputs):
+    _check(arm_outputs, plotted=3, drawn=2)  # step responses, learning curve, distances; home pose, strip
+
+
+@pytest.mark.slow
+def test_import_of_the_notebook_keeps_the_urdf_and_reports_its_flaw(arm_outputs):
+    text = _text(arm_outputs)
+    mass = 1.5 + 0.7 + 0.6 + 0.4 + 0.25 + 0.2 + 0.03 + 0.03  # of the links in the notebook [kg]
+    assert _figure(r"mass: ([\d.]+) kg", text) == pytest.approx(mass, abs=1e-3)
+    assert _figure(r"in the URDF ([\d.]+) kg", text) == pytest.approx(mass, abs=1e-3)
+    assert "arm: waist, lift, elbow, pitch, roll  gripper: left_slide\n" in text
+    assert "left_finger, limits [0.0, 0.035]\n" in text and "right_finger, limits [0.0, 0.035] follows left_slide" in text
+    assert re.findall(r"^(?:repaired|warning): (\S+ \S+):", text, re.MULTILINE) == ["link forearm"]
+    assert "the inertia was zero" in text
+    assert _figure(r"100 poses: at most ([\d.]+) micrometres", text) < 1
+    # The grasp point at home, by hand: pitched by 0.2, 1.7 and 3.1 rad, it hangs from an arm of 0.24, 0.2 and 0.06 + 0.093 m.
+    x = 0.24 * math.sin(0.2) + 0.2 * math.sin(1.7) + 0.153 * math.sin(3.1)
+    z = 0.15 + 0.24 * math.cos(0.2) + 0.2 * math.cos(1.7) + 0.153 * math.cos(3.1)
+    assert _figure(r" ee +([\d.]+) +0\.000", text) == pytest.approx(x, abs=2e-3)
+    assert _figure(r" ee +[\d.]+ +0\.000 +([\d.]+)", text) == pytest.approx(z, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_collision_shapes_of_the_notebook_cover_the_parts(arm_outputs):
+    covered = re.findall(r"covers (\d+)% of the surface", _text(arm_outputs))
+    assert len(covered) >= 7 and min(map(int, covered)) >= 95
+
+
+@pytest.mark.slow
+def test_joints_of_the_notebook_reach_their_limits_and_are_tuned(arm_outputs):
+    text = _text(arm_outputs)
+    assert "movements that arrive: 12 of 12" in text  # both ends of five joints, and the finger
+    before = _figure(r"largest overshoot: ([\d.]+)%", text)
+    assert _figure(r"largest overshoot: .* -> ([\d.]+)%", text) < min(2, before)
+    settled = _figure(r"slowest to settle: ([\d.]+) s", text)
+    assert _figure(r"slowest to settle: .* -> ([\d.]+) s", text) < settled
+    assert "guessed gains left: 0\n" in text
+
+
+@pytest.mark.slow
+def test_arm_of_the_notebook_learns_to_reach(arm_outputs):
+    text = _text(arm_outputs)
+    assert _figure(r"([\d,]+) env steps in \d+ s, success", text) == ARM_STEPS
+    assert _figure(r"no action: success rate ([\d.]+)", text) < 0.05
+    assert _figure(r"the policy: success rate ([\d.]+)", text) > 0.3
+    idle = _figure(r"no action: .* at the end ([\d.]+) cm", text)
+    assert _figure(r"the policy: .* at the end ([\d.]+) cm", text) < idle / 3

@@ -1,5 +1,6 @@
 """AgileX Piper: six joints and the Nero's gripper."""
 
+import dataclasses
 import math
 
 from mjx_nero.env import Envs
@@ -38,9 +39,10 @@ LIFT = lift.Work(  # Nero's regions
     scene=SceneCfg(cube_edge=0.03, cube_mass=0.03),
     cube=((0.3, 0.4), (-0.1, 0.2)),
     goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
-    calm=-0.1,
 )
-# The recipe's box: the gripper level, pointing along +x.
+# The recipe's box, its level gripper, which points along +x, and its home, which does nearly so: from the other one, fingers
+# down, learning ends with the wrist bent the wrong way.
+REACH_PIPER = dataclasses.replace(PIPER, arm=dataclasses.replace(PIPER.arm, home=(0.0,) * 6))
 REACH = reach.Work(
     position=((0.3, 0.4), (0.1, 0.15), (0.3, 0.3)),
     orientation=(reach.STILL, (math.pi / 2, math.pi / 2), reach.STILL),
@@ -50,5 +52,5 @@ REACH = reach.Work(
 
 ENVS: Envs = {
     "piper_lift": (PIPER, lift.presets(LIFT)),
-    "piper_reach": (PIPER, reach.presets(REACH)),
+    "piper_reach": (REACH_PIPER, reach.presets(REACH)),
 }

@@ -21,7 +21,7 @@ LIFT = lift.Work(
     scene=SCENE,
     cube=((0.1, 0.3), (-0.2, 0.2)),
     goal=((0.15, 0.3), (-0.1, 0.1), (0.2, 0.35)),
-    calm=-0.1,
+    grasp_radius=0.02,
 )
 REACH = reach.Work(scene=reach.scene(SCENE))
 

@@ -17,14 +17,13 @@ class Work:
     Attributes:
         cube: ``x`` and ``y`` of the cube at the start of an episode.
         goal: ``x``, ``y`` and ``z`` of the commanded point.
-        calm: weight of the action rate's penalty once grasping is learnt, after 6,000 steps of every environment. Without it a
-            policy may tremble as it likes between two targets that the drives' speed limit makes one. None: as before.
+        grasp_radius: how near to the grasp point the object counts as held [m].
     """
 
     scene: SceneCfg
     cube: tuple[Range, Range]
     goal: tuple[Range, Range, Range]
-    calm: float | None = None
+    grasp_radius: float = 0.04
 
     @property
     def lifted(self) -> dict[str, float]:
@@ -34,7 +33,7 @@ class Work:
     @property
     def held(self) -> dict[str, float]:
         """... and held, if it is this near to the grasp point [m]."""
-        return {**self.lifted, "grasp_radius": 0.04}
+        return {**self.lifted, "grasp_radius": self.grasp_radius}
 
 
 def isaac(robot: RobotCfg, work: Work) -> EnvCfg:
@@ -130,9 +129,7 @@ def default(robot: RobotCfg, work: Work) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={}
-        if work.calm is None
-        else {"action_rate": Term(curriculum.step_weight, params={"to": work.calm, "num_steps": 6_000})},
+        curriculum={},
     )
 
 

@@ -121,7 +121,8 @@ def _print(report: Report) -> None:
             console.print(f"[{style}]{kind}[/{style}] {escape(f'{note.where} {note.name}: {note.text}')}", soft_wrap=True)
         if len(found) > len(shown):
             console.print(f"[{style}]{kind}[/{style}] and {len(found) - len(shown)} more in report.json", soft_wrap=True)
-    folder = escape(str(report.folder))
+    # A bare name might be one of the package's robots.
+    folder = escape(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
     console.print(
         "covers: share of the part's surface inside the shape; filled: volume of the part's convex hull over the shape's",
         style="dim",

@@ -1,0 +1,84 @@
+"""What can touch what, and the contacts and constraint rows that this needs at worst."""
+
+import dataclasses
+import itertools
+
+import mujoco
+import numpy as np
+
+# The most contacts that MuJoCo and MJX-Warp find between two shapes; a pair that is not listed goes by their general convex
+# routine, which gives 4.
+_MOST = {
+    "plane": {"sphere": 1, "ellipsoid": 1, "capsule": 2, "cylinder": 4, "box": 4},
+    "sphere": {"sphere": 1, "capsule": 1, "ellipsoid": 1, "cylinder": 1, "box": 1, "mesh": 1},
+    "capsule": {"capsule": 2, "box": 2},
+    "box": {"box": 8},
+    "hfield": dict.fromkeys(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), 50),
+}
+_CONVEX = 4
+_EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two geoms that can meet: the most contacts that their shapes make, and the constraint rows of all those."""
+
+    first: str
+    second: str
+    shapes: str
+    contacts: int
+    condim: int
+    rows: int
+
+
+def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
+    """The pairs of geoms that MuJoCo lets meet.
+
+    Explicit pairs, and those whose contact bits match: unless of one body, of a body and its parent, or of excluded bodies.
+    """
+    explicit = {(int(a), int(b)): int(d) for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)}
+    excluded = {(int(s) >> 16, int(s) & 0xFFFF) for s in model.exclude_signature}
+    weld, pairs = model.body_weldid, []
+    parents = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    for a, b in itertools.combinations(range(model.ngeom), 2):
+        if (a, b) in explicit or (b, a) in explicit:
+            continue
+        bodies = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+        wa, wb = (int(weld[body]) for body in bodies)
+        related = wa and wb and (weld[model.body_parentid[wa]] == wb or weld[model.body_parentid[wb]] == wa)
+        if wa == wb or (parents and related) or bodies in excluded or bodies[::-1] in excluded:
+            continue
+        if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
+            pairs.append((a, b, _condim(model, a, b)))
+    pairs += [(a, b, dim) for (a, b), dim in explicit.items()]
+    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    return tuple(_pair(model, a, b, dim, elliptic) for a, b, dim in pairs)
+
+
+def constraint_rows(model: mujoco.MjModel) -> dict[str, int]:
+    """Constraint rows at worst, by kind: all contacts made, every joint at a limit."""
+    kinds = [mujoco.mjtEq(kind).name.removeprefix("mjEQ_") for kind in model.eq_type]
+    return {
+        "contacts": sum(pair.rows for pair in contact_pairs(model)),
+        "joint limits": int(np.sum(model.jnt_limited != 0) + np.sum(model.tendon_limited != 0)),
+        "joint friction": int(np.sum(model.dof_frictionloss > 0) + np.sum(model.tendon_frictionloss > 0)),
+        "equalities": sum(_EQUALITY_ROWS.get(kind, 1) for kind in kinds),
+    }
+
+
+def _condim(model: mujoco.MjModel, a: int, b: int) -> int:
+    """The higher priority's, else the larger."""
+    (pa, pb), (da, db) = model.geom_priority[[a, b]], model.geom_condim[[a, b]]
+    return int(max(da, db) if pa == pb else da if pa > pb else db)
+
+
+def _pair(model: mujoco.MjModel, a: int, b: int, condim: int, elliptic: bool) -> Pair:
+    a, b = sorted((a, b), key=lambda g: int(model.geom_type[g]))  # plane, height field, sphere, capsule, ..., as _MOST has them
+    kinds = [mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower() for g in (a, b)]
+    contacts = _MOST.get(kinds[0], {}).get(kinds[1], _CONVEX)
+    each = condim if elliptic else max(1, 2 * (condim - 1))
+    return Pair(_geom(model, a), _geom(model, b), ", ".join(kinds), contacts, condim, contacts * each)
+
+
+def _geom(model: mujoco.MjModel, geom: int) -> str:
+    return model.geom(geom).name or f"{model.body(model.geom_bodyid[geom]).name}'s geom {geom}"
