@@ -10,6 +10,8 @@ import tempfile
 import jaxtyping
 import pytest
 
+pytest.register_assert_rewrite("model_checks")  # a helper's assertions show their values, as a test's do
+
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
 # ``types``, ``ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them
 # with a batch axis.

@@ -1,7 +1,6 @@
 """The Cobotta Pro 900's MJCF with the RG6 gripper: against its published description, its stated masses and its gap formula."""
 
-from itertools import combinations
-
+import model_checks as check
 import mujoco
 import numpy as np
 import pytest
@@ -72,16 +71,6 @@ SOLIDS = {
 # conaffinity of every geom that collides; contype is 0 throughout.
 COLLIDERS = {"left_pad": 2, "right_pad": 2, "left_tip": 1, "right_tip": 1, "palm": 3, "forearm": 1, "wrist": 1}
 
-# Most contacts that one pair of shapes can make.
-PLANE, SPHERE, CAPSULE, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{k}")) for k in ("PLANE", "SPHERE", "CAPSULE", "BOX"))
-CONTACTS = {
-    frozenset((PLANE, BOX)): 4,
-    frozenset((PLANE, SPHERE)): 1,
-    frozenset((PLANE, CAPSULE)): 2,
-    frozenset((CAPSULE, BOX)): 2,
-    frozenset((BOX,)): 8,
-}
-
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
@@ -147,14 +136,10 @@ def test_sites(model):
 
 
 def test_joints(model):
-    assert [model.joint(i).name for i in range(model.njnt)] == JOINTS
-    assert (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).all() and model.jnt_limited.all()
+    check.joints_are(model, {name: (-URDF[name][5], URDF[name][5]) for name in JOINTS})
+    assert (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).all()
     for name in JOINTS:
-        assert tuple(model.joint(name).range) == (-URDF[name][5], URDF[name][5])
         assert tuple(model.joint(name).axis) == URDF[name][4]
-    assert (model.dof_armature > 0).all()
-    assert not model.dof_damping.any() and not model.dof_frictionloss.any()
-    assert model.nu == 0 and model.nkey == 0 and model.nlight == 0 and model.ncam == 0
 
 
 def test_mimic_relations(model):
@@ -177,7 +162,6 @@ def test_masses(model):
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_inertia_is_the_stated_solids(model, name):
-    body = model.body(name)
     mass, *shape = SOLIDS[name]
     if isinstance(shape[0], str):
         axis, radius, length = shape
@@ -186,25 +170,15 @@ def test_inertia_is_the_stated_solids(model, name):
     else:
         squares = np.square(shape)
         expected = mass * (squares.sum() - squares) / 12
-    assert body.mass[0] == mass
+    assert model.body(name).mass[0] == mass
     # Along the axes of the link: MuJoCo sorts the principal ones and turns the frame.
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, body.iquat)
-    tensor = turn.reshape(3, 3) @ np.diag(body.inertia) @ turn.reshape(3, 3).T
+    tensor = check.inertia_in_link_frame(model, name)
     np.testing.assert_allclose(tensor, np.diag(expected), rtol=1e-3, atol=1e-3 * expected.min())
-    small, middle, large = np.sort(body.inertia)
-    assert small > 0 and small + middle >= large
+    check.obeys_triangle_inequality(model, name)
 
 
 def test_geoms(model):
-    assert model.nmesh == 0
-    for i in range(model.ngeom):
-        geom = model.geom(i)
-        assert geom.type[0] not in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
-        assert geom.contype[0] == 0
-        assert geom.conaffinity[0] == COLLIDERS.get(geom.name, 0)
-        assert geom.group[0] == (3 if geom.name in COLLIDERS else 2)
-    assert {model.geom(i).name for i in range(model.ngeom)} >= set(COLLIDERS)
+    check.geoms_are(model, COLLIDERS)
 
 
 def test_contact_budget():
@@ -217,11 +191,7 @@ def test_contact_budget():
     cube.add_geom(name="cube", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02575] * 3, mass=0.1, contype=2, conaffinity=1)
     model = spec.compile()
     assert {model.geom(i).name for i in range(model.ngeom)} == {"table", "cube", *COLLIDERS}
-    pairs, count = set(), 0
-    for a, b in combinations(range(model.ngeom), 2):
-        if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
-            pairs.add(frozenset((model.geom(a).name, model.geom(b).name)))
-            count += CONTACTS[frozenset(int(t) for t in model.geom_type[[a, b]])]
+    pairs, count = check.contacts(model)
     table = {"cube", "left_tip", "right_tip", "palm", "forearm", "wrist"}
     cube = {"left_pad", "right_pad", "palm"}
     assert pairs == {frozenset(("table", g)) for g in table} | {frozenset(("cube", g)) for g in cube}

@@ -12,6 +12,7 @@ from mjx_nero import benchmark, scene
 from mjx_nero.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.arms.nero import NERO
 from mjx_nero.control import ik
+from mjx_nero.robots import RobotCfg
 
 N = 500  # every test of the batched solver has this batch: it is compiled once a robot
 
@@ -19,7 +20,7 @@ N = 500  # every test of the batched solver has this batch: it is compiled once 
 class Arm:
     """A robot, its solver, compiled, and MuJoCo's kinematics of it."""
 
-    def __init__(self, robot: robots.RobotCfg):
+    def __init__(self, robot: RobotCfg):
         self.robot, self.model = robot, scene.robot_model(robot)
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site(robot.ee_site).id

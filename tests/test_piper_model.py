@@ -1,8 +1,6 @@
 """The Piper's MJCF against its published description, the contacts it is meant to make, and a scripted grasp."""
 
-from itertools import combinations
-from pathlib import Path
-
+import model_checks as check
 import mujoco
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ from scipy.optimize import least_squares
 
 from mjx_nero.arms.piper import PIPER
 from mjx_nero.scene import SceneCfg, SimCfg, build
-
-REFERENCE = Path(__file__).parent / "data" / "piper_fk.npz"
 
 # Joint limits of the URDF: rad for the arm, m for the fingers.
 RANGES = {
@@ -70,16 +66,6 @@ EXTENTS = {
 # conaffinity of every geom that collides; contype is 0 throughout.
 COLLIDERS = {"pad1": 2, "pad2": 2, "tip1": 1, "tip2": 1, "palm": 3, "forearm": 1, "wrist": 1}
 
-# Most contacts that one pair of shapes can make.
-CONTACTS = {
-    ("plane", "box"): 4,
-    ("plane", "sphere"): 1,
-    ("plane", "capsule"): 2,
-    ("sphere", "box"): 1,
-    ("capsule", "box"): 2,
-    ("box", "box"): 8,
-}
-
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
@@ -92,46 +78,12 @@ def scene() -> mujoco.MjModel:
     return build(PIPER, SceneCfg(), SimCfg(), visuals=False)
 
 
-def inertia_in_link_frame(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Inertia tensor about the centre of mass, along the axes of the link."""
-    body = model.body(name)
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, body.iquat)
-    rotation = rotation.reshape(3, 3)
-    return rotation @ np.diag(body.inertia) @ rotation.T
-
-
 def test_poses_agree_with_urdf(model):
-    with np.load(REFERENCE) as file:
-        reference = dict(file)
-    data = mujoco.MjData(model)
-    joints = [model.joint(name).qposadr[0] for name in reference["joints"]]
-    bodies = [model.body(name).id for name in reference["links"]]
-    base = model.body("base_link")
-    assert np.array_equal(base.pos, np.zeros(3)) and np.array_equal(base.quat, [1, 0, 0, 0])
-    assert reference["qpos"].shape == (100, 8) and len(bodies) == model.nbody - 2
-
-    inverse, difference = np.empty(4), np.empty(4)
-    for q, pos, quat in zip(reference["qpos"], reference["pos"], reference["quat"], strict=True):
-        data.qpos[joints] = q
-        mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.xpos[bodies], pos, rtol=0, atol=1e-6)
-        for body, expected in zip(bodies, quat, strict=True):
-            mujoco.mju_negQuat(inverse, expected)
-            mujoco.mju_mulQuat(difference, inverse, data.xquat[body])
-            # The vector part keeps full precision near zero, where the arc cosine of the scalar part would not.
-            angle = 2 * np.arcsin(min(1.0, np.linalg.norm(difference[1:])))
-            assert angle < 1e-6, (model.body(body).name, angle)
+    check.poses_agree(model, "piper", base="base_link")
 
 
 def test_joints(model):
-    assert [model.joint(i).name for i in range(model.njnt)] == list(RANGES)
-    assert model.jnt_limited.all()
-    for name, limits in RANGES.items():
-        assert tuple(model.joint(name).range) == limits
-    assert (model.dof_armature > 0).all()
-    assert not model.dof_damping.any() and not model.dof_frictionloss.any()
-    assert model.nu == 0 and model.nkey == 0 and model.nlight == 0 and model.ncam == 0
+    check.joints_are(model, RANGES)
 
 
 def test_bodies_and_masses(model):
@@ -146,46 +98,23 @@ def test_bodies_and_masses(model):
 def test_inertia_is_the_published_one_moved(model, name):
     """Parallel axes, back from the centre of mass to the link's frame."""
     mass, center = MASSES[name][0], np.array(MASSES[name][1])
-    moved = inertia_in_link_frame(model, name) + mass * (center @ center * np.eye(3) - np.outer(center, center))
+    moved = check.inertia_in_link_frame(model, name) + mass * (center @ center * np.eye(3) - np.outer(center, center))
     xx, yy, zz, xy, xz, yz = TENSORS[name]
     np.testing.assert_allclose(moved, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], rtol=0, atol=1e-4 * max(xx, yy, zz))
 
 
 @pytest.mark.parametrize("name", EXTENTS)
 def test_inertia_is_physical(model, name):
-    """No mass distribution inside the link's extent exceeds the bound on the second moment along each axis."""
-    body = model.body(name)
-    small, middle, large = np.sort(body.inertia)
-    assert small > 0 and small + middle >= large
-    tensor = inertia_in_link_frame(model, name)
-    second_moments = np.trace(tensor) / 2 - np.diag(tensor)
-    lower, upper = np.array(EXTENTS[name])
-    assert (lower <= body.ipos).all() and (body.ipos <= upper).all()
-    assert (second_moments > 0).all()
-    assert (second_moments <= body.mass[0] * (upper - body.ipos) * (body.ipos - lower)).all()
+    check.inertia_is_physical(model, name, *EXTENTS[name])
 
 
 def test_geoms(model):
-    assert model.nmesh == 0
-    for i in range(model.ngeom):
-        geom = model.geom(i)
-        assert geom.type[0] not in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
-        assert geom.contype[0] == 0
-        assert geom.conaffinity[0] == COLLIDERS.get(geom.name, 0)
-        assert geom.group[0] == (3 if geom.name in COLLIDERS else 2)
-    assert {model.geom(i).name for i in range(model.ngeom)} >= set(COLLIDERS)
+    check.geoms_are(model, COLLIDERS)
 
 
 def test_contact_budget(scene):
     assert {scene.geom(i).name for i in range(scene.ngeom)} == {"table", "cube", *COLLIDERS}
-    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in ("plane", "sphere", "capsule", "box")}
-    pairs, count = set(), 0
-    for a, b in combinations(range(scene.ngeom), 2):
-        if not (scene.geom_contype[a] & scene.geom_conaffinity[b] or scene.geom_contype[b] & scene.geom_conaffinity[a]):
-            continue
-        first, second = sorted((a, b), key=lambda g: scene.geom_type[g])
-        pairs.add(frozenset((scene.geom(a).name, scene.geom(b).name)))
-        count += CONTACTS[kinds[int(scene.geom_type[first])], kinds[int(scene.geom_type[second])]]
+    pairs, count = check.contacts(scene)
     table = {"cube", "tip1", "tip2", "palm", "forearm", "wrist"}
     cube = {"pad1", "pad2", "palm"}
     assert pairs == {frozenset(("table", g)) for g in table} | {frozenset(("cube", g)) for g in cube}
@@ -193,22 +122,7 @@ def test_contact_budget(scene):
 
 
 def test_gripper_geometry(model):
-    data = mujoco.MjData(model)
-    base, pads = model.body("gripper_base").id, [model.geom("pad1").id, model.geom("pad2").id]
-    q1, q2 = (model.joint(name).qposadr[0] for name in ("gripper_joint1", "gripper_joint2"))
-    for opening in ((0.0, 0.0), (0.05, -0.05), (0.01, -0.03)):
-        data.qpos[[q1, q2]] = opening
-        mujoco.mj_kinematics(model, data)
-        rotation = data.xmat[base].reshape(3, 3)
-        centres = (data.geom_xpos[pads] - data.xpos[base]) @ rotation
-        thickness, length = model.geom_size[pads[0], 2], model.geom_size[pads[0], 1]
-        faces = centres[:, 1] + np.array([thickness, -thickness])
-        assert faces[1] - faces[0] == pytest.approx(opening[0] - opening[1], abs=1e-7)
-        np.testing.assert_allclose(faces, np.negative(opening), atol=1e-7)  # gripper_link1 is the one at -y
-        np.testing.assert_allclose(centres[:, 2] + length, 0.1358, atol=1e-7)
-
-    np.testing.assert_allclose((data.site("ee").xpos - data.xpos[base]) @ rotation, [0, 0, 0.125], atol=1e-12)
-    assert model.site("ee").bodyid[0] == base
+    check.nero_gripper_opens(model, side=-1)
 
 
 def test_zero_and_home(model):

@@ -1,10 +1,9 @@
 """The SO-ARM100's and SO-ARM101's MJCFs: against their published descriptions, their jaws' formula, and a scripted grasp."""
 
 import dataclasses
-from itertools import combinations
-from pathlib import Path
 
 import jax.numpy as jnp
+import model_checks as check
 import mujoco
 import numpy as np
 import pytest
@@ -15,8 +14,6 @@ from mjx_nero.arms.so_arm100 import SO_ARM100
 from mjx_nero.arms.so_arm101 import SO_ARM101
 from mjx_nero.robots import ASSETS, RobotCfg
 from mjx_nero.scene import SceneCfg, SimCfg
-
-REFERENCE = Path(__file__).parent / "data" / "so_arm_fk.npz"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,16 +102,6 @@ ARMS = {
 # conaffinity of every geom that collides; contype is 0 throughout.
 COLLIDERS = {"fixed_pad": 2, "moving_pad": 2, "fixed_tip": 1, "moving_tip": 1, "palm": 3, "forearm": 1, "wrist": 1}
 
-# Most contacts that one pair of shapes can make.
-PLANE, SPHERE, CAPSULE, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{k}")) for k in ("PLANE", "SPHERE", "CAPSULE", "BOX"))
-CONTACTS = {
-    frozenset((PLANE, BOX)): 4,
-    frozenset((PLANE, SPHERE)): 1,
-    frozenset((PLANE, CAPSULE)): 2,
-    frozenset((CAPSULE, BOX)): 2,
-    frozenset((BOX,)): 8,
-}
-
 
 @pytest.fixture(scope="module", params=ARMS)
 def arm(request) -> Published:
@@ -126,44 +113,14 @@ def model(arm) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(arm.robot.xml))
 
 
-def rotation(quat) -> np.ndarray:
-    out = np.empty(9)
-    mujoco.mju_quat2Mat(out, quat)
-    return out.reshape(3, 3)
-
-
 def test_poses_agree_with_urdf(arm, model):
-    with np.load(REFERENCE) as data:
-        reference = {key: data[f"{arm.robot.name}_{key}"] for key in ("joints", "links", "qpos", "pos", "quat")}
-    data = mujoco.MjData(model)
-    joints = [model.joint(name).qposadr[0] for name in reference["joints"]]
-    base = model.body(arm.robot.base_link)
-    assert np.array_equal(base.pos, np.zeros(3)) and np.array_equal(base.quat, [1, 0, 0, 0])
-    assert reference["qpos"].shape == (50, 6)
-
-    inverse, difference, quat = np.empty(4), np.empty(4), np.empty(4)
-    for q, places, turns in zip(reference["qpos"], reference["pos"], reference["quat"], strict=True):
-        data.qpos[joints] = q
-        mujoco.mj_kinematics(model, data)
-        for name, place, turn in zip(reference["links"], places, turns, strict=True):
-            frame = data.site(name) if name == "gripper_frame_link" else data.body(name)
-            np.testing.assert_allclose(frame.xpos, place, rtol=0, atol=1e-6)
-            mujoco.mju_mat2Quat(quat, frame.xmat)
-            mujoco.mju_negQuat(inverse, turn)
-            mujoco.mju_mulQuat(difference, inverse, quat)
-            # The vector part keeps full precision near zero, where the arc cosine of the scalar part would not.
-            angle = 2 * np.arcsin(min(1.0, np.linalg.norm(difference[1:])))
-            assert angle < 1e-6, (name, angle)
+    check.poses_agree(model, arm.robot.name, arm.robot.base_link, sites=("gripper_frame_link",))
 
 
 def test_joints(arm, model):
-    assert [model.joint(i).name for i in range(model.njnt)] == list(arm.ranges) == list(arm.robot.joints)
-    assert model.jnt_limited.all()
-    for name, limits in arm.ranges.items():
-        assert tuple(model.joint(name).range) == limits
+    check.joints_are(model, arm.ranges)
+    assert list(arm.ranges) == list(arm.robot.joints)
     assert (model.dof_armature == [0.028] * 5 + [0.3]).all()
-    assert not model.dof_damping.any() and not model.dof_frictionloss.any()
-    assert model.nu == 0 and model.nkey == 0 and model.nlight == 0 and model.ncam == 0
     low, high = model.jnt_range.T
     assert (low <= arm.robot.home).all() and (arm.robot.home <= high).all()
 
@@ -177,39 +134,18 @@ def test_bodies_and_masses(arm, model):
 
 
 def test_inertia_is_physical(arm, model):
-    """No mass distribution inside the link's extent exceeds the bound on the second moment along each axis."""
-    for name, (mass, lower, upper) in arm.links.items():
-        body = model.body(name)
-        small, middle, large = np.sort(body.inertia)
-        assert small > 0 and small + middle >= large
-        axes = rotation(body.iquat)
-        tensor = axes @ np.diag(body.inertia) @ axes.T
-        second_moments = np.trace(tensor) / 2 - np.diag(tensor)
-        assert (lower <= body.ipos).all() and (body.ipos <= upper).all(), name
-        assert (second_moments > 0).all()
-        assert (second_moments <= mass * (upper - body.ipos) * (body.ipos - lower)).all(), name
+    for name, (_, lower, upper) in arm.links.items():
+        check.inertia_is_physical(model, name, lower, upper)
 
 
 def test_geoms(model):
-    assert model.nmesh == 0
-    for i in range(model.ngeom):
-        geom = model.geom(i)
-        assert geom.type[0] not in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
-        assert geom.contype[0] == 0
-        assert geom.conaffinity[0] == COLLIDERS.get(geom.name, 0)
-        assert geom.group[0] == (3 if geom.name in COLLIDERS else 2)
-    assert {model.geom(i).name for i in range(model.ngeom)} >= set(COLLIDERS)
+    check.geoms_are(model, COLLIDERS)
 
 
 def test_contact_budget(arm):
     model = scene.build(arm.robot, SceneCfg(), SimCfg(), visuals=False)
-    named = {model.geom(i).name for i in range(model.ngeom)}
-    assert named == {"table", "cube", *COLLIDERS}
-    pairs, count = set(), 0
-    for a, b in combinations(range(model.ngeom), 2):
-        if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
-            pairs.add(frozenset((model.geom(a).name, model.geom(b).name)))
-            count += CONTACTS[frozenset((int(model.geom_type[a]), int(model.geom_type[b])))]
+    assert {model.geom(i).name for i in range(model.ngeom)} == {"table", "cube", *COLLIDERS}
+    pairs, count = check.contacts(model)
     table = {"cube", "fixed_tip", "moving_tip", "palm", "forearm", "wrist"}
     cube = {"fixed_pad", "moving_pad", "palm"}
     assert pairs == {frozenset(("table", g)) for g in table} | {frozenset(("cube", g)) for g in cube}
@@ -321,7 +257,7 @@ def clearance(model, q) -> float:
         geom = data.geom(name)
         size, up = model.geom(name).size, geom.xmat.reshape(3, 3)[2]
         kind = int(model.geom(name).type[0])
-        below = np.abs(up) @ size if kind == BOX else size[0] + (np.abs(up[2]) * size[1] if kind == CAPSULE else 0.0)
+        below = np.abs(up) @ size if kind == check.BOX else size[0] + (np.abs(up[2]) * size[1] if kind == check.CAPSULE else 0.0)
         low.append(geom.xpos[2] - below)
     return min(low)
 

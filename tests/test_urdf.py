@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import model_checks as check
 import mujoco
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import urdf_files as make
 import yourdfpy
 from mujoco import mjx
 from scipy import optimize
-from test_nero_model import CONTACTS, EXTENTS, MASSES
+from test_nero_model import EXTENTS, MASSES
 
 import mjx_nero
 from mjx_nero import robot_file, scene
@@ -129,17 +130,6 @@ def test_nero_pads(nero):
         assert faces[0][0] - faces[1][1] == pytest.approx(opening[0] - opening[1], abs=1e-3)
 
 
-def contacts_with(model: mujoco.MjModel) -> int:
-    """Most contacts of all pairs that may meet."""
-    count = 0
-    for a in range(model.ngeom):
-        for b in range(a):
-            if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
-                pair = sorted((model.geom_type[a], model.geom_type[b]))
-                count += CONTACTS[KINDS[pair[0]], KINDS[pair[1]]]
-    return count
-
-
 @pytest.mark.parametrize("name", ["nero", "piper"])
 def test_geoms(name, request):
     folder, report = request.getfixturevalue(name)
@@ -158,7 +148,7 @@ def test_geoms(name, request):
     assert model.body_mass.sum() == pytest.approx(report.mass)  # no mass from geoms
     fast = scene.build(robot, scene.SceneCfg(), scene.SimCfg(), visuals=False)
     assert fast.nmesh == 0 and fast.body_mass.sum() == pytest.approx(report.mass + 0.03)
-    assert contacts_with(fast) == report.contacts["table_and_cube"] <= 56
+    assert check.contacts(fast)[1] == report.contacts["table_and_cube"] <= 56
     mjx.put_model(fast)
 
 

@@ -3,8 +3,9 @@
 import dataclasses
 import math
 
+from mjx_nero.arms.nero import NERO
 from mjx_nero.env import Envs
-from mjx_nero.robots import DriveCfg, GripperCfg, RobotCfg
+from mjx_nero.robots import DriveCfg, RobotCfg
 from mjx_nero.scene import SceneCfg
 from mjx_nero.tasks import lift, reach
 
@@ -23,16 +24,7 @@ ROBOT = PIPER = RobotCfg(
         speed=(2.0,) * 6,
         home=(0.0, 1.29, -1.161, 0.0, 1.1, 0.0),
     ),
-    gripper=GripperCfg(
-        joints=("gripper_joint1", "gripper_joint2"),
-        stiffness=(800.0, 800.0),
-        damping=(20.0, 20.0),
-        effort=(22.0, 22.0),
-        speed=(1.5, 1.5),
-        home=(0.05, -0.05),
-        open=(0.05, -0.05),
-        close=(0.0, -0.001),
-    ),
+    gripper=NERO.gripper,
 )
 
 LIFT = lift.Work(  # Nero's regions

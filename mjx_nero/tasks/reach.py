@@ -26,7 +26,7 @@ RUNNER = {
 
 def scene(like: SceneCfg) -> SceneCfg:
     """A scene to reach in: without a cube, and with a table that is a picture."""
-    return dataclasses.replace(like, table=False, cube=False, goal="frame")
+    return dataclasses.replace(like, table=False, cube=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ def isaac(robot: RobotCfg, work: Work) -> EnvCfg:
     angles = dict(zip(("roll", "pitch", "yaw"), work.orientation or (STILL,) * 3, strict=True))
     return EnvCfg(
         robot=robot,
-        scene=work.scene,
+        scene=dataclasses.replace(work.scene, goal="frame" if turned else "sphere"),
         # Nothing touches: all that is left to solve are the joints' limits.
         sim=SimCfg(dt=1 / 60, decimation=work.decimation, iterations=3, ls_iterations=6, elliptic=False),
         episode_length_s=work.episode_length_s,
