@@ -1,4 +1,4 @@
-"""``robot.yaml``: the config of an imported robot, beside its ``model.xml``. Written by import-urdf, meant to be edited."""
+"""Files of robots: models, and beside an imported one its config ``robot.yaml``, which import-urdf writes and users edit."""
 
 import dataclasses
 import math
@@ -59,21 +59,25 @@ def read(folder: pathlib.Path) -> RobotCfg:
     if not arm.joints:
         raise UserError(f"{path}: arm names no joint")
     robot = dataclasses.replace(default, **fields, arm=arm, gripper=gripper, folder=str(folder))
-    spec = _model(robot)
+    spec = model(robot)
     if [spec.joint(j).type for j in gripper.joints] != [mujoco.mjtJoint.mjJNT_SLIDE] * 2:
         gripper = dataclasses.replace(gripper, gap=None, positions=None)  # known of two slides alone
     return dataclasses.replace(robot, gripper=gripper)
 
 
-def _model(robot: RobotCfg) -> mujoco.MjSpec:
-    """The model, if it has what the robot names."""
+def model(robot: RobotCfg) -> mujoco.MjSpec:
+    """The robot's model, of the package or imported.
+
+    Raises:
+        UserError: the file is missing or damaged, or lacks what the robot's config names.
+    """
     try:
         spec = mujoco.MjSpec.from_file(str(robot.xml))
     except ValueError as error:
         raise UserError(f"{robot.xml} is no model: {' '.join(str(error).split())}") from None
     for what, wanted, found in (
         ("joint", robot.joints, spec.joints),
-        ("site", [robot.ee_site], spec.sites),
+        ("site or body", [robot.ee_site], [*spec.sites, *spec.bodies[1:]]),
         ("body", [robot.base_link], spec.bodies[1:]),
     ):
         names = [x.name for x in found]

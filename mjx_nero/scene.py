@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from mjx_nero import robot_file
 from mjx_nero.robots import RobotCfg
 
 
@@ -99,7 +100,7 @@ def robot_model(robot: RobotCfg) -> mujoco.MjModel:
 
 
 def _robot_spec(robot: RobotCfg) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec.from_file(str(robot.xml))
+    spec = robot_file.model(robot)
     base = spec.body(robot.base_link)
     base.pos, base.quat = robot.base_pos, robot.base_quat
     if robot.gravity_compensation:

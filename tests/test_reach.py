@@ -124,6 +124,10 @@ def test_an_arm_without_gripper_reaches():
     [
         (lambda: env_cfg("reach"), r"reach is for any robot: pass one \(--robot, a folder that import-urdf made, or cobotta"),
         (lambda: env_cfg("reach", robot="nerro"), r"no robot 'nerro' \(did you mean 'nero'\?\): choose one of"),
+        (
+            lambda: make("cobotta_follow_target", robot="nero", impl="jax"),
+            "nero.xml has no site or body 'flange'",
+        ),
         (lambda: env_cfg("reach", robot=dataclasses.replace(NERO, workspace=None)), "nero has no workspace to command from"),
     ],
 )

@@ -71,7 +71,7 @@ ROW = {"stiffness": 1.0, "damping": 1.0, "effort": 1.0, "speed": 1.0, "home": 0.
         ({"arm": {"joint1": {**ROW, "effort": float("nan")}}}, "joint1.effort takes a value like 0.0, got nan"),
         ({"arm": {"joint1": {**ROW, "stiffness": -1}}}, "joint1.stiffness has to be above 0, got -1"),
         ({"arm": {"joint11": ROW}}, r"model.xml has no joint 'joint11' \(did you mean 'joint1'\?\)"),
-        ({"ee_site": "eee"}, r"has no site 'eee' \(did you mean 'ee'\?\)"),
+        ({"ee_site": "eee"}, r"has no site or body 'eee' \(did you mean 'ee'\?\)"),
         ({"base_link": "bass"}, r"has no body 'bass'"),
         ({"base_pos": [0, 0]}, r"base_pos takes a value like \[0.0, 0.0, 0.0\], got \[0, 0\]"),
         ({"workspace": [0.1, 0.2]}, "workspace takes a value like"),
