@@ -24,7 +24,7 @@ def can_draw():
 
 
 MISTAKES = [
-    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of nero_lift"),
+    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of cobotta_lift"),
     ("train", ["--preset", "isac"], "unknown preset of nero_lift 'isac' (did you mean 'isaac'?): choose one of default, isaac"),
     ("train", ["--env.sim.td", "0.01"], "no field 'sim.td': 'td' is not one of dt, decimation"),
     ("train", ["--env.rewards.reaching_object.params.sdt=1"], "(did you mean 'std'?)"),

@@ -255,8 +255,9 @@ def test_tables_have_a_line_a_joint(tuned):
 
 @pytest.fixture
 def call(monkeypatch, capfd, tmp_path):
-    """``call("--robot", ...) -> (exit status, stdout, stderr)``, in an empty working folder."""
+    """``call("--robot", ...) -> (exit status, stdout, stderr)``, in an empty working folder, not a terminal."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COLUMNS", raising=False)
 
     def run(*argv):
         monkeypatch.setattr(sys, "argv", ["tune-gains", *argv])
