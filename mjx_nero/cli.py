@@ -64,9 +64,9 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     sys.exit(code)
 
 
-def console() -> Console:
+def console(highlight: bool = True) -> Console:
     """For tables: as wide as the terminal, and wide enough for names where there is none."""
-    console = Console()
+    console = Console(highlight=highlight)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 160  # a pipe has no width of its own, and rich would take 80
     return console

@@ -1,7 +1,6 @@
 """The command ``import-urdf``."""
 
 import pathlib
-import sys
 from collections.abc import Mapping, Sequence
 
 from mjx_nero import cli
@@ -81,11 +80,10 @@ def _positions(text: str | None) -> Mapping[str, float]:
 
 
 def _print(report: Report) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console(file=sys.stdout, highlight=False)
+    console = cli.console(highlight=False)
     robot = report.robot
     moving = [row for row in report.joints.values() if not row.get("merged")]
     mimics = sum("mimic" in row for row in moving)
