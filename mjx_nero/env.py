@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mjx_nero import scene, terms
 from mjx_nero.mdp import actions, success
 from mjx_nero.mdp.rewards import held
-from mjx_nero.physics import Physics, resolve_impl
+from mjx_nero.physics import Physics, make_physics, resolve_impl
 from mjx_nero.robots import RobotCfg
 from mjx_nero.scene import SceneCfg, SimCfg
 from mjx_nero.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
@@ -97,8 +97,8 @@ class ManipulationEnv(Env):
 
     Args:
         cfg: the task.
-        impl: ``auto``, ``jax`` or ``warp``.
-        num_envs: how many will be stepped together (Warp sizes its buffers by it; MJX-JAX ignores it).
+        impl: ``auto``, ``warp``, ``jax`` or ``native``.
+        num_envs: how many are meant to be stepped together.
 
     Raises:
         UserError: ``impl`` is unknown or not possible on this machine.
@@ -124,9 +124,9 @@ class ManipulationEnv(Env):
 
     @functools.cached_property
     def physics(self) -> Physics:
-        """The MJX backend; made when first stepped, so that other backends never pay for it."""
+        """The backend; made when first stepped."""
         with jax.ensure_compile_time_eval():  # the first step may well be under a trace
-            return Physics(self.physics_model, self.cfg.sim, self.impl, self.num_envs)
+            return make_physics(self.physics_model, self.cfg.sim, self.impl)
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:

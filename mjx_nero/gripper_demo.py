@@ -19,7 +19,7 @@ from rich.table import Table
 from mjx_nero import cli, kinematics, registry, render, run_folder, scene
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.env import ManipulationEnv
-from mjx_nero.physics import NativePhysics
+from mjx_nero.physics.native import NativePhysics
 from mjx_nero.types import UserError
 
 _SHARE = 0.08  # default step, of a joint's range: 0.1 rad for the RG6, as in Isaac Sim's tutorial

@@ -13,7 +13,7 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.env import ManipulationEnv
-from mjx_nero.physics import NativePhysics
+from mjx_nero.physics.native import NativePhysics
 from mjx_nero.types import Key
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjx_nero.physics import NativePhysics
+from mjx_nero.physics.native import NativePhysics
 
 # Corners, edges and middle of the region where cubes start.
 PLACES = [(0.3, -0.1), (0.3, 0.2), (0.4, -0.1), (0.4, 0.2), (0.35, 0.05), (0.3, 0.05), (0.4, 0.05), (0.35, -0.1)]

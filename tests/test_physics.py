@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.physics import NativePhysics, Physics
+from mjx_nero.physics.mjx_jax import JaxPhysics
+from mjx_nero.physics.native import NativePhysics
 
 CUBE = slice(9, 12)
 
@@ -165,7 +166,7 @@ def test_backend_is_made_when_first_stepped():
     env = make("nero_lift", impl="jax")
     env.reset(jax.random.PRNGKey(0))
     assert "physics" not in vars(env)
-    assert isinstance(env.physics, Physics) and env.physics is env.physics
+    assert isinstance(env.physics, JaxPhysics) and env.physics is env.physics
 
 
 @pytest.mark.gpu
