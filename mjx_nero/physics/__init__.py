@@ -3,7 +3,7 @@
 Each is a module of its own with one class; ``make_physics`` picks. All give the terms the same state, ``types.Sim``.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import mujoco
@@ -15,6 +15,7 @@ from mjx_nero.types import Sim, UserError
 IMPLS = ("auto", "warp", "jax", "native")
 
 
+@runtime_checkable
 class Physics(Protocol):
     """A compiled model, stepped at control rate."""
 
