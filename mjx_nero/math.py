@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def quat_mul(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Hamilton product: the rotation ``b`` first, then ``a``."""
+def quat_mul(a: Float[Array, "4 *many"], b: Float[Array, "4 *many"]) -> Float[Array, "4 *many"]:
+    """Hamilton product: the rotation ``b`` first, then ``a``. One of each, or many with the components in front."""
     # Written out: XLA fuses plain products into one kernel, but not the reductions and slices of dot and cross.
     aw, ax, ay, az = a
     bw, bx, by, bz = b
@@ -19,8 +19,8 @@ def quat_mul(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     )
 
 
-def rotate(quat: Float[Array, "4"], vec: Float[Array, "3"]) -> Float[Array, "3"]:
-    """``vec`` turned by ``quat``."""
+def rotate(quat: Float[Array, "4 *many"], vec: Float[Array, "3 *many"]) -> Float[Array, "3 *many"]:
+    """``vec`` turned by ``quat``. One of each, or many with the components in front."""
     w, x, y, z = quat
     vx, vy, vz = vec
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)

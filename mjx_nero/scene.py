@@ -52,8 +52,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
     """Compiles robot, table, cube (joint ``cube``, if there is one) and goal marker.
 
     Args:
-        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
-            ctrl, less work a step.
+        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras, bodies without joints): same
+            qpos, qvel and ctrl, less work a step.
     """
     spec = _robot_spec(robot)
     spec.modelname = f"{robot.name}_scene"
@@ -91,6 +91,9 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
         _add_visuals(spec, scene, goal)
     else:
         spec.discard_visual()
+        # Links that nothing moves against their parents become part of them: Warp goes through the tree level by level. A body
+        # that serves as the end effector keeps its name.
+        spec.compiler.fusestatic = spec.site(robot.ee_site) is not None
     return spec.compile()
 
 

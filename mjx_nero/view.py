@@ -39,8 +39,7 @@ class Viewer:
 
     def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
         """The view after a step that ``action`` caused; ``carry.action`` is the action before it."""
-        # The barrier keeps XLA from computing the whole chain again for each of the terms that read it.
-        ee_pos, ee_quat = jax.lax.optimization_barrier(self._ee_pose(sim.qpos))
+        ee_pos, ee_quat = self._ee_pose(sim.qpos)
         goal, goal_linvel = self.goal(carry)
         if self.object_qpos is not None and self._object_dof is not None:
             pose, speed = sim.qpos[self.object_qpos :][:7], sim.qvel[self._object_dof :][:6]
