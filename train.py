@@ -18,6 +18,9 @@ def main(argv):
     parser.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
     parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 4096 on a GPU, 128 on a CPU)")
     parser.add_argument(
+        "--num-devices", type=cli.positive, default=1, help="GPUs to spread the environments over (default: %(default)s)"
+    )
+    parser.add_argument(
         "--num-timesteps", type=cli.positive, help="env steps in all (default: 60 M on a GPU, 4 minutes' worth on a CPU)"
     )
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
@@ -54,6 +57,7 @@ def main(argv):
         checkpoint_every=args.checkpoint_every,
         max_minutes=args.max_minutes,
         video=args.video,
+        num_devices=args.num_devices,
     )
     cli.setup_jax()
     summary = training.train(run, command=training.command_line(argv))

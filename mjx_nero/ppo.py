@@ -6,24 +6,33 @@ This loop hands its whole state to the caller and is compiled ahead of time, so 
 
 The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in
 each of its forty minibatches, as their loop over time is slow on a GPU. At the first minibatch both agree (tests/test_ppo.py).
+
+On several devices each has an equal share of the environments, and of every minibatch; everything else is on all of them. Sums
+and means go over all devices, so their number changes only which environments share a minibatch, and the noise of the actions.
 """
 
 import dataclasses
-from typing import Any
+import functools
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, networks, optimizer
 from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from mjx_nero.policy import NetworkCfg, init_params, make_networks
 from mjx_nero.types import Key, UserError
 
 Metrics = dict[str, Float[Array, ""]]
+Tree = TypeVar("Tree")
+
+_AXIS = "devices"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +79,10 @@ class TrainState:
     iteration: Int[Array, ""]
 
 
+_HERE, _SPREAD = PartitionSpec(), PartitionSpec(_AXIS)
+_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE)
+
+
 @struct.dataclass
 class Batch:
     """What an update learns from. Leaves are [time, env, ...], or any part of that."""
@@ -88,18 +101,26 @@ class Learner:
 
     Args:
         env: from ``wrappers.for_training``.
-        cfg: with ``num_envs`` filled in.
+        cfg: with ``num_envs`` filled in, the number on all devices together.
+        num_devices: how many of this machine's devices to spread them over.
 
     Raises:
-        UserError: sizes or options that do not go together.
+        UserError: sizes or options that do not go together, or fewer devices than that.
     """
 
-    def __init__(self, env: Env, cfg: PpoCfg):
-        if not cfg.num_envs or cfg.num_envs % cfg.num_minibatches:
-            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of ppo.num_minibatches ({cfg.num_minibatches})")
+    def __init__(self, env: Env, cfg: PpoCfg, num_devices: int = 1):
+        devices, parts = jax.local_devices(), num_devices * cfg.num_minibatches
+        if num_devices > len(devices):
+            raise UserError(f"num_devices is {num_devices}, but JAX finds {len(devices)} here ({devices[0].platform})")
+        if not cfg.num_envs or cfg.num_envs % parts:
+            factors = f"ppo.num_minibatches ({cfg.num_minibatches})"
+            factors += f" x num_devices ({num_devices}) = {parts}" if num_devices > 1 else ""
+            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of {factors}")
         if cfg.desired_kl and cfg.network.distribution != "normal":
             raise UserError("an adaptive learning rate needs the normal distribution: pass --ppo.desired_kl 0")
-        self.env, self.cfg = env, cfg
+        self.env, self.cfg, self.num_devices = env, cfg, num_devices
+        self._axis = _AXIS if num_devices > 1 else None  # None: a program without any communication
+        self._mesh = Mesh(np.array(devices[:num_devices]), (_AXIS,))
         self.sizes = env.observation_size
         self.networks = make_networks(self.sizes, env.action_size, cfg.network)
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
@@ -118,20 +139,62 @@ class Learner:
         opt_state = self._optimizer.init(params)
         return TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32))
 
+    def place(self, state: TrainState) -> TrainState:
+        """The state, or its shapes, where ``run`` takes it: environments spread over the devices, the rest on each of them."""
+        if not self._axis:
+            return state
+
+        def put(part, spec):
+            sharding = NamedSharding(self._mesh, spec)
+            if isinstance(jax.tree.leaves(part)[0], jax.ShapeDtypeStruct):
+                return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
+            return jax.device_put(part, sharding)
+
+        return TrainState(*(put(getattr(state, f.name), getattr(_SPECS, f.name)) for f in dataclasses.fields(TrainState)))
+
+    def on_one_device(self, state: TrainState) -> TrainState:
+        """The state with the parameters and statistics as the first device has them, for programs that run there alone."""
+        if not self._axis:
+            return state
+        normalizer, params = jax.tree.map(lambda x: x.addressable_data(0), (state.normalizer, state.params))
+        return state.replace(normalizer=normalizer, params=params)
+
+    def load_physics(self, state: TrainState) -> None:
+        """One physics step whose result nobody needs: every device loads what the backend compiles itself (Warp's kernels)."""
+        step = jax.vmap(self.env.unwrapped.physics.step)
+        if self._axis:
+            specs = {"in_specs": (_SPREAD, _SPREAD), "out_specs": (_SPREAD, _SPREAD)}
+            step = jax.shard_map(step, mesh=self._mesh, check_vma=False, **specs)
+        sim = state.env_state.pipeline_state
+        jax.block_until_ready(jax.jit(step)(sim, sim.ctrl))
+
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""
+        run = functools.partial(self._run, iterations=iterations)
+        if self._axis:  # unchecked: no check sees through the calls of physics that is not a JAX program
+            run = jax.shard_map(run, mesh=self._mesh, in_specs=(_SPECS,), out_specs=(_SPECS, _HERE), check_vma=False)
+        return run(state)
+
+    def _run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         with jax.default_matmul_precision(self.cfg.matmul_precision):
             state, metrics = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
         return state, {name: jnp.mean(value) for name, value in metrics.items()}
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, k_roll, k_update = jax.random.split(state.key, 3)
-        env_state, batch, episodes = self.rollout(state, k_roll)
+        if self._axis:
+            k_roll = jax.random.fold_in(k_roll, jax.lax.axis_index(self._axis))
+        env_state, batch, sums = self.rollout(state, k_roll)
         params, opt_state, metrics = self._update(state, batch, k_update)
         # After the update: the loss compares with log-probabilities made under the statistics that acted.
-        normalizer = running_statistics.update(state.normalizer, batch.obs)
+        normalizer = running_statistics.update(state.normalizer, batch.obs, pmap_axis_name=self._axis)
         state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1)
-        return state, {**episodes, **metrics}
+        sums = jax.lax.psum(sums, self._axis) if self._axis else sums
+        return state, {**sums, **metrics}
+
+    def _mean(self, tree: Tree) -> Tree:
+        """The mean over the devices, in ``run``, of what each has for its equal share."""
+        return jax.lax.pmean(tree, self._axis) if self._axis else tree
 
     def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
         """Acts for ``unroll_length`` steps in every environment and computes returns and advantages.
@@ -175,7 +238,8 @@ class Learner:
         logits = nets.policy_network.apply(normalizer, params.policy, batch.obs)
         value = nets.value_network.apply(normalizer, params.value, batch.obs)
 
-        advantages = (batch.advantages - jnp.mean(batch.advantages)) / (jnp.std(batch.advantages) + 1e-8)
+        centred = batch.advantages - self._mean(jnp.mean(batch.advantages))
+        advantages = centred / (jnp.sqrt(self._mean(jnp.mean(jnp.square(centred)))) + 1e-8)
         ratio = jnp.exp(dist.log_prob(logits, batch.raw_action) - batch.log_prob)
         clipped = jnp.clip(ratio, 1 - cfg.clipping, 1 + cfg.clipping)
         policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
@@ -200,7 +264,7 @@ class Learner:
             params, opt_state = carry
             envs, key = envs_and_key
             part = jax.tree.map(lambda x: x[:, envs], batch)
-            grads, metrics = jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key)
+            grads, metrics = self._mean(jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key))
             if cfg.desired_kl:
                 opt_state, _ = optimizer.adaptive_kl_learning_rate(
                     opt_state, metrics["kl"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
@@ -211,7 +275,7 @@ class Learner:
 
         def epoch(carry, key):
             k_order, k_loss = jax.random.split(key)
-            order = jax.random.permutation(k_order, cfg.num_envs).reshape(cfg.num_minibatches, -1)
+            order = jax.random.permutation(k_order, cfg.num_envs // self.num_devices).reshape(cfg.num_minibatches, -1)
             return jax.lax.scan(minibatch, carry, (order, jax.random.split(k_loss, cfg.num_minibatches)))
 
         start = (state.params, state.opt_state)

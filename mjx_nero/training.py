@@ -10,7 +10,6 @@ import time
 from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -38,6 +37,7 @@ class RunCfg:
     eval_episodes: int = 256
     max_minutes: float = 0.0  # of training, compilation apart; 0: no limit
     video: bool = True
+    num_devices: int = 1  # GPUs to spread the environments over
 
 
 def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
@@ -76,7 +76,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     stamp = time.strftime("%Y%m%d_%H%M%S")
     path = run.out or resume_folder or pathlib.Path("runs") / f"{run.env_name}_{stamp}"
     env = ManipulationEnv(run.env, impl=run.impl, num_envs=ppo.num_envs)
-    learner = Learner(wrappers.for_training(env), ppo)
+    learner = Learner(wrappers.for_training(env), ppo, run.num_devices)
     folder = RunFolder(path, resume=resume_folder is not None and path.resolve() == resume_folder.resolve())
     meta = policy.describe(env, run.env_name, run.preset, ppo.network)
 
@@ -92,12 +92,15 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
         advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
         evaluate = _evaluator(run, learner)
-        first = evaluate(state)
-        # Loads what the backend compiles at its first call (Warp's kernels), on a copy.
-        jax.block_until_ready(jax.jit(learner.env.step)(state.env_state, np.zeros((ppo.num_envs, env.action_size), np.float32)))
+        first = evaluate(learner.on_one_device(state))
+        if env.impl == "warp":
+            learner.load_physics(state)
     compile_s = time.perf_counter() - started
+    spread = f" on {run.num_devices} devices" if run.num_devices > 1 else ""
     console.print(
-        f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments", highlight=False, soft_wrap=True
+        f"{path}: compiled in {compile_s:.0f} s; {env.impl}, {ppo.num_envs} environments{spread}",
+        highlight=False,
+        soft_wrap=True,
     )
 
     done = int(state.iteration)
@@ -119,6 +122,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         "seed": run.seed,
         "impl": env.impl,
         "num_envs": ppo.num_envs,
+        "num_devices": run.num_devices,
         "env_steps": steps,
         "compile_s": round(compile_s, 1),
         "train_s": round(loop.wall, 1),
@@ -133,7 +137,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     }
     (path / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     if run.video and stopped != "interrupted":
-        _video(env, run, state, learner, path / "video.mp4", console)
+        _video(env, run, learner.on_one_device(state), learner, path / "video.mp4", console)
     return {**summary, "folder": str(path)}
 
 
@@ -174,7 +178,7 @@ class _Loop:
                 last = steps >= self.iterations * per or out_of_time or interrupted
                 evaluation = {}
                 if steps >= wait["eval"] or last:
-                    self.last_eval = evaluation = self.evaluate(state)
+                    self.last_eval = evaluation = self.evaluate(self.learner.on_one_device(state))
                     wait["eval"] += self.eval_every
                     self.wall = time.perf_counter() - begun
                     if self.seconds_to_95 is None and evaluation["success_rate"] >= 0.95:
@@ -278,12 +282,12 @@ def _initial_state(learner: Learner, seed: int, source: pathlib.Path | None) -> 
     init = jax.jit(learner.init)
     key = jax.random.PRNGKey(seed)
     if source is None:
-        return init(key)
+        return learner.place(init(key))
     if checkpoint.load_meta(source).get("kind") == "checkpoint":
-        return checkpoint.load(source, jax.eval_shape(learner.init, key))
+        return learner.place(checkpoint.load(source, jax.eval_shape(learner.init, key)))
     fresh = init(key)
     normalizer, params = checkpoint.load(source, (fresh.normalizer, fresh.params))
-    return fresh.replace(normalizer=normalizer, params=params)
+    return learner.place(fresh.replace(normalizer=normalizer, params=params))
 
 
 def _checkpoint_path(restore: pathlib.Path) -> pathlib.Path:

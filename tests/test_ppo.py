@@ -1,6 +1,10 @@
 """The training loop: its data, its loss against Brax's, its learning rate, exact resumption, and that it learns."""
 
 import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -240,6 +244,26 @@ def test_learning_rate_keeps_its_bounds(learner, eventful, rolled):
 def test_minibatches_must_divide_the_environments(learner):
     with pytest.raises(UserError, match=r"num_envs \(8\) must be a multiple of ppo.num_minibatches \(3\)"):
         Learner(learner.env, dataclasses.replace(SMALL, num_minibatches=3))
+
+
+def test_devices_must_be_there(learner):
+    count = len(jax.local_devices())
+    with pytest.raises(UserError, match=f"num_devices is {count + 1}, but JAX finds {count} here"):
+        Learner(learner.env, SMALL, count + 1)
+
+
+@pytest.mark.slow
+def test_on_two_devices():
+    """The tests of two_devices.py, in a process that counts this CPU as two devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    tests = pathlib.Path(__file__).with_name("two_devices.py")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tests)],
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_an_adaptive_learning_rate_needs_a_distribution_with_kl(learner):
