@@ -22,10 +22,13 @@ def main(argv):
         "--backend",
         choices=evaluation.BACKENDS,
         default="auto",
-        help="mjx, or mujoco: the C library (default: mjx on a GPU, else mujoco)",
+        help="mjx, or mujoco: the C library (default: what --impl says)",
     )
     parser.add_argument(
-        "--impl", choices=IMPLS, default="auto", help="MJX physics (default: warp where there is a GPU for it, else jax)"
+        "--impl",
+        choices=IMPLS,
+        default="auto",
+        help="physics: warp or jax, which are MJX, or native, MuJoCo's C library (default: warp on a GPU, native without one)",
     )
     parser.add_argument("--video", type=pathlib.Path, help="write an MP4 of up to three of the episodes")
     parser.add_argument("--json", type=pathlib.Path, help="write the result as JSON")

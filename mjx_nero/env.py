@@ -148,7 +148,7 @@ class ManipulationEnv(Env):
     @property
     def backend(self) -> str:
         """Name of the physics backend, as Brax asks for it."""
-        return f"mjx-{self.impl}"
+        return "mujoco" if self.impl == "native" else f"mjx-{self.impl}"
 
     def reset(self, rng: Key) -> State:
         """A fresh episode: joints at home, object and command drawn anew.

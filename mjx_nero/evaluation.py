@@ -14,6 +14,7 @@ from rich.table import Table
 
 from mjx_nero import config, control, policy, registry, render, rollout, run_folder
 from mjx_nero.env import ManipulationEnv
+from mjx_nero.physics import warp_available
 from mjx_nero.types import UserError
 
 AGENTS = ("policy", "zero", "random")
@@ -72,7 +73,8 @@ def evaluate(
     Args:
         robot: another than the environment's own, by name or folder.
         agent_name: one of ``AGENTS``; None: the controller, where one is named or the task has its own and no policy is given.
-        backend: ``mjx``, ``mujoco`` (the C library on the CPU), or ``auto``: mjx on an accelerator, mujoco else.
+        backend: ``mjx``, ``mujoco`` (the C library on the CPU), or ``auto``: what ``impl`` says.
+        impl: one of ``physics.IMPLS``.
         out: JSON file.
         overrides: config fields by dotted name.
         controller_name: one of the task's.
@@ -83,9 +85,7 @@ def evaluate(
     """
     cfg = dataclasses.replace(registry.env_cfg(env_name, preset, robot), corruption=False)
     cfg = config.override(cfg, overrides or {})
-    if backend == "auto":
-        backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
-    env = ManipulationEnv(cfg, impl=impl if backend == "mjx" else "jax", num_envs=episodes)
+    env = ManipulationEnv(cfg, impl=_impl(backend, impl), num_envs=episodes)
     if controller_name and (agent_name or policy_path):
         raise UserError("one can play: give --controller, or --agent or --policy")
     if not (controller_name or agent_name or policy_path):
@@ -101,15 +101,14 @@ def evaluate(
         act, params = agent(agent_name or "policy", env, env_name, policy_path)
     for path in filter(None, (video, out)):
         run_folder.check_writable(path)
-    runner = rollout.mjx_runner if backend == "mjx" else rollout.native_runner
     started = time.perf_counter()
-    played = runner(env, act, episodes, record=min(3, episodes) if video else 0)(params, seed)
+    played = rollout.runner(env, act, episodes, record=min(3, episodes) if video else 0)(params, seed)
     seconds = time.perf_counter() - started
     result = {
         "env": env_name,
         "preset": preset,
         **({"controller": controller_name} if controller_name else {"agent": agent_name or "policy"}),
-        "backend": f"mjx-{env.impl}" if backend == "mjx" else "mujoco",
+        "backend": env.backend,
         "episodes": episodes,
         "seed": seed,
         **played.summary(),
@@ -137,6 +136,16 @@ def evaluate(
         except UserError as error:
             console.print(str(error), highlight=False, soft_wrap=True)
     return result
+
+
+def _impl(backend: str, impl: str) -> str:
+    """The physics that a backend stands for; ``impl`` chooses among MJX's own."""
+    native = backend == "mujoco"
+    if backend != "auto" and impl != "auto" and native != (impl == "native"):
+        raise UserError(f"--backend {backend} cannot play with --impl {impl}: give one of them")
+    if impl == "auto" and backend != "auto":
+        return "native" if native else "warp" if warp_available() else "jax"
+    return impl
 
 
 def tracking(played: rollout.Episodes, last: int) -> dict[str, float]:

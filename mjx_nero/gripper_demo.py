@@ -62,20 +62,20 @@ def demo(env: ManipulationEnv, cycles: int = 2, delta: float | None = None, seco
         if value is not None and not 0 < value < math.inf:
             raise UserError(f"{name} takes a number above 0, got {value:g}")
     robot, model = env.cfg.robot, env.physics_model
-    gripper, native = ParallelGripper(robot), NativePhysics(model, env.cfg.sim)
-    at = [int(model.joint(j).qposadr[0]) for j in gripper.joints]
+    gripper, physics = ParallelGripper(robot), jax.jit(NativePhysics(model, env.cfg.sim).step)
+    at = np.array([model.joint(j).qposadr[0] for j in gripper.joints])
     width = np.array([np.ptp(model.joint(j).range) for j in gripper.joints])
     closes = np.sign(gripper.closed - gripper.opened) * (_SHARE * width if delta is None else delta)
     step, gap = jax.jit(gripper.step), jax.jit(jax.vmap(gripper.gap))
 
-    sim = jax.tree.map(lambda x: x[None], jax.jit(env.draw)(jax.random.PRNGKey(0))[0])
-    start = float(gap(sim.qpos[:, at])[0])
+    sim, _ = jax.jit(env.draw)(jax.random.PRNGKey(0))
+    start = float(gap(sim.qpos[None, at])[0])
     movement = np.repeat(np.arange(2 * cycles), max(1, round(seconds / env.dt)))
     targets, qpos = [], []
     for m in movement:
-        targets.append(step(sim.qpos[0, at], closes if m % 2 == 0 else -closes))
-        sim = native.step(sim, jnp.concatenate([jnp.array(robot.arm.home), targets[-1]])[None])
-        qpos.append(np.asarray(sim.qpos[0]))
+        targets.append(step(sim.qpos[at], closes if m % 2 == 0 else -closes))
+        sim, _ = physics(sim, jnp.concatenate([jnp.array(robot.arm.home), targets[-1]]))
+        qpos.append(np.asarray(sim.qpos))
     commanded, measured = (np.asarray(gap(jnp.stack(list(q)))) for q in (targets, [q[at] for q in qpos]))
     return Motion(env.dt * np.arange(1, len(movement) + 1), movement, commanded, measured, np.stack(qpos), start)
 
@@ -142,7 +142,7 @@ def main(argv: Sequence[str]) -> None:
     for path in filter(None, (args.out, args.video)):
         run_folder.check_writable(path)
     cli.setup_jax()
-    env = registry.make(args.env, impl="jax")
+    env = registry.make(args.env, impl="native")
     motion = demo(env, args.cycles, args.delta, args.seconds)
     console = Console()
     console.print(table(motion))

@@ -1,7 +1,6 @@
-"""Evaluation: whole episodes with a policy or a controller, on MJX or in MuJoCo's C library."""
+"""Evaluation: whole episodes with a policy or a controller."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,6 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.env import ManipulationEnv
-from mjx_nero.physics.native import NativePhysics
 from mjx_nero.types import Key
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]
@@ -126,13 +124,12 @@ def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array,
     return first.pipeline_state.qpos, jax.vmap(env.goal)(first), state.metrics["distance"]
 
 
-def mjx_runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 0) -> Runner:
-    """Plays ``episodes`` at once on MJX: one compiled program, reused from call to call.
+def runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 0) -> Runner:
+    """Plays ``episodes`` at once, on the environment's physics: one compiled program, reused from call to call.
 
     Args:
         record: how many of the episodes to keep qpos and goals of.
     """
-
     agent = act if isinstance(act, Agent) else policy_agent(act)
 
     @jax.jit
@@ -149,37 +146,6 @@ def mjx_runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: in
         return totals, frames, memory
 
     return lambda params, seed: _collect(*run(params, *_keys(seed, episodes)))
-
-
-def native_runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 0) -> Runner:
-    """Plays the same episodes with MuJoCo's C library; only the MDP's terms are compiled, which takes seconds."""
-    physics = NativePhysics(env.physics_model, env.cfg.sim)
-    agent = act if isinstance(act, Agent) else policy_agent(act)
-    start, init = jax.jit(functools.partial(_start, env)), jax.jit(agent.init)
-
-    @jax.jit
-    def decide(params, memory, state, key):
-        action, memory = agent.act(params, memory, state, key)
-        return action, jax.vmap(env.targets)(state, action), memory
-
-    @jax.jit
-    def finish(state, action, sim, totals, active):
-        after = jax.vmap(functools.partial(env.finish, overflow=jnp.zeros(())))(state, action, sim)
-        return _accumulate(state, after, totals, active)
-
-    def run(params, seed: int) -> Episodes:
-        keys, key = _keys(seed, episodes)
-        state, totals, active = start(keys)
-        memory = init(state)
-        frames = []
-        for k in jax.random.split(key, env.episode_length):
-            action, ctrl, memory = decide(params, memory, state, k)
-            sim = physics.step(state.pipeline_state, ctrl)
-            state, totals, active = finish(state, action, sim, totals, active)
-            frames.append(jax.tree.map(np.asarray, _frames(env, state, record)))
-        return _collect(totals, tuple(np.stack(x) for x in zip(*frames, strict=True)), memory)
-
-    return run
 
 
 def _keys(seed: int, episodes: int) -> tuple[Key, Key]:

@@ -271,9 +271,9 @@ def _act(learner: Learner) -> rollout.Act:
 
 def _evaluator(run: RunCfg, learner: Learner):
     """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo C where there is no accelerator."""
-    env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=run.impl, num_envs=run.eval_episodes)
-    make = rollout.native_runner if jax.default_backend() == "cpu" else rollout.mjx_runner
-    play = make(env, _act(learner), run.eval_episodes)
+    impl = "native" if jax.default_backend() == "cpu" else run.impl
+    env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
+    play = rollout.runner(env, _act(learner), run.eval_episodes)
     return lambda state: play((state.normalizer, state.params), run.seed).summary()
 
 
@@ -303,8 +303,8 @@ def _checkpoint_path(restore: pathlib.Path) -> pathlib.Path:
 
 def _video(env: ManipulationEnv, run: RunCfg, state: TrainState, learner: Learner, path: pathlib.Path, console: Console) -> None:
     """Three episodes of the trained policy, played in MuJoCo C."""
-    play_env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=env.impl)
-    played = rollout.native_runner(play_env, _act(learner), 3, record=3)((state.normalizer, state.params), run.seed)
+    play_env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl="native")
+    played = rollout.runner(play_env, _act(learner), 3, record=3)((state.normalizer, state.params), run.seed)
     try:
         render.write_episodes(path, env.mj_model, played.qpos, played.goals, env.dt)
     except UserError as error:

@@ -168,7 +168,7 @@ def test_task_overrides_by_dotted_name():
         (lambda: env_cfg("nero_lif"), r"unknown env 'nero_lif' \(did you mean 'nero_lift'\?\): choose one of cobotta_lift"),
         (lambda: env_cfg("nero_lift", "isac"), r"unknown preset of nero_lift 'isac' \(did you mean 'isaac'\?\): choose one of"),
         (lambda: list_presets("x"), r"unknown env 'x': choose one of cobotta_lift"),
-        (lambda: make("nero_lift", impl="cuda"), r"unknown impl 'cuda': choose one of auto, jax, warp"),
+        (lambda: make("nero_lift", impl="cuda"), r"unknown impl 'cuda': choose one of auto, warp, jax, native"),
     ],
 )
 def test_unknown_names(call, message):

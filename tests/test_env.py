@@ -63,7 +63,7 @@ def test_joint_reset_events_keep_the_joint_ranges(env):
     from mjx_nero.terms import Term
 
     joints = Term(events.joints_offset_uniform, params={"offset": 0.3})
-    noisy = make("nero_lift", impl="jax", events={**env.cfg.events, "joints": joints})
+    noisy = make("nero_lift", impl="native", events={**env.cfg.events, "joints": joints})
     qpos = jax.jit(jax.vmap(noisy.reset))(jax.random.split(jax.random.PRNGKey(0), 64)).pipeline_state.qpos[:, :9]
     low, high = np.array([env.physics_model.joint(j).range for j in env.cfg.robot.joints], np.float32).T
     assert (qpos >= low).all() and (qpos <= high).all()
@@ -86,7 +86,7 @@ def test_same_seed_same_episode(batch):
 
 def test_brax_env(env, batch):
     assert isinstance(env, Env) and isinstance(batch.train_env, Env) and batch.train_env.unwrapped is env
-    assert env.action_size == 8 and env.backend == "mjx-jax"
+    assert env.action_size == 8 and env.backend == "mujoco"
     # joint positions, velocities, target errors; three vectors; goal; action. Then velocity and orientation of the object.
     assert env.observation_size == {"state": (9 * 3 + 3 * 3 + 3 + 8,), "privileged_state": (47 + 6 + 4,)}
     state = batch.reset(0)
@@ -148,7 +148,7 @@ def test_gripper_closes_for_negative_actions(env, start, action, fingers):
 
 
 def test_clip_bounds_actions_before_use(start):
-    clipped = make("nero_lift", impl="jax", **{"action.clip": 0.04})
+    clipped = make("nero_lift", impl="native", **{"action.clip": 0.04})
     ctrl = clipped.targets(start, jnp.array([5.0, -5.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(ctrl[:3], [0.02, -0.02, 0.01], atol=1e-7)
     after = clipped.finish(start, jnp.full(8, 5.0), start.pipeline_state, jnp.zeros(()))
@@ -193,7 +193,7 @@ def test_only_the_policys_group_is_noisy_and_only_while_corruption_is_on(finish,
     assert (noise[18:30] == 0).all() and (noise[36:] == 0).all()  # target error, grasp point; goal, action
     assert (np.abs(noise[30:36]) <= 0.002 + 1e-6).all() and (noise[30:36] != 0).all()
     assert (finish(after).obs["state"] != after.obs["state"])[:18].all()  # drawn anew at every step
-    play = make("nero_lift", impl="jax", corruption=False)
+    play = make("nero_lift", impl="native", corruption=False)
     for state in (play.reset(jax.random.PRNGKey(0)), play.finish(start, jnp.zeros(8), start.pipeline_state, jnp.zeros(()))):
         np.testing.assert_array_equal(state.obs["state"], state.obs["privileged_state"][:47])
 
@@ -264,7 +264,7 @@ def test_grasp_time_is_the_first(env, finish, start):
 
 
 def test_curriculum_follows_the_count_of_steps():
-    recipe = make("nero_lift", "isaac", impl="jax")
+    recipe = make("nero_lift", "isaac", impl="native")
     state = recipe.reset(jax.random.PRNGKey(0))
     assert float(state.info["count"]) == 0
     for count, weight in [(9_999, -1e-4), (10_000, -1e-1)]:
@@ -275,7 +275,7 @@ def test_curriculum_follows_the_count_of_steps():
 
 
 def test_goal_is_drawn_anew_every_resample_time(finish, start):
-    env = make("nero_lift", impl="jax", **{"command.resample_s": 0.1})
+    env = make("nero_lift", impl="native", **{"command.resample_s": 0.1})
     advance = jax.jit(env.finish)
     state, goals = env.reset(jax.random.PRNGKey(0)), []
     for _ in range(12):
@@ -457,7 +457,7 @@ def test_both_models_have_the_same_state(env):
 @pytest.fixture(scope="module")
 def follow():
     """The Cobotta's moving target; no cube in the scene."""
-    env = make("cobotta_follow_target", impl="jax", corruption=False)
+    env = make("cobotta_follow_target", impl="native", corruption=False)
     return type("Follow", (), {"env": env, "reset": jax.jit(env.reset), "finish": jax.jit(env.finish), "view": jax.jit(env.view)})
 
 
@@ -537,7 +537,7 @@ def test_a_linkage_starts_closed(offset):
     from mjx_nero.terms import Term
 
     joints = {"joints": Term(events.joints_offset_uniform, params={"offset": offset})}
-    env = make("cobotta_follow_target", impl="jax", events=joints)
+    env = make("cobotta_follow_target", impl="native", events=joints)
     qpos = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16)).pipeline_state.qpos
     model = env.physics_model
     assert model.neq == 5
@@ -585,13 +585,13 @@ def test_observations_of_following(follow):
 @pytest.fixture(scope="module")
 def place():
     """The Cobotta's pick-and-place task."""
-    env = make("cobotta_pick_place", impl="jax", corruption=False)
+    env = make("cobotta_pick_place", impl="native", corruption=False)
     finish = jax.jit(env.finish)
     return type("Place", (), {"env": env, "reset": jax.jit(env.reset), "finish": finish, "view": jax.jit(env.view)})
 
 
 def test_the_goal_of_a_long_episode_stays():
-    env = make("cobotta_pick_place", impl="jax", episode_length_s=100.0)
+    env = make("cobotta_pick_place", impl="native", episode_length_s=100.0)
     state = at_step(jax.jit(env.reset)(jax.random.PRNGKey(0)), 999)  # 20 s: a whole episode of the default length
     after = jax.jit(env.finish)(state, state.pipeline_state.ctrl, state.pipeline_state, jnp.zeros(()))
     assert int(after.info["carry"].step) == 1000 and float(after.done) == 0

@@ -17,7 +17,7 @@ STEPS = {"nero": 2 * 0.004, "cobotta": 2 * 0.08 * 0.1}  # most that the gap lead
 
 @pytest.fixture(scope="module", params=["nero", "cobotta"])
 def played(request):
-    env = mjx_nero.make(f"{request.param}_lift", impl="jax")
+    env = mjx_nero.make(f"{request.param}_lift", impl="native")
     return request.param, env, gripper_demo.demo(env, cycles=2, seconds=1.2)
 
 
@@ -46,14 +46,14 @@ def test_measured_follows_commanded(played):
 
 
 def test_the_arm_stays_at_home():
-    env = mjx_nero.make("cobotta_lift", impl="jax")
+    env = mjx_nero.make("cobotta_lift", impl="native")
     motion = gripper_demo.demo(env, cycles=1, seconds=0.5)
     arm = [env.physics_model.joint(j).qposadr[0] for j in env.cfg.robot.arm.joints]
     assert np.abs(motion.qpos[:, arm] - np.array(env.cfg.robot.arm.home)).max() < 0.01
 
 
 def test_a_smaller_step_is_slower():
-    env = mjx_nero.make("cobotta_lift", impl="jax")
+    env = mjx_nero.make("cobotta_lift", impl="native")
     slow, fast = (gripper_demo.demo(env, cycles=1, delta=delta, seconds=0.4).measured[19] for delta in (0.02, 0.1))
     assert 0.0 < slow - fast and fast < 0.01 < 0.07 < slow
 
@@ -62,7 +62,7 @@ def test_a_smaller_step_is_slower():
 def test_steps_and_times_are_above_zero(bad):
     (name, value), *_ = bad.items()
     with pytest.raises(UserError, match=f"{name} takes a number above 0, got {value:g}"):
-        gripper_demo.demo(mjx_nero.make("nero_lift", impl="jax"), **bad)
+        gripper_demo.demo(mjx_nero.make("nero_lift", impl="native"), **bad)
 
 
 def printed(motion):
@@ -79,7 +79,7 @@ def test_table_has_a_line_a_movement(played):
 
 
 def test_table_tells_what_never_arrives():
-    motion = gripper_demo.demo(mjx_nero.make("cobotta_lift", impl="jax"), cycles=1, delta=0.02, seconds=0.2)
+    motion = gripper_demo.demo(mjx_nero.make("cobotta_lift", impl="native"), cycles=1, delta=0.02, seconds=0.2)
     assert printed(motion).count("not there") == 2
 
 

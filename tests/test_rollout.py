@@ -16,13 +16,13 @@ def idle(params, obs, key):
 
 
 @pytest.fixture(scope="module")
-def native(env):
-    return rollout.native_runner(env, idle, N, record=3)
+def play(env):
+    return rollout.runner(env, idle, N, record=3)
 
 
 @pytest.fixture(scope="module")
-def episodes(native):
-    return native(None, 0)
+def episodes(play):
+    return play(None, 0)
 
 
 def test_idle_episodes(env, episodes):
@@ -62,8 +62,8 @@ class Counter:
 
 
 def test_controllers_play_every_environment_of_a_batch_with_a_memory_of_their_own():
-    env = make("cobotta_follow_target", "static", impl="jax", episode_length_s=0.2, corruption=False)
-    episodes = rollout.native_runner(env, rollout.controller_agent(env, Counter()), 3, record=3)(None, 0)
+    env = make("cobotta_follow_target", "static", impl="native", episode_length_s=0.2, corruption=False)
+    episodes = rollout.runner(env, rollout.controller_agent(env, Counter()), 3, record=3)(None, 0)
     np.testing.assert_array_equal(episodes.memory, [10, 10, 10])
     np.testing.assert_array_equal(episodes.lengths, [10, 10, 10])
     np.testing.assert_allclose(episodes.qpos[:, :, :6], np.broadcast_to(env.cfg.robot.arm.home, (10, 3, 6)), atol=1e-4)
@@ -71,8 +71,8 @@ def test_controllers_play_every_environment_of_a_batch_with_a_memory_of_their_ow
     np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.goals[-1, :, :3] - home, axis=1), atol=1e-3)
 
 
-def test_same_seed_same_episodes(native, episodes):
-    again, other = native(None, 0), native(None, 1)
+def test_same_seed_same_episodes(play, episodes):
+    again, other = play(None, 0), play(None, 1)
     np.testing.assert_array_equal(again.qpos, episodes.qpos)
     np.testing.assert_array_equal(again.returns, episodes.returns)
     assert (other.qpos[0, :, 9] != episodes.qpos[0, :, 9]).all()
@@ -143,9 +143,9 @@ def test_wilson(successes, n, interval):
 
 def test_ended_episodes_freeze():
     """Episodes that end early count once; nothing is added after their end, and their picture stands still."""
-    env = make("nero_lift", impl="jax", **{"terminations.object_off_table.params.center": (0.3, -0.55)})
+    env = make("nero_lift", impl="native", **{"terminations.object_off_table.params.center": (0.3, -0.55)})
     # The table now ends at y = 0.05: cubes beyond it are lost in the first step, the others not at all.
-    episodes = rollout.native_runner(env, idle, N, record=N)(None, 0)
+    episodes = rollout.runner(env, idle, N, record=N)(None, 0)
     lost = episodes.qpos[0, :, 10] > 0.05
     assert 0 < lost.sum() < N
     np.testing.assert_array_equal(episodes.lengths, np.where(lost, 1, 250))

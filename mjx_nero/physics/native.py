@@ -1,41 +1,94 @@
-"""MuJoCo's C library on CPU threads."""
+"""MuJoCo's C library on CPU threads: by far the fastest physics without an accelerator, and the sim-to-sim check of a policy.
 
-import functools
+JAX calls it back on the host, once a control step, with all environments of a batch. It computes in double precision.
+"""
+
+import contextlib
 import os
+import threading
+from collections.abc import Iterator
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float, Float32
+from mujoco import rollout
 
 from mjx_nero.scene import SimCfg
 from mjx_nero.types import Sim
 
+# One batch at a time: it has all the cores to itself, and its work arrays.
+_lock = threading.Lock()
+
 
 class NativePhysics:
-    """The same model stepped by MuJoCo's C library on CPU threads; takes and returns batched numpy arrays.
+    """See ``physics.Physics``. Work arrays are made at the first step with a batch size, and kept.
 
-    The sim-to-sim check of a policy, and by far the fastest physics without an accelerator.
+    The C library does not tell the solver's last acceleration, so ``Sim.warmstart`` is the change of velocity over the last
+    physics step instead. It is a guess to start from, and a function of the state as the rest.
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg):
-        from mujoco import rollout
-
         self.model, self.decimation = model, cfg.decimation
+        self._period = cfg.decimation * cfg.dt
+        self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu])
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._data = [mujoco.MjData(model) for _ in range(threads)]
-        self._rollout = functools.partial(rollout.Rollout(nthread=threads).rollout, model, self._data)
+        self._rollout = rollout.Rollout(nthread=threads).rollout
+        self._made: dict[int, tuple[np.ndarray, ...]] = {}  # by number of environments
 
-    def step(self, sim: Sim, ctrl) -> Sim:
-        """One control step of a batch: leaves of ``sim`` are [n, ...], ``ctrl`` is [n, nu]."""
-        qpos, qvel = np.asarray(sim.qpos, np.float64), np.asarray(sim.qvel, np.float64)
-        start = np.concatenate([np.asarray(sim.time, np.float64)[:, None], qpos, qvel], axis=1)
-        controls = np.repeat(np.asarray(ctrl, np.float64)[:, None], self.decimation, axis=1)
-        states, _ = self._rollout(start, controls, initial_warmstart=np.asarray(sim.warmstart, np.float64))
-        last, nq = states[:, -1], self.model.nq
-        return Sim(
-            qpos=jnp.asarray(last[:, 1 : 1 + nq], jnp.float32),
-            qvel=jnp.asarray(last[:, 1 + nq :], jnp.float32),
-            ctrl=jnp.asarray(ctrl),
-            warmstart=sim.warmstart,
-            time=jnp.asarray(last[:, 0], jnp.float32),
-        )
+    def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
+        """One control step; any leading axes are environments. Where MuJoCo gives up, the state is NaN."""
+        packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl], axis=-1)
+        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2]), jnp.float32)
+        after = jax.pure_callback(self._step, shape, packed, vmap_method="broadcast_all")
+        qpos, qvel, warmstart = jnp.split(after, self._sizes[:2], axis=-1)
+        after = Sim(qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=sim.time + self._period)
+        return after, jnp.zeros(packed.shape[:-1])
+
+    def _step(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
+        """(qpos, qvel, warmstart, ctrl) -> the first three after the step; no JAX in here, it would wait for itself."""
+        given = np.asarray(packed).reshape(-1, self._sizes[3])
+        n, (nq, nqv, nqvv, _) = len(given), self._sizes
+        after = np.empty((n, nqvv), np.float32)
+        with _lock, _quiet():
+            if n not in self._made:
+                self._made[n] = self._make(n)
+            models, start, warmstart, ctrl, states, nothing = self._made[n]
+            start[:, 1:], warmstart[:], ctrl[:] = given[:, :nqv], given[:, nqv:nqvv], given[:, None, nqvv:]
+            self._rollout(
+                models,
+                self._data,
+                start,
+                ctrl,
+                nstep=self.decimation,
+                initial_warmstart=warmstart,
+                state=states,
+                sensordata=nothing,
+                skip_checks=True,
+            )
+            last, before = states[:, -1, 1:], states[:, -2, 1:] if self.decimation > 1 else start[:, 1:]
+            after[:, :nqv] = last
+            after[:, nqv:] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
+            # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time tells.
+            after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
+        return after.reshape(*packed.shape[:-1], nqvv)
+
+    def _make(self, n: int) -> tuple:
+        m, steps = self.model, self.decimation
+        state = 1 + m.nq + m.nv
+        start = np.ones((n, state))  # the clock starts at 1, so that one after a reset, from 0, differs
+        sensors = np.empty((n, steps, m.nsensordata))
+        return [m] * n, start, np.empty((n, m.nv)), np.empty((n, steps, m.nu)), np.empty((n, steps, state)), sensors
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps MuJoCo from printing its warnings and writing them to a file; the environments count what came of them."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
