@@ -137,7 +137,9 @@ class Learner:
         phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
         env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
         opt_state = self._optimizer.init(params)
-        return TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32))
+        state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32))
+        # A weakly typed leaf comes back from ``run`` a strong one, and whatever takes the state would be compiled for both.
+        return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
 
     def place(self, state: TrainState) -> TrainState:
         """The state, or its shapes, where ``run`` takes it: environments spread over the devices, the rest on each of them."""

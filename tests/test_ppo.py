@@ -192,6 +192,16 @@ def test_environments_start_spread_over_their_episodes(fresh):
     assert len(set(steps)) >= 7 and steps.min() >= 0 and steps.max() < 250 and steps.std() > 30
 
 
+def test_a_state_keeps_its_types(learner):
+    """So that what takes a state, as the evaluation does, is compiled once a run."""
+    fresh = jax.eval_shape(learner.init, KEY)
+    after, _ = jax.eval_shape(lambda state: learner.run(state, 1), fresh)
+    for x, y in zip(
+        jax.tree.leaves((fresh.normalizer, fresh.params)), jax.tree.leaves((after.normalizer, after.params)), strict=True
+    ):
+        assert (x.shape, x.dtype, x.weak_type) == (y.shape, y.dtype, False)
+
+
 def test_an_iteration(run, fresh):
     state, metrics = run(fresh, 1)
     assert int(state.iteration) == 1

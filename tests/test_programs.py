@@ -1,4 +1,4 @@
-"""train.py, eval.py and the benchmark as a user calls them: results, files, and mistakes that end in one line."""
+"""train.py and eval.py as a user calls them: results, files, and mistakes that end in one line."""
 
 import json
 import os
@@ -36,6 +36,7 @@ MISTAKES = [
     ("train", ["--num-timesteps", "0"], "at least 1, got '0'"),
     ("train", ["--num-envs", "100"], "num_envs (100) must be a multiple of ppo.num_minibatches (8)"),
     ("train", ["--ppo.network.distribution", "tanh_normal"], "pass --ppo.desired_kl 0"),
+    ("train", ["--num-devices", "99"], "num_devices is 99, but JAX finds"),
     ("train", ["--restore", "nowhere"], "no such file: nowhere"),
     ("train", ["--restore", "."], "holds no checkpoint to restore"),
     ("train", ["--out", "/proc/run"], "cannot write to /proc/run"),
@@ -46,9 +47,6 @@ MISTAKES = [
     ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--video", "."], "is a folder: give a file name"),
-    ("benchmark", ["--impl", "cuda"], "unknown impl cuda: choose from auto, jax, warp"),
-    ("benchmark", ["--num-envs", "8,x"], "--num-envs: expected a whole number, got 'x'"),
-    ("benchmark", ["--what", "everything"], "unknown what everything"),
 ]
 
 
@@ -172,15 +170,3 @@ def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
     code, _, err = call("train", "--num-envs", 32, "--restore", "run", "--out", "other")
     assert code == 2 and "does not fit" in err and not (tmp_path / "other").exists()
     shutil.rmtree(run)
-
-
-@pytest.mark.slow
-def test_benchmark(call, tmp_path):
-    code, out, _ = call("benchmark", "--num-envs", 8, "--impl", "jax", "--steps", 4, "--repeats", 2, "--json", "rows.json")
-    (row,) = json.loads((tmp_path / "rows.json").read_text())
-    assert code == 0 and "env_steps_per_s" in out
-    assert (row["env"], row["impl"], row["num_envs"]) == ("nero_lift", "jax", 8)
-    assert row["env_steps_per_s"] > 0 and row["compile_s"] > 0
-    assert abs(row["physics_steps_per_s"] - 2 * row["env_steps_per_s"]) <= 1  # both are rounded
-    assert row["env_steps_per_s_min"] <= row["env_steps_per_s"] <= row["env_steps_per_s_max"]
-    assert row["nan_count"] == row["overflow_count"] == 0
