@@ -28,6 +28,7 @@ MISTAKES = [
     (["--what", "control"], "nero_lift has no controller, only policies"),
     (["--what", "step,ppo", "--num-envs", "8,12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
     (["--what", "learning", "--num-envs", "12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
+    (["--what", "ppo", "--num-envs", "8", "--num-devices", "99"], "num_devices is 99, but JAX finds"),
     (["--json", "nowhere/rows.json"], "cannot write nowhere/rows.json"),
     (["--plot", "nowhere/rows.png"], "cannot write nowhere/rows.png"),
     (["--plot", "rows.jpeg"], "--plot rows.jpeg: give a name that ends in .png"),
@@ -171,6 +172,11 @@ class Runs:
     def run(self, state, iterations):
         nans = jnp.where(state["iteration"] == 0, 0.5, 0.0)  # a mean over the iterations
         return {**state, "iteration": state["iteration"] + iterations}, {"sum/nan": nans, "sum/overflow": jnp.zeros(())}
+
+    def place(self, state):
+        return state
+
+    on_one_device = place
 
     def evaluate(self, state):
         return {"success_rate": self.success[int(state["seed"])][int(state["iteration"]) // 2]}

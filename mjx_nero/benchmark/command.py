@@ -33,6 +33,7 @@ WHATS = {
 }
 _SIZES = "1024,4096,16384"
 _ENDS = ("_min", "_max")
+_ON_DEVICES = ("ppo", "learning")  # what --num-devices spreads
 _COUNTS = ("nan_count", "overflow_count")
 _MEMORY = ("compile_s", "memory_mb", "device_peak_mb", "warp_mb")
 _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the table that shows it
@@ -78,7 +79,8 @@ def main(argv: Sequence[str]) -> None:
     rows: list[Row] = []
     try:
         for row in _measured(jobs):
-            rows.append({**head, **row})
+            spread = {"num_devices": args.num_devices} if row["what"] in _ON_DEVICES else {}
+            rows.append({**head, **row, **spread})
             print(_line(row), file=sys.stderr)
             _save(args.json, {**report, "rows": rows})  # each time: even a killed process leaves what it has measured
         _save(args.json, {**report, "complete": True, "rows": rows})
@@ -109,6 +111,9 @@ def _parser() -> cli.Parser:
     parser.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
     parser.add_argument(
         "--num-envs", type=_sizes, help=f"list (default: {_SIZES}; for learning the one number that train.py takes here)"
+    )
+    parser.add_argument(
+        "--num-devices", type=cli.positive, default=1, help="GPUs for ppo and learning to spread over (default: %(default)s)"
     )
     parser.add_argument("--impl", default="auto", help=f"list of {', '.join(IMPLS)} (default: %(default)s)")
     parser.add_argument("--what", default="step", help="list, see below (default: %(default)s)")
@@ -152,7 +157,7 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _J
     make: Callable[[], throughput.Program]
     if what == "ppo":
         ppo_cfg = dataclasses.replace(training.learner_cfg(env.cfg, args.preset), num_envs=env.num_envs)
-        learner = ppo.Learner(wrappers.for_training(env), ppo_cfg)
+        learner = ppo.Learner(wrappers.for_training(env), ppo_cfg, args.num_devices)
         make = functools.partial(throughput.training, learner, max(1, args.steps // ppo_cfg.unroll_length))
     elif what == "control":
         name = next(iter(env.cfg.controllers), "")
@@ -166,8 +171,8 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _J
 def _run(args: argparse.Namespace, cfg: EnvCfg, impl: str, num_envs: int) -> training.RunCfg:
     sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
     learner = config.override(training.learner_cfg(cfg, args.preset), {name: value for name, value in sizes.items() if value})
-    run = training.RunCfg(args.env, args.preset, cfg, learner, impl=impl, eval_every=args.eval_every)
-    return training.fit_machine(run)[0]
+    how = {"impl": impl, "eval_every": args.eval_every, "num_devices": args.num_devices}
+    return training.fit_machine(training.RunCfg(args.env, args.preset, cfg, learner, **how))[0]
 
 
 def _measured(jobs: Iterable[_Job]) -> Iterator[Row]:

@@ -31,16 +31,16 @@ def measure_learning(run: training.RunCfg, seeds: int, target: float) -> Iterato
 
     begun = time.perf_counter()
     init = jax.jit(learner.init)
-    state = init(jax.random.PRNGKey(0))
+    state = learner.place(init(jax.random.PRNGKey(0)))
     advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
     evaluate = training._evaluator(run, learner)
-    evaluate(state)
-    jax.block_until_ready(advance(state))  # loads what the backend compiles at its first call
+    state, _ = jax.block_until_ready(advance(state))  # loads what the backend compiles at its first call
+    evaluate(learner.on_one_device(state))
     compile_s = time.perf_counter() - begun
 
     rows = []
     for seed in range(seeds):
-        state = jax.block_until_ready(init(jax.random.PRNGKey(seed)))
+        state = jax.block_until_ready(learner.place(init(jax.random.PRNGKey(seed))))
         evaluating, nans, overflows, success, done = 0.0, 0.0, 0.0, 0.0, 0
         begun = time.perf_counter()
         while done < calls and success < target:
@@ -48,7 +48,7 @@ def measure_learning(run: training.RunCfg, seeds: int, target: float) -> Iterato
             done += 1
             nans, overflows = nans + float(metrics["sum/nan"]) * chunk, overflows + float(metrics["sum/overflow"]) * chunk
             evaluated = time.perf_counter()
-            success = evaluate(state)["success_rate"]
+            success = evaluate(learner.on_one_device(state))["success_rate"]
             evaluating += time.perf_counter() - evaluated
         rows.append(
             {
@@ -72,10 +72,10 @@ def make_learner(run: training.RunCfg) -> ppo.Learner:
     """The learner of a run.
 
     Raises:
-        UserError: the number of environments does not suit it.
+        UserError: the number of environments or devices does not suit it.
     """
     env = ManipulationEnv(run.env, impl=run.impl, num_envs=run.ppo.num_envs)
-    return ppo.Learner(wrappers.for_training(env), run.ppo)
+    return ppo.Learner(wrappers.for_training(env), run.ppo, run.num_devices)
 
 
 def summary(rows: list[Row]) -> Row:

@@ -50,7 +50,9 @@ def training(learner: ppo.Learner, iterations: int) -> Program:
         state, metrics = learner.run(state, iterations)
         return state, {name: metrics[f"sum/{name}"] * iterations for name in ("nan", "overflow")}
 
-    start = lambda: jax.jit(learner.init)(jax.random.PRNGKey(0))  # noqa: E731
+    def start():
+        return learner.place(jax.jit(learner.init)(jax.random.PRNGKey(0)))
+
     return Program.compiled(run, start, iterations * learner.steps_per_iteration)
 
 
