@@ -77,9 +77,10 @@ def setup_jax() -> None:
     import jax
 
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 in the physics or the learner costs success
+    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "mjx_nero"
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "mjx_nero" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_compilation_cache_dir", str(cache / "jax"))
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))  # Warp reads it at its first use
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 

@@ -161,14 +161,17 @@ class Learner:
         normalizer, params = jax.tree.map(lambda x: x.addressable_data(0), (state.normalizer, state.params))
         return state.replace(normalizer=normalizer, params=params)
 
-    def load_physics(self, state: TrainState) -> None:
+    def load_physics(self) -> None:
         """One physics step whose result nobody needs: every device loads what the backend compiles itself (Warp's kernels)."""
-        step = jax.vmap(self.env.unwrapped.physics.step)
+        env = self.env.unwrapped
+
+        def step(keys):
+            sim = jax.vmap(lambda key: env.draw(key)[0])(keys)
+            return jax.vmap(env.physics.step)(sim, sim.ctrl)
+
         if self._axis:
-            specs = {"in_specs": (_SPREAD, _SPREAD), "out_specs": (_SPREAD, _SPREAD)}
-            step = jax.shard_map(step, mesh=self._mesh, check_vma=False, **specs)
-        sim = state.env_state.pipeline_state
-        jax.block_until_ready(jax.jit(step)(sim, sim.ctrl))
+            step = jax.shard_map(step, mesh=self._mesh, in_specs=_SPREAD, out_specs=_SPREAD, check_vma=False)
+        jax.block_until_ready(jax.jit(step)(jax.random.split(jax.random.PRNGKey(0), self.cfg.num_envs)))
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""

@@ -1,5 +1,6 @@
 """A training run: machine defaults, the loop with progress and checkpoints, final files."""
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import json
@@ -13,7 +14,7 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mjx_nero import checkpoint, config, policy, registry, render, rollout, wrappers
+from mjx_nero import checkpoint, config, memory, policy, registry, render, rollout, wrappers
 from mjx_nero.env import EnvCfg, ManipulationEnv
 from mjx_nero.ppo import PRESETS, Learner, PpoCfg, TrainState
 from mjx_nero.run_folder import RunFolder
@@ -77,24 +78,33 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     path = run.out or resume_folder or pathlib.Path("runs") / f"{run.env_name}_{stamp}"
     env = ManipulationEnv(run.env, impl=run.impl, num_envs=ppo.num_envs)
     learner = Learner(wrappers.for_training(env), ppo, run.num_devices)
+    memory.check(learner)
     folder = RunFolder(path, resume=resume_folder is not None and path.resolve() == resume_folder.resolve())
     meta = policy.describe(env, run.env_name, run.preset, ppo.network)
 
     if note:
         console.print(note, highlight=False, soft_wrap=True)
     started = time.perf_counter()
-    with console.status("compiling (a minute or two the first time) ..."), folder.unless_failed():
+    iterations = -(-ppo.num_timesteps // learner.steps_per_iteration)
+    chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
+    with (
+        console.status("compiling (a minute or two the first time) ..."),
+        folder.unless_failed(),
+        memory.in_one_line(learner),
+        concurrent.futures.ThreadPoolExecutor() as side_by_side,  # compilers work without Python's lock
+    ):
+        evaluate = _evaluator(run, learner)
+        loading = side_by_side.submit(learner.load_physics) if env.impl == "warp" else None
         state = _initial_state(learner, run.seed, source)
-        iterations = -(-ppo.num_timesteps // learner.steps_per_iteration)
         if state.iteration >= iterations:
             made = int(state.iteration) * learner.steps_per_iteration
             raise UserError(f"{source} has made its {made:,} steps already: pass a larger --num-timesteps")
-        chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
+        playing = side_by_side.submit(evaluate, learner.on_one_device(state))
         advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
-        evaluate = _evaluator(run, learner)
-        first = evaluate(learner.on_one_device(state))
-        if env.impl == "warp":
-            learner.load_physics(state)
+        memory.check_compiled(learner, advance)
+        first = playing.result()
+        if loading:
+            loading.result()
     compile_s = time.perf_counter() - started
     spread = f" on {run.num_devices} devices" if run.num_devices > 1 else ""
     console.print(
@@ -107,7 +117,8 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     folder.begin(config.to_dict(run), done * learner.steps_per_iteration)
     loop = _Loop(run, learner, folder, evaluate, advance, chunk, iterations, meta, console)
     try:
-        state, stopped = loop.run(state, first)
+        with memory.in_one_line(learner):
+            state, stopped = loop.run(state, first)
     finally:
         folder.close()
     steps = int(state.iteration) * learner.steps_per_iteration

@@ -13,7 +13,7 @@ import pytest
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
-from mjx_nero import UserError, checkpoint, make, wrappers
+from mjx_nero import UserError, checkpoint, make, memory, wrappers
 from mjx_nero.policy import NetworkCfg
 from mjx_nero.ppo import Learner, PpoCfg
 
@@ -343,6 +343,14 @@ def reaching():
 def test_a_saved_run_on_mjx_goes_on_bit_for_bit(reaching, tmp_path):
     learner, template, run = reaching
     resumes(run, jax.jit(learner.init)(KEY), template, tmp_path / "state.safetensors")
+
+
+@pytest.mark.slow
+def test_memory_on_mjx_is_estimated(reaching):
+    learner, _, run = reaching
+    fixed, per_env = memory.estimate(learner)
+    used = memory.program_bytes(run)
+    assert used / 1.5 < fixed + per_env * learner.cfg.num_envs < used * 1.5
 
 
 @pytest.mark.slow

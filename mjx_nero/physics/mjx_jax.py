@@ -1,5 +1,6 @@
 """MJX-JAX: the physics as a JAX program, for any accelerator. With ``mjx_warp`` the only caller of MJX."""
 
+import jax
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
@@ -27,6 +28,10 @@ class JaxPhysics:
             data = mjx.step(self._mx if self._touches else self._saturated(data), data)
         after = Sim(qpos=data.qpos, qvel=data.qvel, ctrl=ctrl, warmstart=data.qacc_warmstart, time=data.time)
         return after, jnp.zeros(())
+
+    def bytes_per_env(self) -> int:
+        """Size of MJX's data of one environment."""
+        return sum(x.nbytes for x in jax.tree.leaves(self._template))
 
     def _saturated(self, data):
         """The model with constant forces in place of the drives that are at their limits.

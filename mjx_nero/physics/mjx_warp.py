@@ -5,6 +5,7 @@ Warp made them: in go the few arrays of ``types.Sim``, then one CUDA graph runs 
 come the same few. What else the engine keeps is recomputed from them, so the function is pure.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjx_nero.physics import newton
 from mjx_nero.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -85,6 +87,21 @@ class WarpPhysics:
 
         return batched
 
+    def bytes_per_env(self) -> int:
+        """Size of MuJoCo Warp's data of one environment."""
+        import warp as wp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        def size(value) -> int:
+            if isinstance(value, wp.array):
+                return value.capacity
+            return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
+
+        cfg = self._cfg
+        with wp.ScopedDevice("cpu"):
+            sizes = {"naconmax": cfg.contacts_per_env, "njmax": cfg.constraints_per_env}
+            return size(mujoco_warp.make_data(self.model, 1, **sizes))
+
     def _make(self, n: int) -> tuple[Any, Callable[[], None]]:
         """MuJoCo Warp's data for ``n`` environments on the current device, and what steps them."""
         import warp as wp
@@ -94,11 +111,17 @@ class WarpPhysics:
         model = mujoco_warp.put_model(self.model)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
+        solve = newton.make(model, data)
 
         def run():
             data.overflow.zero_()
             for _ in range(self.decimation):
-                mujoco_warp.step(model, data)
+                mujoco_warp.fwd_position(model, data, factorize=False)
+                mujoco_warp.fwd_velocity(model, data)
+                mujoco_warp.fwd_actuation(model, data)
+                mujoco_warp.fwd_acceleration(model, data, factorize=True)
+                solve()
+                mujoco_warp.implicit(model, data)
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, run
