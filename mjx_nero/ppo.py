@@ -79,7 +79,8 @@ class TrainState:
     iteration: Int[Array, ""]
 
 
-_HERE, _SPREAD = PartitionSpec(), PartitionSpec(_AXIS)
+_HERE: Any = PartitionSpec()
+_SPREAD: Any = PartitionSpec(_AXIS)
 _SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE)
 
 
@@ -159,7 +160,7 @@ class Learner:
         if not self._axis:
             return state
         normalizer, params = jax.tree.map(lambda x: x.addressable_data(0), (state.normalizer, state.params))
-        return state.replace(normalizer=normalizer, params=params)
+        return dataclasses.replace(state, normalizer=normalizer, params=params)
 
     def load_physics(self) -> None:
         """One physics step whose result nobody needs: every device loads what the backend compiles itself (Warp's kernels)."""

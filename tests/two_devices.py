@@ -1,6 +1,7 @@
 """The training loop on two devices against one: run by tests/test_ppo.py in a process whose CPU counts as two devices."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from test_ppo import KEY, SMALL, Kinematic, differ, same
 
-from mjx_nero import UserError, checkpoint, make, wrappers
+from mjx_nero import ManipulationEnv, UserError, checkpoint, make, training, wrappers
 from mjx_nero.ppo import Learner
 
 
@@ -123,6 +124,31 @@ def test_a_checkpoint_goes_on_with_as_many_devices_and_with_others(learners, run
     near(again[0], after[0][0], 1e-3)
     same(again[1], after[1][0])
     assert differ(again[1], half)
+
+
+def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
+    """Its evaluations get the policy on one device, as their program is for one."""
+
+    def evaluate(state):
+        assert all(len(x.devices()) == 1 for x in jax.tree.leaves((state.normalizer, state.params)))
+        return {"success_rate": 0.0, "return_mean": 0.0}
+
+    monkeypatch.setattr(training, "_evaluator", lambda run, learner: evaluate)
+    monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
+    sizes = {"num_envs": 16, "num_minibatches": 2, "unroll_length": 4, "network.actor": (8,), "network.critic": (8,)}
+
+    def train(iterations, **rest):
+        run = training.resolve(
+            "nero_lift", "default", None, {}, {**sizes, "num_timesteps": iterations * 16 * 4}, impl="native", **rest
+        )
+        return training.train(dataclasses.replace(run, out=tmp_path / "run", video=False, eval_episodes=2))
+
+    summary = train(2, num_devices=2)
+    assert (summary["num_devices"], summary["env_steps"], summary["stopped"]) == (2, 128, "finished")
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["num_devices"] == 2
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["num_devices"] == 2
+    summary = train(4, restore=tmp_path / "run")
+    assert (summary["num_devices"], summary["env_steps"]) == (1, 256)
 
 
 def test_sizes_must_fit_the_devices(env):
