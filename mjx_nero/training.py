@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mjx_nero import checkpoint, config, memory, policy, registry, render, rollout, wrappers
 from mjx_nero.env import EnvCfg, ManipulationEnv
+from mjx_nero.physics import compiler_options
 from mjx_nero.ppo import PRESETS, Learner, PpoCfg, TrainState
 from mjx_nero.run_folder import RunFolder
 from mjx_nero.types import UserError
@@ -100,7 +101,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             made = int(state.iteration) * learner.steps_per_iteration
             raise UserError(f"{source} has made its {made:,} steps already: pass a larger --num-timesteps")
         playing = side_by_side.submit(evaluate, learner.on_one_device(state))
-        advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
+        advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile(compiler_options(env.impl))
         memory.check_compiled(learner, advance)
         first = playing.result()
         if loading:

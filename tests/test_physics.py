@@ -279,6 +279,14 @@ def test_fingers_open_and_close_fully(env, native):
         np.testing.assert_allclose(sim.qpos[0, 7:9], fingers, atol=1e-3)
 
 
+def test_only_mjx_jax_does_without_the_fusion(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")  # as the package sets it for an old JAX
+    assert physics.compiler_options("native") == physics.compiler_options("warp") == {"xla_cpu_use_fusion_emitters": True}
+    assert physics.compiler_options("jax") == {}
+    monkeypatch.delenv("XLA_FLAGS")
+    assert physics.compiler_options("native") == {}
+
+
 def test_backend_is_made_when_first_stepped():
     env = make("nero_lift", impl="jax")
     env.reset(jax.random.PRNGKey(0))

@@ -8,6 +8,8 @@ from typing import Any
 
 import jax
 
+from mjx_nero.physics import compiler_options
+
 Row = dict[str, Any]  # one measurement, as JSON has it
 
 
@@ -27,11 +29,11 @@ class Program:
         self.memory_mb: float | None = None
 
     @classmethod
-    def compiled(cls, function: Callable, make_state: Callable[[], Any], work: int) -> "Program":
+    def compiled(cls, function: Callable, make_state: Callable[[], Any], work: int, impl: str = "jax") -> "Program":
         """Compiles ``function`` and calls it once, which also loads what the backend compiles at its first call."""
         begun = time.perf_counter()
         state = make_state()
-        call = jax.jit(function, donate_argnums=0).lower(state, jax.random.PRNGKey(0)).compile()
+        call = jax.jit(function, donate_argnums=0).lower(state, jax.random.PRNGKey(0)).compile(compiler_options(impl))
         program = cls(call, state, work)
         program.warm_up(begun)
         with contextlib.suppress(Exception):  # not every backend tells

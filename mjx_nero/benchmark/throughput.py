@@ -19,7 +19,7 @@ def physics(env: ManipulationEnv, steps: int) -> Program:
         sim, overflow = jax.vmap(env.physics.step)(state.pipeline_state, jax.vmap(env.targets)(state, action))
         return state.replace(pipeline_state=sim), {"overflow": jnp.sum(overflow)}
 
-    return Program.compiled(_repeated(step, steps), _start(env), env.num_envs * steps)
+    return Program.compiled(_repeated(step, steps), _start(env), env.num_envs * steps, env.impl)
 
 
 def step(env: ManipulationEnv, steps: int) -> Program:
@@ -30,7 +30,7 @@ def step(env: ManipulationEnv, steps: int) -> Program:
         state = batch.step(state, jax.random.normal(key, (env.num_envs, env.action_size)))
         return state, {name: jnp.sum(state.metrics[name]) for name in ("nan", "overflow")}
 
-    return Program.compiled(_repeated(step, steps), _start(env), env.num_envs * steps)
+    return Program.compiled(_repeated(step, steps), _start(env), env.num_envs * steps, env.impl)
 
 
 def reset(env: ManipulationEnv, times: int) -> Program:
@@ -40,7 +40,7 @@ def reset(env: ManipulationEnv, times: int) -> Program:
     def again(state, key):
         return batch.reset(jax.random.split(key, env.num_envs)), {}
 
-    return Program.compiled(_repeated(again, times), _start(env), env.num_envs * times)
+    return Program.compiled(_repeated(again, times), _start(env), env.num_envs * times, env.impl)
 
 
 def training(learner: ppo.Learner, iterations: int) -> Program:
@@ -53,7 +53,7 @@ def training(learner: ppo.Learner, iterations: int) -> Program:
     def start():
         return learner.place(jax.jit(learner.init)(jax.random.PRNGKey(0)))
 
-    return Program.compiled(run, start, iterations * learner.steps_per_iteration)
+    return Program.compiled(run, start, iterations * learner.steps_per_iteration, learner.env.unwrapped.impl)
 
 
 def controlled(env: ManipulationEnv, controller: control.Controller) -> Program:

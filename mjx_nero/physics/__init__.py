@@ -3,6 +3,7 @@
 Each is a module of its own with one class; ``make_physics`` picks. All give the terms the same state, ``types.Sim``.
 """
 
+import os
 from typing import Protocol, runtime_checkable
 
 import jax
@@ -48,6 +49,16 @@ def resolve_impl(impl: str) -> str:
     if impl == "warp" and not warp_available():
         raise UserError("impl 'warp' needs an NVIDIA GPU and the cuda extra (pip install -e '.[cuda]'): use --impl auto here")
     return impl
+
+
+def compiler_options(impl: str) -> dict[str, bool]:
+    """Options of ``jax.jit`` for programs with this physics.
+
+    With an old JAX the package switches off a fusion of XLA's that MJX-JAX cannot do with (see ``mjx_nero/__init__.py``).
+    Networks take half as long again without it, so it comes back for the others.
+    """
+    switch = "xla_cpu_use_fusion_emitters"
+    return {switch: True} if impl != "jax" and f"{switch}=false" in os.environ.get("XLA_FLAGS", "") else {}
 
 
 def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str) -> Physics:
