@@ -13,6 +13,7 @@ and means go over all devices, so their number changes only which environments s
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -162,8 +163,12 @@ class Learner:
         normalizer, params = jax.tree.map(lambda x: x.addressable_data(0), (state.normalizer, state.params))
         return dataclasses.replace(state, normalizer=normalizer, params=params)
 
-    def load_physics(self) -> None:
-        """One physics step whose result nobody needs: every device loads what the backend compiles itself (Warp's kernels)."""
+    def physics_loader(self) -> Callable[[], None]:
+        """A call that makes every device load what the backend compiles itself (Warp's kernels), by a step that nobody needs.
+
+        It may run in a thread, but is traced here: Warp numbers its calls as they are traced, and programs whose numbers change
+        from run to run are not found in JAX's cache of compiled ones.
+        """
         env = self.env.unwrapped
 
         def step(keys):
@@ -172,7 +177,11 @@ class Learner:
 
         if self._axis:
             step = jax.shard_map(step, mesh=self._mesh, in_specs=_SPREAD, out_specs=_SPREAD, check_vma=False)
-        jax.block_until_ready(jax.jit(step)(jax.random.split(jax.random.PRNGKey(0), self.cfg.num_envs)))
+        keys = jax.random.split(jax.random.PRNGKey(0), self.cfg.num_envs)
+        if self._axis:
+            keys = jax.device_put(keys, NamedSharding(self._mesh, _SPREAD))
+        lowered = jax.jit(step).lower(keys)
+        return lambda: jax.block_until_ready(lowered.compile()(keys))
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""

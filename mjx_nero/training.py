@@ -95,7 +95,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         concurrent.futures.ThreadPoolExecutor() as side_by_side,  # compilers work without Python's lock
     ):
         evaluate = _evaluator(run, learner)
-        loading = side_by_side.submit(learner.load_physics) if env.impl == "warp" else None
+        loading = side_by_side.submit(learner.physics_loader()) if env.impl == "warp" else None
         state = _initial_state(learner, run.seed, source)
         if state.iteration >= iterations:
             made = int(state.iteration) * learner.steps_per_iteration

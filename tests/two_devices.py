@@ -106,6 +106,23 @@ def test_environments_are_spread_and_the_rest_is_everywhere(learners, after):
     assert all(len(x.devices()) == 1 for x in jax.tree.leaves((local.params, local.normalizer)))
 
 
+def test_every_device_loads_its_physics(env, learners, monkeypatch):
+    """By a step of its own share of the environments: there Warp loads its kernels, before training."""
+    called = []
+
+    class Counting(Kinematic):
+        def step(self, sim, ctrl):
+            jax.debug.callback(lambda index, _: called.append(int(index)), jax.lax.axis_index("devices"), sim.time)
+            return super().step(sim, ctrl)
+
+    monkeypatch.setattr(env.unwrapped, "physics", Counting())
+    load = learners[1].physics_loader()
+    assert called == []
+    load()
+    jax.effects_barrier()
+    assert sorted(called) == [0] * 4 + [1] * 4
+
+
 def test_devices_act_with_noise_of_their_own(env):
     learner = Learner(env, SMALL, 2)
     fresh = jax.jit(learner.init)(KEY)
