@@ -133,7 +133,7 @@ def placer(**changes) -> PickPlace:
 @pytest.fixture(scope="module")
 def cobotta_view() -> View:
     """The Cobotta at home, the cube at ``PICK``, its place at ``PLACE``; the robot stands at the world's origin."""
-    env = make("cobotta_pick_place", impl="jax")
+    env = make("cobotta_pick_place", impl="native")
     view = jax.jit(lambda key: env.view(env.reset(key)))(jax.random.PRNGKey(0))
     place = jnp.asarray(PLACE, jnp.float32)
     return view.replace(object_pos_w=jnp.asarray(PICK, jnp.float32), goal_pos_w=place, command=place)

@@ -150,7 +150,7 @@ def test_a_weak_drive_does_not_get_there():
 
 def test_task_of_an_environment():
     task = inspection.inspect("nero_lift").task
-    env = mjx_nero.make("nero_lift", impl="jax")
+    env = mjx_nero.make("nero_lift", impl="native")
     assert (task.env, task.preset, task.episode_s, task.control_dt) == ("nero_lift", "default", 5.0, pytest.approx(0.02))
     assert task.action_size == 8 and "gripper" in task.action
     assert {group: (sum(terms.values()),) for group, terms in task.observations.items()} == env.observation_size

@@ -61,7 +61,7 @@ def _figure(pattern: str, text: str) -> float:
 
 def _can_draw() -> bool:
     try:
-        with render.Renderer(mjx_nero.make("nero_lift", impl="jax").mj_model):
+        with render.Renderer(mjx_nero.make("nero_lift", impl="native").mj_model):
             return True
     except mjx_nero.UserError:
         return False

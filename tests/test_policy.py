@@ -81,7 +81,7 @@ def test_critic_reads_the_privileged_group_where_there_is_one(env, trained, obs)
     value = nets.value_network.apply(normalizer, params.value, obs)
     other = {**obs, "privileged_state": obs["privileged_state"] + 1}
     assert (nets.value_network.apply(normalizer, params.value, other) != value).all()
-    recipe = make("nero_lift", "isaac", impl="jax")
+    recipe = make("nero_lift", "isaac", impl="native")
     nets = policy.make_networks(recipe.observation_size, recipe.action_size, CFG)
     normalizer, params = policy.init_params(nets, recipe.observation_size, jax.random.PRNGKey(0))
     assert nets.value_network.apply(normalizer, params.value, recipe.reset(jax.random.PRNGKey(0)).obs).shape == ()
@@ -95,7 +95,7 @@ def test_policy_of_another_environment(env, trained, tmp_path):
 
 
 def test_policy_of_another_preset(path):
-    recipe = make("nero_lift", "isaac", impl="jax")
+    recipe = make("nero_lift", "isaac", impl="native")
     with pytest.raises(UserError, match=r"was trained on other observations \(preset default\): pass --preset default$"):
         policy.load_for(recipe, "nero_lift", path)
 

@@ -307,7 +307,7 @@ def test_a_saved_run_goes_on_bit_for_bit(learner, run, fresh, tmp_path):
     resumes(lambda s: run(s, 1), fresh, jax.eval_shape(learner.init, KEY), tmp_path / "state.safetensors")
 
 
-# --- on MJX
+# --- with physics
 
 REACH = {
     "rewards.reaching_object.params.std": 0.4,
@@ -318,10 +318,9 @@ REACH = {
 ROUND = 5  # iterations
 
 
-@pytest.fixture(scope="module")
-def reaching():
+def reaching_with(impl: str):
     """A learner that only has to bring the grasp point to the cube, and its compiled run of ``ROUND`` iterations."""
-    env = make("nero_lift", impl="jax", **REACH)
+    env = make("nero_lift", impl=impl, **REACH)
     cfg = PpoCfg(
         num_envs=64,
         unroll_length=20,
@@ -339,15 +338,25 @@ def reaching():
     return learner, template, jax.jit(learner.run, static_argnums=1).lower(template, ROUND).compile()
 
 
+@pytest.fixture(scope="module")
+def reaching():
+    return reaching_with("native")
+
+
+@pytest.fixture(scope="module")
+def reaching_on_mjx():
+    return reaching_with("jax")
+
+
 @pytest.mark.slow
-def test_a_saved_run_on_mjx_goes_on_bit_for_bit(reaching, tmp_path):
+def test_a_saved_run_with_physics_goes_on_bit_for_bit(reaching, tmp_path):
     learner, template, run = reaching
     resumes(run, jax.jit(learner.init)(KEY), template, tmp_path / "state.safetensors")
 
 
 @pytest.mark.slow
-def test_memory_on_mjx_is_estimated(reaching):
-    learner, _, run = reaching
+def test_memory_on_mjx_is_estimated(reaching_on_mjx):
+    learner, _, run = reaching_on_mjx
     fixed, per_env = memory.estimate(learner)
     used = memory.program_bytes(run)
     assert used / 1.5 < fixed + per_env * learner.cfg.num_envs < used * 1.5

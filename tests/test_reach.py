@@ -20,7 +20,7 @@ LEARNT = [*REACHES, "piper_lift", "so100_lift", "so101_lift"]
 
 @pytest.fixture(scope="module")
 def env():
-    return make("nero_reach", impl="jax", corruption=False)
+    return make("nero_reach", impl="native", corruption=False)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_a_position_alone_leaves_orientation_out():
 
 
 def test_any_robot_reaches():
-    env = make("reach", robot="nero", impl="jax")
+    env = make("reach", robot="nero", impl="native")
     assert env.cfg.robot == NERO and env.cfg.command.params["x"] == (0.3, 0.4)
     moved = dataclasses.replace(NERO, workspace=((0.1, 0.2), (0.0, 0.1), (0.3, 0.3)))
     assert env_cfg("reach", robot=moved).command.params["x"] == (0.1, 0.2)
@@ -113,10 +113,10 @@ def test_any_robot_reaches():
 
 def test_an_arm_without_gripper_reaches():
     arm = dataclasses.replace(NERO, gripper=GripperCfg())
-    env = make("reach", robot=arm, impl="jax")
+    env = make("reach", robot=arm, impl="native")
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     assert env.action_size == 7 and state.pipeline_state.ctrl.shape == (7,)
-    assert make("nero_lift", robot=arm, impl="jax").action_size == 7
+    assert make("nero_lift", robot=arm, impl="native").action_size == 7
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_an_arm_without_gripper_reaches():
         (lambda: env_cfg("reach"), r"reach is for any robot: pass one \(--robot, a folder that import-urdf made, or cobotta"),
         (lambda: env_cfg("reach", robot="nerro"), r"no robot 'nerro' \(did you mean 'nero'\?\): choose one of"),
         (
-            lambda: make("cobotta_follow_target", robot="nero", impl="jax"),
+            lambda: make("cobotta_follow_target", robot="nero", impl="native"),
             "nero.xml has no site or body 'flange'",
         ),
         (lambda: env_cfg("reach", robot=dataclasses.replace(NERO, workspace=None)), "nero has no workspace to command from"),

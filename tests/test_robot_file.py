@@ -52,7 +52,7 @@ def test_edits_count(folder):
     rows = yaml.safe_load((folder / robot_file.NAME).read_text())["arm"]
     rows["joint1"]["stiffness"] = 123
     change(folder, arm=rows, workspace=[[0.2, 0.3], [-0.1, 0.1], [0.2, 0.2]])
-    env = make("reach", robot=str(folder), impl="jax")
+    env = make("reach", robot=str(folder), impl="native")
     assert env.cfg.robot.arm.stiffness[0] == 123.0 and env.cfg.command.params["z"] == (0.2, 0.2)
     assert env.physics_model.actuator("joint1").gainprm[0] == 123.0
 

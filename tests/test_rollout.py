@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero import make, rollout
+from mjx_nero import evaluation, make, physics, rollout
 
 N = 8
 
@@ -35,6 +35,21 @@ def test_idle_episodes(env, episodes):
     terms = sum(v for k, v in episodes.metrics.items() if k.startswith("reward/"))
     np.testing.assert_allclose(episodes.returns, terms, rtol=1e-4)
     assert (episodes.metrics["reward/reaching_object"] > 0).all() and (episodes.metrics["reward/holding_object"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("backend", "impl", "played"),
+    [
+        ("auto", "auto", "auto"),
+        ("auto", "jax", "jax"),
+        ("mujoco", "auto", "native"),
+        ("mujoco", "native", "native"),
+        ("mjx", "jax", "jax"),
+        ("mjx", "auto", "warp" if physics.warp_available() else "jax"),
+    ],
+)
+def test_what_a_backend_of_eval_means(backend, impl, played):
+    assert evaluation._impl(backend, impl) == played
 
 
 def test_records(env, episodes):
