@@ -81,7 +81,7 @@ def setup_jax() -> None:
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         jax.config.update("jax_compilation_cache_dir", str(cache / "jax"))
     os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))  # Warp reads it at its first use
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # a run has dozens of small programs
 
 
 def positive(text: str) -> int:

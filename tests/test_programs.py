@@ -10,7 +10,7 @@ import jax
 import mujoco
 import pytest
 
-from mjx_nero import checkpoint, policy, render, training
+from mjx_nero import checkpoint, cli, policy, render, training
 from mjx_nero.types import UserError
 
 
@@ -47,6 +47,8 @@ MISTAKES = [
     ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--video", "."], "is a folder: give a file name"),
+    ("eval", ["--backend", "mjx", "--impl", "native"], "--backend mjx cannot play with --impl native: give one of them"),
+    ("eval", ["--backend", "mujoco", "--impl", "jax"], "--backend mujoco cannot play with --impl jax: give one of them"),
 ]
 
 
@@ -124,6 +126,34 @@ def test_without_opengl_all_but_the_video(call, tmp_path, monkeypatch):
     )
     assert code == 0 and "install libegl1" in out
     assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
+
+
+def test_compiled_code_is_kept_in_the_users_cache(monkeypatch):
+    names = ("jax_default_matmul_precision", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    monkeypatch.setenv("XDG_CACHE_HOME", "/home/me/kept")
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("WARP_CACHE_PATH", "to be put back")
+    monkeypatch.delenv("WARP_CACHE_PATH")
+    try:
+        cli.setup_jax()
+        assert jax.config.jax_compilation_cache_dir == "/home/me/kept/mjx_nero/jax"
+        assert os.environ["WARP_CACHE_PATH"] == "/home/me/kept/mjx_nero/warp"
+        monkeypatch.setenv("WARP_CACHE_PATH", "/of/the/user")
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/of/the/user")
+        jax.config.update("jax_compilation_cache_dir", "/of/the/user")
+        cli.setup_jax()
+        assert jax.config.jax_compilation_cache_dir == os.environ["WARP_CACHE_PATH"] == "/of/the/user"
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+def test_too_many_environments_leave_nothing_behind(call, tmp_path):
+    code, out, err = call("train", "--num-envs", 8_000_000_000, "--out", "run")
+    assert (code, out, list(tmp_path.iterdir())) == (2, "", [])
+    assert err.startswith("error: 8000000000 environments need about ") and err.count("\n") == 1
+    assert "or fewer" in err
 
 
 @pytest.mark.slow

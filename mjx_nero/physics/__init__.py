@@ -51,7 +51,7 @@ def resolve_impl(impl: str) -> str:
     return impl
 
 
-def compiler_options(impl: str) -> dict[str, bool]:
+def compiler_options(impl: str) -> dict[str, str | bool]:
     """Options of ``jax.jit`` for programs with this physics.
 
     With an old JAX the package switches off a fusion of XLA's that MJX-JAX cannot do with (see ``mjx_nero/__init__.py``).
