@@ -1,7 +1,7 @@
 """MuJoCo's Newton solver for constraint forces, as one GPU kernel.
 
 MuJoCo Warp solves with a dozen kernels an iteration, each for all environments, until the slowest of them has converged: at
-thousands of environments that is most of a step that grasps. Here a warp of 32 threads takes one environment from beginning to
+thousands of environments that is most of a step that grasps. Here a block of 32 threads takes one environment from beginning to
 end, in shared memory. The problem is MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that
 minimise Gauss' cost and the constraints' cost, with elliptic or pyramidal friction cones), so the solution is, too.
 
@@ -15,46 +15,64 @@ import mujoco
 _SHARED_BYTES = 48 * 1024  # of a block, on every GPU that Warp supports
 
 # One environment: a <- argmin  1/2 (a - smooth)' M (a - smooth) + s(J a - aref).
-# Names: NV degrees of freedom, NJ rows at most, r = J a - aref, f = -s'(r), p the search direction, W = s''(r) J.
+# NV degrees of freedom, at most NJ rows, n of them in use; r = J a - aref, f = -s'(r), p the search direction.
+# The rows of a contact with an elliptic cone follow one another; the first, the normal's, stands for all of them.
 _SOLVE = """
+    const auto& in = problem;
 #if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x % 32, lanes = 32;
-    __shared__ float pool[WORLDS * SIZE];
-    float* s = pool + threadIdx.x / 32 * SIZE;
+    constexpr int lanes = 32;
+    const int lane = threadIdx.x % lanes;
+    __shared__ float s[SIZE];
     auto sync = [] { __syncwarp(); };
     auto sum = [](float x) {
         for (int offset = 16; offset; offset >>= 1) x += __shfl_xor_sync(0xffffffff, x, offset);
         return x;
     };
 #else
-    const int lane = 0, lanes = 1;
+    constexpr int lanes = 1;
+    const int lane = 0;
     float s[SIZE];
     auto sync = [] {};
     auto sum = [](float x) { return x; };
 #endif
-    const int world = tid / lanes, n = nefc.data[world] < NJ ? nefc.data[world] : NJ;
-    const int equalities = ne.data[world], bilateral = equalities + nf.data[world];
-    const float* J = efc_J.data + (size_t)world * efc_J.shape[1] * efc_J.shape[2];
-    const int stride = efc_J.shape[2];
-    const float* D = efc_D.data + (size_t)world * efc_D.shape[1];
-    const float* aref = efc_aref.data + (size_t)world * efc_aref.shape[1];
-    const float* loss = efc_frictionloss.data + (size_t)world * efc_frictionloss.shape[1];
-    const int* type = efc_type.data + (size_t)world * efc_type.shape[1];
-    const int* id = efc_id.data + (size_t)world * efc_id.shape[1];
-    const float* packed = M_in.data + (size_t)world * M_in.shape[1];
-    const float* smooth = qfrc_smooth.data + world * NV;
-    const float shrink = impratio_invsqrt.data[world % impratio_invsqrt.shape[0]];
-    const float limit = tolerance.data[world % tolerance.shape[0]], ls_limit = ls_tolerance.data[world % ls_tolerance.shape[0]];
+    const int world = tid / lanes, n = in.nefc.data[world] < NJ ? in.nefc.data[world] : NJ;
+    const int equalities = in.ne.data[world], bilateral = equalities + in.nf.data[world];
+    const float* efc_J_row = in.efc_J.data + (size_t)world * in.efc_J.shape[1] * in.efc_J.shape[2];
+    const float* aref = in.efc_aref.data + (size_t)world * in.efc_aref.shape[1];
+    const float* loss = in.efc_frictionloss.data + (size_t)world * in.efc_frictionloss.shape[1];
+    const float* packed = in.M.data + (size_t)world * in.M.shape[1];
+    const float* smooth = in.qfrc_smooth.data + world * NV;
+    const float shrink = in.impratio_invsqrt.data[world % in.impratio_invsqrt.shape[0]];
+    const float limit = in.tolerance.data[world % in.tolerance.shape[0]];
+    const float ls_limit = in.ls_tolerance.data[world % in.ls_tolerance.shape[0]];
 
-    float *M = s, *H = M + NV * NV, *W = H + NV * NV;
-    float *a = W + NJ * NV, *p = a + NV, *g = p + NV, *Ma = g + NV, *Mp = Ma + NV, *r = Mp + NV, *Jp = r + NJ, *f = Jp + NJ;
+    float *M = s, *H = M + NV * NV, *J = H + NV * NV;
+    float *a = J + NJ * NV, *p = a + NV, *g = p + NV, *Ma = g + NV, *Mp = Ma + NV, *r = Mp + NV, *Jp = r + NJ;
+    float* D = Jp + NJ;        // a row's stiffness ...
+    float* mu = D + NJ;        // ... and friction: of a cone's normal, mu
+    float* f = mu + NJ;
+    float* weight = f + NJ;    // s''(r) of a row by itself; of a sliding contact -Dm, then N mu / T
+    float* along = weight + NJ;  // of a sliding contact: the direction in which it slides, scaled by friction
+    int* cone = (int*)(along + NJ);  // rows of the contact that begins here; 0: a row by itself, -1: goes with one before
 
     for (int i = lane; i < NV * NV; i += lanes) M[i] = 0.0f;
+    for (int e = lane; e < n * NV; e += lanes) J[e] = efc_J_row[e / NV * in.efc_J.shape[2] + e % NV];
+    for (int row = lane; row < n; row += lanes) {
+        D[row] = in.efc_D.data[(size_t)world * in.efc_D.shape[1] + row];
+        cone[row] = 0;
+        if (in.efc_type.data[(size_t)world * in.efc_type.shape[1] + row] != ELLIPTIC) continue;
+        const int contact = in.efc_id.data[(size_t)world * in.efc_id.shape[1] + row];
+        const int first = in.contact_efc_address.data[contact * in.contact_efc_address.shape[1]];
+        const float* friction = (const float*)(in.contact_friction.data + contact);
+        cone[row] = row == first ? in.contact_dim.data[contact] : -1;
+        if (cone[row] > n - row) cone[row] = n - row;  // cut off by the end of the buffer
+        mu[row] = row == first ? friction[0] * shrink : friction[row - first - 1];
+    }
     sync();
     for (int i = lane; i < NV; i += lanes) {
-        a[i] = n ? warmstart.data[world * NV + i] : qacc_smooth.data[world * NV + i];
-        for (int k = M_rowadr.data[i]; k < M_rowadr.data[i] + M_rownnz.data[i]; ++k) {
-            const int j = M_colind.data[k];
+        a[i] = n ? in.qacc_warmstart.data[world * NV + i] : in.qacc_smooth.data[world * NV + i];
+        for (int k = in.M_rowadr.data[i]; k < in.M_rowadr.data[i] + in.M_rownnz.data[i]; ++k) {
+            const int j = in.M_colind.data[k];
             M[i * NV + j] = M[j * NV + i] = packed[k];
         }
     }
@@ -72,19 +90,12 @@ _SOLVE = """
         }
         for (int row = lane; row < n; row += lanes) {
             float total = b ? -b[row] : 0.0f;
-            for (int j = 0; j < NV; ++j) total += J[row * stride + j] * x[j];
+            for (int j = 0; j < NV; ++j) total += J[row * NV + j] * x[j];
             z[row] = total;
         }
         sync();
     };
-    // A contact with an elliptic cone is its first row's: friction of its other rows, their number with the first; else 0.
-    auto cone = [&](int row, const float*& friction) {
-        if (type[row] != ELLIPTIC) return 0;
-        const int contact = id[row];
-        friction = (const float*)(contact_friction.data + contact);
-        return contact_efc_address.data[contact * contact_efc_address.shape[1]] == row ? contact_dim.data[contact] : -1;
-    };
-    // First and second derivative of a row's cost that is not a cone's, by its own residual x.
+    // First and second derivative of the cost of a row by itself at its residual x.
     auto simple = [&](int row, float x, float& first, float& second) {
         first = D[row] * x, second = D[row];
         if (row < equalities) return;
@@ -94,12 +105,11 @@ _SOLVE = """
             first = second = 0.0f;
         }
     };
-    // Derivatives of the whole cost along p at the step t: the sums of what the lanes hold.
+    // Derivatives of all rows' cost along p at the step t.
     auto slope = [&](float t, float& first, float& second) {
         first = second = 0.0f;
         for (int row = lane; row < n; row += lanes) {
-            const float* friction;
-            const int dim = cone(row, friction);
+            const int dim = cone[row];
             if (dim < 0) continue;
             float d1, d2;
             if (dim == 0) {
@@ -107,111 +117,114 @@ _SOLVE = """
                 first += d1 * Jp[row], second += d2 * Jp[row] * Jp[row];
                 continue;
             }
-            const float mu = friction[0] * shrink, N = mu * (r[row] + t * Jp[row]), dN = mu * Jp[row];
+            const float m = mu[row], N = m * (r[row] + t * Jp[row]);
             float TT = 0.0f, UV = 0.0f, VV = 0.0f;
-            for (int j = 1; j < dim; ++j) {
-                const float U = friction[j - 1] * (r[row + j] + t * Jp[row + j]), V = friction[j - 1] * Jp[row + j];
+            for (int k = row + 1; k < row + dim; ++k) {
+                const float U = mu[k] * (r[k] + t * Jp[k]), V = mu[k] * Jp[k];
                 TT += U * U, UV += U * V, VV += V * V;
             }
             const float T = sqrtf(TT);
-            if (N >= mu * T) continue;
-            if (mu * N + T <= 0.0f) {
-                for (int j = 0; j < dim; ++j) {
-                    const float weight = D[row + j] * Jp[row + j];
-                    first += weight * (r[row + j] + t * Jp[row + j]), second += weight * Jp[row + j];
+            if (N >= m * T) continue;
+            if (m * N + T <= 0.0f) {
+                for (int k = row; k < row + dim; ++k) {
+                    first += D[k] * Jp[k] * (r[k] + t * Jp[k]), second += D[k] * Jp[k] * Jp[k];
                 }
                 continue;
             }
-            const float Dm = D[row] / (mu * mu * (1.0f + mu * mu)), gap = N - mu * T, dT = UV / T, dgap = dN - mu * dT;
-            first += Dm * gap * dgap, second += Dm * (dgap * dgap - gap * mu * (VV - dT * dT) / T);
+            const float Dm = D[row] / (m * m * (1.0f + m * m)), gap = N - m * T, dT = UV / T, dgap = m * (Jp[row] - dT);
+            first += Dm * gap * dgap, second += Dm * (dgap * dgap - gap * m * (VV - dT * dT) / T);
         }
         first = sum(first), second = sum(second);
     };
+    // The lower triangle of a symmetric matrix, dealt out to the lanes.
+    constexpr int triangle = NV * (NV + 1) / 2, entries = (triangle + lanes - 1) / lanes;
+    int column[entries], line[entries];
+    for (int e = 0; e < entries; ++e) {
+        const int at = e * lanes + lane < triangle ? e * lanes + lane : 0;
+        int i = (int)((sqrtf(8.0f * at + 1.0f) - 1.0f) / 2.0f);
+        i += (i + 1) * (i + 2) / 2 <= at;
+        line[e] = i, column[e] = at - i * (i + 1) / 2;
+    }
 
     multiply(a, Ma, r, aref);
     int iteration = 0;
-    while (iteration < iterations && n) {
-        // f and W
+    while (iteration < in.iterations && n) {
         for (int row = lane; row < n; row += lanes) {
-            const float* friction;
-            const int dim = cone(row, friction);
+            const int dim = cone[row];
             if (dim < 0) continue;
             if (dim == 0) {
-                float d1, d2;
-                simple(row, r[row], d1, d2);
-                f[row] = -d1;
-                for (int j = 0; j < NV; ++j) W[row * NV + j] = d2 * J[row * stride + j];
+                simple(row, r[row], f[row], weight[row]);
+                f[row] = -f[row];
                 continue;
             }
-            const float mu = friction[0] * shrink, N = mu * r[row];
+            const float m = mu[row], N = m * r[row];
             float TT = 0.0f;
-            for (int j = 1; j < dim; ++j) TT += friction[j - 1] * r[row + j] * friction[j - 1] * r[row + j];
+            for (int k = row + 1; k < row + dim; ++k) TT += mu[k] * r[k] * mu[k] * r[k];
             const float T = sqrtf(TT);
-            if (N >= mu * T || mu * N + T <= 0.0f) {  // apart, or sticking
-                for (int k = 0; k < dim; ++k) {
-                    const float weight = N >= mu * T ? 0.0f : D[row + k];
-                    f[row + k] = -weight * r[row + k];
-                    for (int j = 0; j < NV; ++j) W[(row + k) * NV + j] = weight * J[(row + k) * stride + j];
-                }
+            if (N >= m * T || m * N + T <= 0.0f) {  // apart, or sticking
+                for (int k = row; k < row + dim; ++k) weight[k] = N >= m * T ? 0.0f : D[k], f[k] = -weight[k] * r[k];
                 continue;
             }
-            const float Dm = D[row] / (mu * mu * (1.0f + mu * mu)), ratio = mu * N / T;
-            f[row] = -Dm * (N - mu * T) * mu;
-            for (int k = 1; k < dim; ++k) f[row + k] = -f[row] / T * friction[k - 1] * friction[k - 1] * r[row + k];
-            for (int j = 0; j < NV; ++j) {
-                const float normal = mu * J[row * stride + j];
-                float along = 0.0f;  // the direction in which it slides
-                for (int k = 1; k < dim; ++k) {
-                    along += friction[k - 1] * friction[k - 1] * r[row + k] * J[(row + k) * stride + j];
-                }
-                along /= T;
-                W[row * NV + j] = Dm * mu * (normal - mu * along);
-                for (int k = 1; k < dim; ++k) {
-                    const float u = friction[k - 1] * r[row + k] / T, tangent = friction[k - 1] * J[(row + k) * stride + j];
-                    W[(row + k) * NV + j] =
-                        Dm * friction[k - 1] * (u * (ratio * along - mu * normal) + (mu * mu - ratio) * tangent);
-                }
-            }
+            const float Dm = D[row] / (m * m * (1.0f + m * m));
+            f[row] = -Dm * (N - m * T) * m, weight[row] = -Dm, weight[row + 1] = m * N / T;
+            for (int k = row + 1; k < row + dim; ++k) along[k] = mu[k] * mu[k] * r[k] / T, f[k] = -f[row] * along[k];
         }
         sync();
-        // gradient g and Hessian H (its lower triangle)
+        // gradient g, and Hessian H = M + J' s''(r) J
         float gg = 0.0f;
         for (int i = lane; i < NV; i += lanes) {
             float total = Ma[i] - smooth[i];
-            for (int row = 0; row < n; ++row) total -= J[row * stride + i] * f[row];
+            for (int row = 0; row < n; ++row) total -= J[row * NV + i] * f[row];
             g[i] = total, p[i] = -total;
             gg += total * total;
         }
-        for (int e = lane; e < NV * (NV + 1) / 2; e += lanes) {
-            int i = (int)((sqrtf(8.0f * e + 1.0f) - 1.0f) / 2.0f);
-            i += (i + 1) * (i + 2) / 2 <= e;
-            const int j = e - i * (i + 1) / 2;
-            float total = M[i * NV + j];
-            for (int row = 0; row < n; ++row) total += J[row * stride + i] * W[row * NV + j];
-            H[i * NV + j] = total;
-        }
-        sync();
         if (scale * sqrtf(sum(gg)) < limit) break;
-        // H = L L', then p = -H^-1 g
+        float h[entries];
+        for (int e = 0; e < entries; ++e) h[e] = M[line[e] * NV + column[e]];
+        for (int row = 0; row < n; ++row) {
+            const float* first = J + row * NV;
+            if (weight[row] >= 0.0f) {
+                if (weight[row] > 0.0f) {
+                    for (int e = 0; e < entries; ++e) h[e] += weight[row] * first[line[e]] * first[column[e]];
+                }
+                continue;
+            }
+            const float m = mu[row], ratio = weight[row + 1];
+            for (int e = 0; e < entries; ++e) {
+                const int i = line[e], j = column[e];
+                float slide_i = 0.0f, slide_j = 0.0f, tangents = 0.0f;
+                for (int k = 1; k < cone[row]; ++k) {
+                    const float Ji = first[k * NV + i], Jj = first[k * NV + j];
+                    slide_i += along[row + k] * Ji, slide_j += along[row + k] * Jj;
+                    tangents += mu[row + k] * mu[row + k] * Ji * Jj;
+                }
+                const float normal_i = m * first[i], normal_j = m * first[j];
+                h[e] -= weight[row] * (normal_i * normal_j - m * (normal_i * slide_j + normal_j * slide_i)
+                                       + ratio * slide_i * slide_j + (m * m - ratio) * tangents);
+            }
+            row += cone[row] - 1;
+        }
+        for (int e = 0; e < entries; ++e) H[line[e] * NV + column[e]] = h[e];
+        sync();
+        // H = L L', with the inverse of L's diagonal in its place; then p = -H^-1 g
         for (int k = 0; k < NV; ++k) {
-            const float pivot = sqrtf(H[k * NV + k] > 1e-15f ? H[k * NV + k] : 1e-15f);
+            const float inverse = 1.0f / sqrtf(H[k * NV + k] > 1e-15f ? H[k * NV + k] : 1e-15f);
             sync();
-            for (int i = k + lane; i < NV; i += lanes) H[i * NV + k] = i == k ? pivot : H[i * NV + k] / pivot;
+            for (int i = k + lane; i < NV; i += lanes) H[i * NV + k] = i == k ? inverse : H[i * NV + k] * inverse;
             sync();
-            for (int e = lane; e < (NV - k - 1) * (NV - k - 1); e += lanes) {
-                const int i = k + 1 + e / (NV - k - 1), j = k + 1 + e % (NV - k - 1);
-                if (j <= i) H[i * NV + j] -= H[i * NV + k] * H[j * NV + k];
+            for (int i = k + 1 + lane; i < NV; i += lanes) {
+                for (int j = k + 1; j <= i; ++j) H[i * NV + j] -= H[i * NV + k] * H[j * NV + k];
             }
             sync();
         }
         for (int k = 0; k < NV; ++k) {
-            const float x = p[k] / H[k * NV + k];
+            const float x = p[k] * H[k * NV + k];
             sync();
             for (int i = k + lane; i < NV; i += lanes) p[i] = i == k ? x : p[i] - H[i * NV + k] * x;
             sync();
         }
         for (int k = NV - 1; k >= 0; --k) {
-            const float x = p[k] / H[k * NV + k];
+            const float x = p[k] * H[k * NV + k];
             sync();
             for (int i = k - lane; i >= 0; i -= lanes) p[i] = i == k ? x : p[i] - H[k * NV + i] * x;
             sync();
@@ -227,7 +240,7 @@ _SOLVE = """
         for (int i = lane; i < NV; i += lanes) gauss += p[i] * (Ma[i] - smooth[i]), curvature += p[i] * Mp[i];
         gauss = sum(gauss), curvature = sum(curvature);
         float step = 1.0f, low = 0.0f, high = 1e30f;
-        for (int k = 0; k < ls_iterations; ++k) {
+        for (int k = 0; k < in.ls_iterations; ++k) {
             float d1, d2;
             slope(step, d1, d2);
             d1 += gauss + step * curvature, d2 += curvature;
@@ -241,8 +254,8 @@ _SOLVE = """
         for (int row = lane; row < n; row += lanes) r[row] += step * Jp[row];
         sync();
     }
-    for (int i = lane; i < NV; i += lanes) qacc.data[world * NV + i] = a[i], efc_Ma.data[world * NV + i] = Ma[i];
-    if (lane == 0) solver_niter.data[world] = iteration;
+    for (int i = lane; i < NV; i += lanes) in.qacc.data[world * NV + i] = a[i], in.efc_Ma.data[world * NV + i] = Ma[i];
+    if (lane == 0) in.solver_niter.data[world] = iteration;
 """
 
 
@@ -250,126 +263,39 @@ def make(model, data) -> Callable[[], None]:
     """What puts the solution into ``data.qacc`` and ``data.efc.Ma``, all that MuJoCo Warp's integrators read of it.
 
     Args:
-        model, data: MuJoCo Warp's, with dense Jacobians.
+        model, data: MuJoCo Warp's.
+
+    Returns:
+        a function without arguments; MuJoCo Warp's own solver where the model is too large for this one.
     """
     import warp as wp
+    from mujoco.mjx.third_party import mujoco_warp
 
     nv, njmax = model.nv, data.njmax
-    size = 2 * nv * nv + njmax * nv + 5 * nv + 3 * njmax
-    worlds = max(1, min(4, _SHARED_BYTES // (4 * size)))
-    numbers = {
-        "NV": nv,
-        "NJ": njmax,
-        "SIZE": size,
-        "WORLDS": worlds,
-        "ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
-    }
+    size = 2 * nv * nv + njmax * nv + 5 * nv + 8 * njmax
+    if model.is_sparse or 4 * size > _SHARED_BYTES:
+        return lambda: mujoco_warp.solve(model, data)
+    numbers = {"NV": nv, "NJ": njmax, "SIZE": size, "ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)}
     source = "".join(f"constexpr int {name} = {value};\n" for name, value in numbers.items()) + _SOLVE
-    ints, floats, rows = wp.array(dtype=int), wp.array(dtype=float), wp.array(dtype=float, ndim=2)
-    int_rows, vec5 = wp.array(dtype=int, ndim=2), wp.array(dtype=data.contact.friction.dtype)
+    arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_smooth", "qacc_warmstart")}
+    arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma")}
+    arrays |= {f"contact_{name}": getattr(data.contact, name) for name in ("friction", "dim", "efc_address")}
+    arrays |= {name: getattr(model, name) for name in ("M_rownnz", "M_rowadr", "M_colind")}
+    arrays |= {name: getattr(model.opt, name) for name in ("impratio_invsqrt", "tolerance", "ls_tolerance")}
+    arrays |= {"qacc": data.qacc, "solver_niter": data.solver_niter}
+    types = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in arrays.items()}
+    Problem = wp.struct(type("Problem", (), {"__annotations__": {**types, "iterations": int, "ls_iterations": int}}))
+    problem = Problem()
+    for name, x in arrays.items():
+        setattr(problem, name, x)
+    problem.iterations, problem.ls_iterations = model.opt.iterations, model.opt.ls_iterations
 
     @wp.func_native(source)
-    def solve(
-        tid: int,
-        nefc: ints,
-        ne: ints,
-        nf: ints,
-        efc_J: wp.array(dtype=float, ndim=3),
-        efc_D: rows,
-        efc_aref: rows,
-        efc_frictionloss: rows,
-        efc_type: int_rows,
-        efc_id: int_rows,
-        contact_friction: vec5,
-        contact_dim: ints,
-        contact_efc_address: int_rows,
-        M_rownnz: ints,
-        M_rowadr: ints,
-        M_colind: ints,
-        M_in: rows,
-        qfrc_smooth: rows,
-        qacc_smooth: rows,
-        warmstart: rows,
-        impratio_invsqrt: floats,
-        tolerance: floats,
-        ls_tolerance: floats,
-        iterations: int,
-        ls_iterations: int,
-        qacc: rows,
-        efc_Ma: rows,
-        solver_niter: ints,
-    ): ...
+    def solve(tid: int, problem: Problem): ...
 
     @wp.kernel(module="unique", enable_backward=False)
-    def newton(
-        nefc: ints,
-        ne: ints,
-        nf: ints,
-        efc_J: wp.array(dtype=float, ndim=3),
-        efc_D: rows,
-        efc_aref: rows,
-        efc_frictionloss: rows,
-        efc_type: int_rows,
-        efc_id: int_rows,
-        contact_friction: vec5,
-        contact_dim: ints,
-        contact_efc_address: int_rows,
-        M_rownnz: ints,
-        M_rowadr: ints,
-        M_colind: ints,
-        M_in: rows,
-        qfrc_smooth: rows,
-        qacc_smooth: rows,
-        warmstart: rows,
-        impratio_invsqrt: floats,
-        tolerance: floats,
-        ls_tolerance: floats,
-        iterations: int,
-        ls_iterations: int,
-        qacc: rows,
-        efc_Ma: rows,
-        solver_niter: ints,
-    ):
-        solve(
-            wp.tid(),
-            nefc,
-            ne,
-            nf,
-            efc_J,
-            efc_D,
-            efc_aref,
-            efc_frictionloss,
-            efc_type,
-            efc_id,
-            contact_friction,
-            contact_dim,
-            contact_efc_address,
-            M_rownnz,
-            M_rowadr,
-            M_colind,
-            M_in,
-            qfrc_smooth,
-            qacc_smooth,
-            warmstart,
-            impratio_invsqrt,
-            tolerance,
-            ls_tolerance,
-            iterations,
-            ls_iterations,
-            qacc,
-            efc_Ma,
-            solver_niter,
-        )
+    def newton(problem: Problem):
+        solve(wp.tid(), problem)
 
-    efc, contact, opt = data.efc, data.contact, model.opt
-    inputs = [data.nefc, data.ne, data.nf, efc.J, efc.D, efc.aref, efc.frictionloss, efc.type, efc.id]
-    inputs += [contact.friction, contact.dim, contact.efc_address, model.M_rownnz, model.M_rowadr, model.M_colind, data.M]
-    inputs += [data.qfrc_smooth, data.qacc_smooth, data.qacc_warmstart, opt.impratio_invsqrt, opt.tolerance, opt.ls_tolerance]
-    inputs += [opt.iterations, opt.ls_iterations]
     threads = 32 if wp.get_device().is_cuda else 1
-
-    def run():
-        outputs = [data.qacc, efc.Ma, data.solver_niter]
-        wp.launch(newton, dim=data.nworld * threads, inputs=inputs, outputs=outputs, block_dim=threads * worlds)
-
-    return run
+    return lambda: wp.launch(newton, dim=data.nworld * threads, inputs=[problem], block_dim=threads)
