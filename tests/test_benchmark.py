@@ -11,6 +11,7 @@ import pytest
 
 from mjx_nero.benchmark import command, drawing, learning, plot, throughput
 from mjx_nero.benchmark.program import Program, spread, warp_mb
+from mjx_nero.physics.mjx_warp import WarpPhysics
 
 MISTAKES = [
     (["--impl", "cuda"], "unknown impl cuda: choose from auto, warp, jax, native"),
@@ -190,7 +191,7 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     argv = ["--what", "learning", "--num-envs", 8, "--impl", "native", "--seeds", 3, "--num-timesteps", 70, "--eval-every", 29]
     code, out, _ = call("benchmark", *argv, "--json", "rows.json")
     *seeds, summary = json.loads((tmp_path / "rows.json").read_text())["rows"]
-    assert code == 0 and "seconds_median" in out
+    assert code == 0 and "2 of 3" in out and "median 40, worst never" in out
     found = [(r["seed"], r["reached"], r["env_steps"], r["success_rate"], r["nan_count"]) for r in seeds]
     assert found == [(0, True, 40, 0.95, 1), (1, True, 20, 1.0, 1), (2, False, 80, 0.94, 1)]
     assert all(0 <= r["evaluation_s"] <= r["seconds"] for r in seeds)
@@ -201,7 +202,7 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
 
 def test_summary_of_seeds():
     rows = [{"reached": True, "seconds": s, "env_steps": n} for s, n in ((3.0, 30), (1.0, 20), (2.0, 50), (8.0, 40))]
-    expected = {"seconds_median": 2.5, "seconds_worst": 8.0, "env_steps_median": 35.0, "env_steps_worst": 50}
+    expected = {"seconds_median": 2.5, "seconds_worst": 8.0, "env_steps_median": 35, "env_steps_worst": 50}
     assert learning.summary(rows) == {"seed": "all", "seeds": 4, "reached": 4, **expected}
 
 
@@ -222,14 +223,8 @@ def test_a_program_counts_and_goes_on():
     assert program.counts == {"nan": 1.0 + 2.0 + 3.0}
 
 
-def test_memory_of_warp():
-    array = types.SimpleNamespace(capacity=2**20)
-
-    class Data:
-        __dataclass_fields__ = ()
-
-    data, contact = Data(), Data()
-    contact.pos = array
-    data.qpos, data.contact, data.steps = array, contact, 7
-    assert warp_mb(types.SimpleNamespace(_made={"gpu": (data, print)})) == 2.0
-    assert warp_mb(types.SimpleNamespace()) is None
+def test_memory_of_warp(env):
+    physics = object.__new__(WarpPhysics)  # making one needs Warp
+    physics.bytes_per_env = lambda: 2**18
+    assert warp_mb(types.SimpleNamespace(physics=physics, num_envs=12)) == 3.0
+    assert warp_mb(env) is None

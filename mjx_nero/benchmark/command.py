@@ -43,10 +43,7 @@ _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the ta
     ),
     ("reset",): ("what", "impl", "num_envs", "resets_per_s", *_MEMORY),
     ("render",): ("what", "gl", "width", "height", "frames_per_s"),
-    ("learning",): (
-        *("impl", "num_envs", "seed", "reached", "seconds", "evaluation_s", "env_steps", "success_rate"),
-        *("seconds_median", "seconds_worst", "env_steps_median", "env_steps_worst", "nan_count"),
-    ),
+    ("learning",): (*("impl", "num_envs", "seed", "reached", "seconds", "evaluation_s", "env_steps", "success_rate", *_COUNTS),),
     ("ik",): (*("solver", "batch", "ms_per_batch", "solves_per_s", "success", "error_mm", "error_mrad", "compile_s"),),
 }
 
@@ -239,11 +236,15 @@ def _without_folders(word: str) -> str:
 
 def _line(row: Row) -> str:
     """A row as it comes, in one line."""
-    return "  ".join(f"{name} {_cell(row, name)}" for name, value in row.items() if value is not None and name[-4:] not in _ENDS)
+    return "  ".join(f"{name} {_cell(row, name)}" for name in row if row[name] is not None and not name.endswith(_ENDS))
 
 
 def _cell(row: Row, name: str) -> str:
-    """A value as text, with its range where the row has one."""
+    """A value as text, with its range where the row has one; of a row about several seeds, median and worst."""
+    if f"{name}_median" in row:
+        return ", ".join(f"{which} {_text(row[f'{name}_{which}'])}" for which in ("median", "worst"))
+    if name == "reached" and "seeds" in row:
+        return f"{row['reached']} of {row['seeds']}"
     if row.get(name) is None:
         return ""
     low, high = (row.get(name + end) for end in _ENDS)
@@ -252,6 +253,8 @@ def _cell(row: Row, name: str) -> str:
 
 
 def _text(value: Any) -> str:
+    if value is None:
+        return "never"
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
@@ -268,7 +271,7 @@ def _show(title: str, rows: list[Row]) -> None:
         if not part:
             continue
         view = Table(title=title)
-        filled = [name for name in (*columns, "note") if any(row.get(name) is not None for row in part)]
+        filled = [name for name in (*columns, "note") if any(_cell(row, name) for row in part)]
         for name in filled:
             view.add_column(name, justify="left" if name == "note" else "right", overflow="fold")
         for row in part:

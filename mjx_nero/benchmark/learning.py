@@ -10,6 +10,7 @@ import jax
 from mjx_nero import ppo, training, wrappers
 from mjx_nero.benchmark.program import Row
 from mjx_nero.env import ManipulationEnv
+from mjx_nero.physics import compiler_options
 
 _EVALUATIONS = 24  # a whole run, where nothing else is asked for
 
@@ -32,7 +33,8 @@ def measure_learning(run: training.RunCfg, seeds: int, target: float) -> Iterato
     begun = time.perf_counter()
     init = jax.jit(learner.init)
     state = learner.place(init(jax.random.PRNGKey(0)))
-    advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile()
+    lowered = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk)
+    advance = lowered.compile(compiler_options(impl))
     evaluate = training._evaluator(run, learner)
     state, _ = jax.block_until_ready(advance(state))  # loads what the backend compiles at its first call
     evaluate(learner.on_one_device(state))
@@ -81,8 +83,8 @@ def make_learner(run: training.RunCfg) -> ppo.Learner:
 def summary(rows: list[Row]) -> Row:
     """How many seeds reached the target; median and worst of seconds and env steps, None where such a seed did not."""
     found: Row = {"seed": "all", "seeds": len(rows), "reached": sum(row["reached"] for row in rows)}
-    for name in ("seconds", "env_steps"):
+    for name, digits in (("seconds", 2), ("env_steps", None)):
         values = [row[name] if row["reached"] else math.inf for row in rows]
         for which, value in (("median", statistics.median(values)), ("worst", max(values))):
-            found[f"{name}_{which}"] = value if math.isfinite(value) else None
+            found[f"{name}_{which}"] = round(value, digits) if math.isfinite(value) else None
     return found

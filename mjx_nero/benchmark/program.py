@@ -1,6 +1,5 @@
 """A piece of work that is called again and again: its seconds, counts and memory."""
 
-import contextlib
 import statistics
 import time
 from collections.abc import Callable
@@ -8,7 +7,10 @@ from typing import Any
 
 import jax
 
+from mjx_nero import memory
+from mjx_nero.env import ManipulationEnv
 from mjx_nero.physics import compiler_options
+from mjx_nero.physics.mjx_warp import WarpPhysics
 
 Row = dict[str, Any]  # one measurement, as JSON has it
 
@@ -36,10 +38,8 @@ class Program:
         call = jax.jit(function, donate_argnums=0).lower(state, jax.random.PRNGKey(0)).compile(compiler_options(impl))
         program = cls(call, state, work)
         program.warm_up(begun)
-        with contextlib.suppress(Exception):  # not every backend tells
-            use: Any = call.memory_analysis()
-            size = use.argument_size_in_bytes + use.output_size_in_bytes + use.temp_size_in_bytes - use.alias_size_in_bytes
-            program.memory_mb = mb(size)
+        size = memory.program_bytes(call)
+        program.memory_mb = None if size is None else mb(size)
         return program
 
     def warm_up(self, begun: float) -> None:
@@ -79,13 +79,6 @@ def device_peak_mb() -> float | None:
     return mb(stats["peak_bytes_in_use"]) if "peak_bytes_in_use" in stats else None
 
 
-def warp_mb(physics: Any) -> float | None:
-    """MuJoCo Warp's own buffers, which JAX does not know of; None for another backend."""
-    made = getattr(physics, "_made", {})
-    return mb(sum(_warp_bytes(part) for parts in made.values() for part in parts)) or None
-
-
-def _warp_bytes(value: Any) -> int:
-    if isinstance(capacity := getattr(value, "capacity", None), int):  # a Warp array's size in bytes
-        return capacity
-    return sum(map(_warp_bytes, vars(value).values())) if hasattr(value, "__dataclass_fields__") else 0
+def warp_mb(env: ManipulationEnv) -> float | None:
+    """MuJoCo Warp's own buffers for all environments, which JAX does not know of; None for another backend."""
+    return mb(env.num_envs * env.physics.bytes_per_env()) if isinstance(env.physics, WarpPhysics) else None

@@ -81,7 +81,7 @@ def measure(what: str, env: ManipulationEnv, make: Callable[[], Program], repeat
         "compile_s": round(program.compile_s, 1),
         "memory_mb": program.memory_mb,
         "device_peak_mb": device_peak_mb(),
-        "warp_mb": warp_mb(env.physics) if unit == "env_steps" else None,
+        "warp_mb": warp_mb(env) if unit == "env_steps" else None,
     }
     if unit == "env_steps":
         row["physics_steps_per_s"] = round(row["env_steps_per_s"] * env.cfg.sim.decimation)
