@@ -92,7 +92,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         console.status("compiling (a minute or two the first time) ..."),
         folder.unless_failed(),
         memory.in_one_line(learner),
-        concurrent.futures.ThreadPoolExecutor() as side_by_side,  # compilers work without Python's lock
+        _threads() as side_by_side,  # compilers work without Python's lock
     ):
         evaluate = _evaluator(run, learner)
         loading = side_by_side.submit(learner.physics_loader()) if env.impl == "warp" else None
@@ -252,6 +252,16 @@ class _Loop:
         )
         with Progress(*columns, console=self.console, disable=not self.console.is_terminal) as bar:
             yield bar, bar.add_task("", sps="-", ret="-", suc="-")
+
+
+@contextlib.contextmanager
+def _threads():
+    """An executor that does not keep an error or Ctrl-C waiting for the others' ends."""
+    pool = concurrent.futures.ThreadPoolExecutor()
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 class _Stop:

@@ -114,6 +114,7 @@ def call(monkeypatch, capfd, tmp_path):
     """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cli, "setup_jax", lambda: None)
+    monkeypatch.setattr(cli.os, "_exit", sys.exit)  # the end of an interrupted program, not of the tests
     monkeypatch.setenv("COLUMNS", "200")
 
     def run(program, *argv):
