@@ -128,7 +128,7 @@ class Learner:
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
         self._optimizer = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam)
-        self._make_policy = networks.make_inference_fn(self.networks, compute_value=True)
+        self._make_policy = networks.make_inference_fn(self.networks)
 
     def init(self, key: Key) -> TrainState:
         """Fresh networks and environments, the latter spread over their episodes so that they don't all end at once."""
@@ -218,7 +218,7 @@ class Learner:
             the environments, the batch (leaves [time, env, ...]), and sums of the environments' metrics over it.
         """
         cfg = self.cfg
-        policy = self._make_policy((state.normalizer, state.params.policy, state.params.value))
+        policy = self._make_policy((state.normalizer, state.params.policy))
 
         def act(env_state: State, key: Key):
             action, extras = policy(env_state.obs, key)
@@ -229,19 +229,18 @@ class Learner:
 
         keys = jax.random.split(key, cfg.unroll_length)
         env_state, (obs, extras, reward, done, truncation, sums) = jax.lax.scan(act, state.env_state, keys)
-        last = self.networks.value_network.apply(state.normalizer, state.params.value, env_state.obs)
+        # All steps' values at once: a few large products in place of many small ones.
+        value, last = (self.networks.value_network.apply(state.normalizer, state.params.value, o) for o in (obs, env_state.obs))
         returns, advantages = losses.compute_gae(
             truncation=truncation,
             termination=done * (1 - truncation),
             rewards=reward * cfg.reward_scaling,
-            values=extras["value"],
+            values=value,
             bootstrap_value=last,
             lambda_=cfg.gae_lambda,
             discount=cfg.discounting,
         )
-        batch = Batch(
-            obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], extras["value"], returns, advantages
-        )
+        batch = Batch(obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], value, returns, advantages)
         return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in sums.items()}
 
     def loss(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.training.agents.ppo import losses
+from brax.training.agents.ppo import losses, networks
 from brax.training.types import Transition
 
 from mjx_nero import UserError, checkpoint, make, memory, wrappers
@@ -86,7 +86,9 @@ def differ(a, b) -> bool:
 @pytest.fixture(scope="module")
 def conventional(learner, eventful):
     """The same steps as ``Learner.rollout``'s, as Brax's own loop collects them: [env, time], every next observation kept."""
-    policy = learner._make_policy((eventful.normalizer, eventful.params.policy, eventful.params.value))
+    policy = networks.make_inference_fn(learner.networks, compute_value=True)(
+        (eventful.normalizer, eventful.params.policy, eventful.params.value)
+    )
 
     def act(env_state, key):
         action, extras = policy(env_state.obs, key)

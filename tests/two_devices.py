@@ -19,15 +19,14 @@ def scripted(learner):
     dist = nets.parametric_action_distribution
 
     def make_policy(params):
-        normalizer, policy, value = params
+        normalizer, policy = params
 
         def act(obs, key):
             logits = nets.policy_network.apply(normalizer, policy, obs)
             normal = dist.create_dist(logits)
             noise = 100 * (obs["state"] - obs["privileged_state"][..., :47])[..., :8]  # within +-1
             raw = normal.loc + normal.scale * noise
-            extras = {"log_prob": dist.log_prob(logits, raw), "raw_action": raw, "distribution_params": logits}
-            return raw, {**extras, "value": nets.value_network.apply(normalizer, value, obs)}
+            return raw, {"log_prob": dist.log_prob(logits, raw), "raw_action": raw, "distribution_params": logits}
 
         return act
 

@@ -27,7 +27,7 @@ class WarpPhysics:
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
-        self._made: dict[tuple[Any, int], tuple[Any, Callable[[], None]]] = {}  # by device and number of environments
+        self._made: dict[tuple[str, int], tuple[Any, Callable[[], None], Any]] = {}  # by device and number of environments
         self._batched = self._as_jax()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
@@ -57,7 +57,7 @@ class WarpPhysics:
             key = (str(wp.get_device()), qpos.shape[0])
             if key not in self._made:
                 self._made[key] = self._make(qpos.shape[0])
-            data, run = self._made[key]
+            data, run, _ = self._made[key]
             wp.copy(data.qpos, qpos)
             wp.copy(data.qvel, qvel)
             wp.copy(data.ctrl, ctrl)
@@ -102,8 +102,8 @@ class WarpPhysics:
             sizes = {"naconmax": cfg.contacts_per_env, "njmax": cfg.constraints_per_env}
             return size(mujoco_warp.make_data(self.model, 1, **sizes))
 
-    def _make(self, n: int) -> tuple[Any, Callable[[], None]]:
-        """MuJoCo Warp's data for ``n`` environments on the current device, and what steps them."""
+    def _make(self, n: int) -> tuple[Any, Callable[[], None], Any]:
+        """MuJoCo Warp's data for ``n`` environments on the current device, what steps them, and what that needs to be kept."""
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
 
@@ -124,8 +124,8 @@ class WarpPhysics:
                 mujoco_warp.implicit(model, data)
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
-            return data, run
+            return data, run, run
         run()  # loads the kernels, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
-        return data, lambda: wp.capture_launch(capture.graph)
+        return data, lambda: wp.capture_launch(capture.graph), run
