@@ -6,6 +6,7 @@ says of the program that it has compiled. Warp's buffers are outside XLA's memor
 
 import contextlib
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -16,8 +17,8 @@ from mjx_nero.physics import Physics
 from mjx_nero.ppo import Learner
 from mjx_nero.types import UserError
 
-# A rollout keeps every step's observations and the like; an update besides copies one minibatch of them, and keeps what its
-# networks' neurons gave, for the gradient. MJX-JAX takes a few times its data.
+# A rollout keeps every step's observations and the like; its end takes two layers of the critic for all of them; an update copies
+# a minibatch, and keeps what all of its networks' neurons gave, for the gradient. MJX-JAX takes a few times its data.
 _BATCH, _NEURONS, _MJX_DATA = 1.1, 1.75, 2.5
 _WARP_DATA = 1.25  # a step's scratch arrays
 
@@ -103,9 +104,12 @@ def estimate(learner: Learner) -> tuple[float, float]:
     state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
     own = _bytes(state.env_state)
     # Observations; actions, their means and deviations; log-probability, value, return, advantage, reward and two ends.
-    step = 4 * (sum(sum(size) for size in learner.sizes.values()) + 3 * env.action_size + 7)
+    obs = 4 * sum(sum(size) for size in learner.sizes.values())
+    step = obs + 4 * (3 * env.action_size + 7)
     neurons = 4 * (sum(cfg.network.actor) + sum(cfg.network.critic))
-    rollout = _MJX_DATA * _data(env.physics) if env.impl == "jax" else 0.0
+    layers = 4 * max(a + b for a, b in itertools.pairwise((*cfg.network.critic, 1)))
+    physics = _MJX_DATA * _data(env.physics) if env.impl == "jax" else 0.0
+    rollout = max(physics, cfg.unroll_length * (obs + layers))
     update = cfg.unroll_length * (step + _NEURONS * neurons) / cfg.num_minibatches
     per_env = own / cfg.num_envs + _BATCH * cfg.unroll_length * step + max(rollout, update)
     return 2.0 * (_bytes(state) - own), per_env
