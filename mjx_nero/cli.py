@@ -1,6 +1,7 @@
 """Command-line plumbing shared by train.py, eval.py and the benchmark."""
 
 import argparse
+import logging
 import os
 import pathlib
 import sys
@@ -55,14 +56,21 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         code = 2
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr, flush=True)
-        sys.stdout.flush()
-        os._exit(130)  # threads may be compiling still, and JAX before 0.11 crashes at the end of an interrupted compilation
     except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+    except BaseException as error:
+        if not interrupted(error):
+            raise
+        print("interrupted", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+        os._exit(130)  # threads may be compiling still, and JAX before 0.11 crashes at the end of an interrupted compilation
     sys.exit(code)
+
+
+def interrupted(error: BaseException) -> bool:
+    """True of Ctrl-C, also while JAX calls native physics back: it then raises an error of its own that tells of ours."""
+    return isinstance(error, KeyboardInterrupt) or "CpuCallback error" in str(error) and "KeyboardInterrupt" in str(error)
 
 
 def console(highlight: bool = True) -> Console:
@@ -83,6 +91,7 @@ def setup_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache / "jax"))
     os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))  # Warp reads it at its first use
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # a run has dozens of small programs
+    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)  # what it logs it raises as well: Ctrl-C, say
 
 
 def positive(text: str) -> int:

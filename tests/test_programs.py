@@ -11,6 +11,7 @@ import mujoco
 import pytest
 
 from mjx_nero import checkpoint, cli, policy, render, training
+from mjx_nero.physics.native import NativePhysics
 from mjx_nero.types import UserError
 
 
@@ -154,6 +155,14 @@ def test_too_many_environments_leave_nothing_behind(call, tmp_path):
     assert (code, out, list(tmp_path.iterdir())) == (2, "", [])
     assert err.startswith("error: 8000000000 environments need about ") and err.count("\n") == 1
     assert "or fewer" in err
+
+
+def test_ctrl_c_while_native_physics_runs(call, tmp_path, monkeypatch):
+    """JAX wraps what happens in a callback in an error of its own."""
+    monkeypatch.setattr(NativePhysics, "_step", lambda self, packed: os.kill(os.getpid(), signal.SIGINT))
+    code, out, err = call("eval", "--agent", "zero", "--episodes", 8, "--impl", "native", "--json", "result.json")
+    assert (code, out, list(tmp_path.iterdir())) == (130, "", [])
+    assert err.endswith("interrupted\n") and "Traceback" not in err
 
 
 @pytest.mark.slow
