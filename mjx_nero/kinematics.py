@@ -94,8 +94,8 @@ class Chain:
         node, end = self._ends[frame]
         links = []
         while node >= 0:
-            i, node, *rest = self._nodes[node]
-            links.append((i, *rest))
+            i, node, fixed, axis, slides = self._nodes[node]
+            links.append((i, fixed, axis, slides))
         return links[::-1], end
 
     def poses(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
@@ -160,8 +160,8 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
         q = jnp.append(qpos[at] - still, 0.0)
         angle = q * half
         # One column a link.
-        pos = position + slide * q
-        quat = quaternion * jnp.cos(angle) + turned * jnp.sin(angle)
+        pos = jnp.asarray(position) + slide * q
+        quat = jnp.asarray(quaternion) * jnp.cos(angle) + turned * jnp.sin(angle)
         while (count := pos.shape[1]) > 1:
             pairs = count // 2 * 2
             inner, outer = slice(0, pairs, 2), slice(1, pairs, 2)

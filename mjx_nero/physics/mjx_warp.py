@@ -40,20 +40,9 @@ class WarpPhysics:
     def _as_jax(self) -> Callable:
         import warp as wp
 
-        rows = wp.array(dtype=float, ndim=2)
-
         # Called by XLA on the stream that it computes on. No graph mode of Warp's: it would capture these copies for every set of
         # addresses that XLA comes up with, where one graph of the steps between them does.
-        def control_step(
-            qpos: rows,
-            qvel: rows,
-            ctrl: rows,
-            warmstart: rows,
-            qpos_out: rows,
-            qvel_out: rows,
-            warmstart_out: rows,
-            overflow_out: wp.array(dtype=int),
-        ):
+        def control_step(qpos, qvel, ctrl, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out):
             key = (str(wp.get_device()), qpos.shape[0])
             if key not in self._made:
                 self._made[key] = self._make(qpos.shape[0])
@@ -68,6 +57,8 @@ class WarpPhysics:
             wp.copy(warmstart_out, data.qacc_warmstart)
             wp.copy(overflow_out, data.overflow)
 
+        names = ("qpos", "qvel", "ctrl", "warmstart", "qpos_out", "qvel_out", "warmstart_out")
+        control_step.__annotations__ = dict.fromkeys(names, wp.array(dtype=float, ndim=2)) | {"overflow_out": wp.array(dtype=int)}
         call = wp.jax_callable(control_step, num_outputs=4, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
         nq, nv = self.model.nq, self.model.nv
 

@@ -291,10 +291,10 @@ def make(model, data) -> Callable[[], None]:
     problem.iterations, problem.ls_iterations = model.opt.iterations, model.opt.ls_iterations
 
     @wp.func_native(source)
-    def solve(tid: int, problem: Problem): ...
+    def solve(tid: int, problem: Problem): ...  # type: ignore[valid-type]
 
     @wp.kernel(module="unique", enable_backward=False)
-    def newton(problem: Problem):
+    def newton(problem: Problem):  # type: ignore[valid-type]
         solve(wp.tid(), problem)
 
     threads = 32 if wp.get_device().is_cuda else 1
