@@ -38,7 +38,7 @@ _COUNTS = ("nan_count", "overflow_count")
 _MEMORY = ("compile_s", "memory_mb", "device_peak_mb", "warp_mb")
 _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the table that shows it
     ("physics", "step", "ppo", "control"): (
-        *("what", "impl", "num_envs", "env_steps_per_s", "physics_steps_per_s"),
+        *("what", "controller", "impl", "num_envs", "env_steps_per_s", "physics_steps_per_s"),
         *(*_MEMORY, "success_rate", *_COUNTS),
     ),
     ("reset",): ("what", "impl", "num_envs", "resets_per_s", *_MEMORY),
@@ -152,6 +152,7 @@ def _jobs(args: argparse.Namespace, cfg: EnvCfg, whats: list[str]) -> list[_Job]
 
 def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _Job:
     make: Callable[[], throughput.Program]
+    about: Row = {}
     if what == "ppo":
         ppo_cfg = dataclasses.replace(training.learner_cfg(env.cfg, args.preset), num_envs=env.num_envs)
         learner = ppo.Learner(wrappers.for_training(env), ppo_cfg, args.num_devices)
@@ -159,10 +160,11 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _J
     elif what == "control":
         name = next(iter(env.cfg.controllers), "")
         make = functools.partial(throughput.controlled, env, evaluation.controller(name, env, args.env))
+        about = {"controller": name}
     else:
         measured = {"physics": throughput.physics, "step": throughput.step, "reset": throughput.reset}[what]
         make = functools.partial(measured, env, args.steps)
-    return _Job(what, env.impl, env.num_envs, lambda: [throughput.measure(what, env, make, args.repeats)])
+    return _Job(what, env.impl, env.num_envs, lambda: [throughput.measure(what, env, make, args.repeats) | about])
 
 
 def _run(args: argparse.Namespace, cfg: EnvCfg, impl: str, num_envs: int) -> training.RunCfg:
