@@ -1,7 +1,6 @@
 """Evaluation: whole episodes with a policy or a controller."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,6 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.env import ManipulationEnv
-from mjx_nero.physics import compiler_options
 from mjx_nero.types import Key
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]
@@ -134,7 +132,7 @@ def runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 
     """
     agent = act if isinstance(act, Agent) else policy_agent(act)
 
-    @functools.partial(jax.jit, compiler_options=compiler_options(env.impl))
+    @jax.jit
     def run(params, keys: Key, key: Key):
         def step(carry, key):
             (state, totals, active), memory = carry

@@ -157,6 +157,18 @@ def test_too_many_environments_leave_nothing_behind(call, tmp_path):
     assert "or fewer" in err
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="a machine without an accelerator")
+def test_what_a_machine_without_a_gpu_trains():
+    def fitted(name, fields=None, **rest):
+        run, note = training.fit_machine(training.resolve(name, "default", None, {}, fields or {}, **rest))
+        return run.ppo.num_envs, run.ppo.num_timesteps, run.max_minutes, note
+
+    assert fitted("nero_lift")[:3] == (256, 10_000_000, 10)
+    assert fitted("nero_reach", max_minutes=3.0)[:3] == (256, 2_000_000, 3)
+    assert "256 environments for 2 M steps, at most 3 minutes" in fitted("nero_reach", max_minutes=3.0)[3]
+    assert fitted("nero_lift", {"num_envs": 64, "num_timesteps": 5}) == (64, 5, 0, "")
+
+
 def test_ctrl_c_while_native_physics_runs(call, tmp_path, monkeypatch):
     """JAX wraps what happens in a callback in an error of its own."""
     monkeypatch.setattr(NativePhysics, "_step", lambda self, packed: os.kill(os.getpid(), signal.SIGINT))

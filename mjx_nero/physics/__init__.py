@@ -52,10 +52,10 @@ def resolve_impl(impl: str) -> str:
 
 
 def compiler_options(impl: str) -> dict[str, str | bool]:
-    """Options of ``jax.jit`` for programs with this physics.
+    """Options of ``jax.jit`` to train with this physics.
 
-    With an old JAX the package switches off a fusion of XLA's that MJX-JAX cannot do with (see ``mjx_nero/__init__.py``).
-    Networks take half as long again without it, so it comes back for the others.
+    With an old JAX the package switches off a fusion of XLA's that MJX-JAX and the controllers cannot do with (see
+    ``mjx_nero/__init__.py``). Networks take half as long again without it, so for them it comes back where MJX-JAX is not.
     """
     switch = "xla_cpu_use_fusion_emitters"
     return {switch: True} if impl != "jax" and f"{switch}=false" in os.environ.get("XLA_FLAGS", "") else {}
