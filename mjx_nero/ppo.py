@@ -48,7 +48,7 @@ class PpoCfg:
     learning_rate: float = 3e-4
     desired_kl: float = 0.02  # adapts the learning rate; 0 keeps it fixed
     min_learning_rate: float = 1e-5
-    max_learning_rate: float = 1e-2
+    max_learning_rate: float = 1e-3  # with thousands of environments it runs up to what it may, and ends exploration too early
     discounting: float = 0.98
     gae_lambda: float = 0.95
     clipping: float = 0.2
@@ -57,14 +57,14 @@ class PpoCfg:
     value_loss: float = 1.0
     max_grad_norm: float = 1.0
     reward_scaling: float = 1.0
-    matmul_precision: str = "float32"  # of the networks; TF32 products can spoil learning
+    matmul_precision: str = "tensorfloat32"  # of the networks, on GPUs that have it; the environment's is always full
     network: NetworkCfg = NetworkCfg()
 
 
 PRESETS = {  # by the environment's preset
     "default": PpoCfg(),
     # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
-    "isaac": PpoCfg(num_minibatches=4, learning_rate=1e-4, desired_kl=0.01, entropy_cost=0.006),
+    "isaac": PpoCfg(num_minibatches=4, learning_rate=1e-4, max_learning_rate=1e-2, desired_kl=0.01, entropy_cost=0.006),
 }
 
 
@@ -191,7 +191,7 @@ class Learner:
         return run(state)
 
     def _run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
-        with jax.default_matmul_precision(self.cfg.matmul_precision):
+        with jax.default_matmul_precision("float32"):
             state, metrics = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
         return state, {name: jnp.mean(value) for name, value in metrics.items()}
 
@@ -200,12 +200,16 @@ class Learner:
         if self._axis:
             k_roll = jax.random.fold_in(k_roll, jax.lax.axis_index(self._axis))
         env_state, batch, sums = self.rollout(state, k_roll)
-        params, opt_state, metrics = self._update(state, batch, k_update)
+        with self._networks_precision():
+            params, opt_state, metrics = self._update(state, batch, k_update)
         # After the update: the loss compares with log-probabilities made under the statistics that acted.
         normalizer = running_statistics.update(state.normalizer, batch.obs, pmap_axis_name=self._axis)
         state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1)
         sums = jax.lax.psum(sums, self._axis) if self._axis else sums
         return state, {**sums, **metrics}
+
+    def _networks_precision(self):
+        return jax.default_matmul_precision(self.cfg.matmul_precision)
 
     def _mean(self, tree: Tree) -> Tree:
         """The mean over the devices, in ``run``, of what each has for its equal share."""
@@ -220,17 +224,25 @@ class Learner:
         cfg = self.cfg
         policy = self._make_policy((state.normalizer, state.params.policy))
 
-        def act(env_state: State, key: Key):
-            action, extras = policy(env_state.obs, key)
+        def figures(env_state: State):
+            return {**env_state.metrics, "reward": env_state.reward, "episodes": env_state.done}
+
+        def act(carry: tuple[State, Metrics], key: Key):
+            env_state, totals = carry
+            with self._networks_precision():
+                action, extras = policy(env_state.obs, key)
             after = self.env.step(env_state, action)
-            sums = {name: jnp.sum(value) for name, value in after.metrics.items()}
-            sums |= {"reward": jnp.sum(after.reward), "episodes": jnp.sum(after.done)}
-            return after, (env_state.obs, extras, after.reward, after.done, after.info["truncation"], sums)
+            totals = jax.tree.map(jnp.add, totals, figures(after))  # by environment: a sum over them at every step costs more
+            return (after, totals), (env_state.obs, extras, after.reward, after.done, after.info["truncation"])
 
         keys = jax.random.split(key, cfg.unroll_length)
-        env_state, (obs, extras, reward, done, truncation, sums) = jax.lax.scan(act, state.env_state, keys)
+        start = state.env_state, jax.tree.map(jnp.zeros_like, figures(state.env_state))
+        (env_state, totals), (obs, extras, reward, done, truncation) = jax.lax.scan(act, start, keys)
         # All steps' values at once: a few large products in place of many small ones.
-        value, last = (self.networks.value_network.apply(state.normalizer, state.params.value, o) for o in (obs, env_state.obs))
+        with self._networks_precision():
+            value, last = (
+                self.networks.value_network.apply(state.normalizer, state.params.value, o) for o in (obs, env_state.obs)
+            )
         returns, advantages = losses.compute_gae(
             truncation=truncation,
             termination=done * (1 - truncation),
@@ -241,7 +253,7 @@ class Learner:
             discount=cfg.discounting,
         )
         batch = Batch(obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], value, returns, advantages)
-        return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in sums.items()}
+        return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in totals.items()}
 
     def loss(
         self, params: losses.PPONetworkParams, normalizer: running_statistics.RunningStatisticsState, batch: Batch, key: Key
