@@ -23,7 +23,7 @@ def main(argv):
     parser.add_argument(
         "--num-timesteps",
         type=cli.positive,
-        help="env steps in all (default: 60 M on a GPU; on a CPU 10 M to lift, 2 M to reach, in 10 minutes at most)",
+        help="env steps in all (default: on a GPU 100 M to lift, 60 M to reach; on a CPU 10 M and 2 M, in 10 minutes at most)",
     )
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
     parser.add_argument(

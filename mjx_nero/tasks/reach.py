@@ -16,7 +16,7 @@ RUNNER = {
     "num_epochs": 8,
     "num_minibatches": 4,
     "learning_rate": 1e-3,
-    "max_learning_rate": 1e-2,  # a tenth of it takes half as long again
+    "max_learning_rate": 1e-2,  # with a tenth of it nero_reach is at 47% after 1.2 M steps of 256 environments, not at 81%
     "desired_kl": 0.01,
     "entropy_cost": 0.001,
     "discounting": 0.99,
