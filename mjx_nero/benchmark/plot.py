@@ -34,6 +34,7 @@ def plot(rows: list[Row], title: str, path: pathlib.Path) -> None:
         axes.set_yscale("log")
         every = sorted({row["num_envs"] for points in lines.values() for row in points})
         axes.set_xticks(every, [f"{n:,}" for n in every])
+        axes.tick_params(axis="x", labelrotation=30)
         axes.xaxis.minorticks_off()
         axes.set_xlabel("environments")
         axes.set_ylabel(unit)
