@@ -14,9 +14,21 @@ pytest.register_assert_rewrite("model_checks")  # a helper's assertions show the
 
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
 # ``types``, ``ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them
-# with a batch axis.
-_CHECKED = ("arms", "checkpoint", "config", "env", "kinematics", "math", "mdp", "physics", "policy", "registry", "robot_file")
-_CHECKED += ("robots", "rollout", "scene", "tasks", "terms", "urdf", "view")
+# with a batch axis; and ``physics.mjx_warp``, of whose functions Warp reads the annotations.
+_CHECKED = (
+    "arms",
+    "checkpoint",
+    "config",
+    "env",
+    "kinematics",
+    "math",
+    "mdp",
+    "physics.mjx_jax",
+    "policy",
+    "registry",
+    "robot_file",
+)
+_CHECKED += ("physics.native", "robots", "rollout", "scene", "tasks", "terms", "urdf", "view")
 _CHECKED += ("control.controller", "control.gripper", "control.ik")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
