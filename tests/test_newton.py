@@ -100,7 +100,7 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
             (ours, lost), (reference, _) = warp_step(sim, ctrl), env.physics.step(sim, ctrl)
             assert not lost.any()
             np.testing.assert_allclose(ours.qpos[:, :12], reference.qpos[:, :12], rtol=0, atol=1e-5)
-            np.testing.assert_allclose(ours.qpos[:, 12:], reference.qpos[:, 12:], rtol=0, atol=1e-4)  # orientation of the cube
+            np.testing.assert_allclose(ours.qpos[:, 12:], reference.qpos[:, 12:], rtol=0, atol=5e-4)  # orientation of the cube
             np.testing.assert_allclose(ours.qvel[:, :12], reference.qvel[:, :12], rtol=0, atol=2e-3)
             np.testing.assert_allclose(ours.qvel[:, 12:], reference.qvel[:, 12:], rtol=0, atol=0.05)
             np.testing.assert_allclose(ours.time, sim.time + 0.02, atol=1e-6)
