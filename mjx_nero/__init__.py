@@ -31,5 +31,5 @@ from mjx_nero.env import EnvCfg, ManipulationEnv
 from mjx_nero.registry import env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.types import UserError
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make"]
