@@ -9,6 +9,7 @@ The same source compiles for the CPU, with one thread for all 32: slow, for test
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 
@@ -283,7 +284,7 @@ def make(model, data) -> Callable[[], None]:
     arrays |= {name: getattr(model, name) for name in ("M_rownnz", "M_rowadr", "M_colind")}
     arrays |= {name: getattr(model.opt, name) for name in ("impratio_invsqrt", "tolerance", "ls_tolerance")}
     arrays |= {"qacc": data.qacc, "solver_niter": data.solver_niter}
-    types = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in arrays.items()}
+    types: dict[str, Any] = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in arrays.items()}
     Problem = wp.struct(type("Problem", (), {"__annotations__": {**types, "iterations": int, "ls_iterations": int}}))
     problem = Problem()
     for name, x in arrays.items():
