@@ -108,7 +108,7 @@ class ManipulationEnv(Env):
         self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), num_envs
         self.dt = cfg.sim.dt * cfg.sim.decimation
         self.episode_length = round(cfg.episode_length_s / self.dt)
-        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
+        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         motion = None if cfg.motion is None else functools.partial(cfg.motion.func, **cfg.motion.params)
         self._viewer = Viewer(model, cfg.robot, self.episode_length, self.dt, motion)

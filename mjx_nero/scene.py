@@ -48,12 +48,14 @@ class SimCfg:
     constraints_per_env: int = 128  # Warp: constraint rows of one environment
 
 
-def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -> mujoco.MjModel:
+def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, fuse: bool = False) -> mujoco.MjModel:
     """Compiles robot, table, cube (joint ``cube``, if there is one) and goal marker.
 
     Args:
-        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras, bodies without joints): same
-            qpos, qvel and ctrl, less work a step.
+        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
+            ctrl, less work a step.
+        fuse: makes links that nothing moves against their parents a part of them, unless one serves as the end effector: Warp
+            goes through the tree level by level.
     """
     spec = _robot_spec(robot)
     spec.modelname = f"{robot.name}_scene"
@@ -91,9 +93,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True) -
         _add_visuals(spec, scene, goal)
     else:
         spec.discard_visual()
-        # Links that nothing moves against their parents become part of them: Warp goes through the tree level by level. A body
-        # that serves as the end effector keeps its name.
-        spec.compiler.fusestatic = spec.site(robot.ee_site) is not None
+    spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
     return spec.compile()
 
 

@@ -225,7 +225,9 @@ def test_statistics_are_those_of_the_observations(learner, eventful, rolled, run
 
 @pytest.mark.parametrize(("desired_kl", "factor"), [(1e-12, 1 / 1.5), (1e3, 1.5), (0.0, 1.0)])
 def test_learning_rate_adapts_to_the_kl(learner, eventful, rolled, desired_kl, factor):
-    cfg = dataclasses.replace(SMALL, num_epochs=4, num_minibatches=1, desired_kl=desired_kl, learning_rate=1e-3)
+    cfg = dataclasses.replace(
+        SMALL, num_epochs=4, num_minibatches=1, desired_kl=desired_kl, learning_rate=1e-3, max_learning_rate=1e-2
+    )
     _, batch, _ = rolled
     other = Learner(learner.env, cfg)
     state = eventful.replace(opt_state=other._optimizer.init(eventful.params))

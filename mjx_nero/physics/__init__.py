@@ -65,7 +65,7 @@ def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str) -> Physics:
     """The backend of a name that ``resolve_impl`` gave.
 
     Args:
-        model: from ``scene.build(..., visuals=False)``.
+        model: from ``scene.build(..., visuals=False, fuse=True)``.
         cfg: options and buffer sizes.
     """
     if impl == "warp":
