@@ -53,7 +53,7 @@ class Chain:
         self._nodes: list[tuple[int, int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]] = []
         self._qpos0 = np.array(model.qpos0[model.jnt_qposadr[ids]], np.float32)  # where a joint displaces nothing
         self._index = {j: i for i, j in enumerate(ids)}
-        self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), np.array([1.0, 0, 0, 0])))}
+        self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), _STILL))}
         self._model = model
         self._ends = [self._end(name) for name in frames]
         # path[f, i]: joint i (in the order of q) moves frame f
@@ -74,10 +74,10 @@ class Chain:
         for j in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
             if m.jnt_type[j] not in (_HINGE, _SLIDE):
                 raise ValueError(f"frame {frame!r} hangs on a ball or free joint: only hinges and slides are supported")
-            anchor, slide, still = m.jnt_pos[j], bool(m.jnt_type[j] == _SLIDE), np.array([1.0, 0, 0, 0])
+            anchor, slide = m.jnt_pos[j], bool(m.jnt_type[j] == _SLIDE)
             if j in self._index:
-                self._nodes.append((self._index[j], node, _compose(fixed, (anchor, still)), m.jnt_axis[j].copy(), slide))
-                node, fixed = len(self._nodes) - 1, (-anchor, still)
+                self._nodes.append((self._index[j], node, _compose(fixed, (anchor, _STILL)), m.jnt_axis[j].copy(), slide))
+                node, fixed = len(self._nodes) - 1, (-anchor, _STILL)
         self._last[body] = node, fixed
         return node, fixed
 

@@ -85,9 +85,15 @@ def in_one_line(learner: Learner) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        if not any(sign in str(error) for sign in ("RESOURCE_EXHAUSTED", "out of memory", "Failed to allocate")):
+        if not says_so(error):
             raise
         raise UserError(f"out of memory with {learner.cfg.num_envs} environments: pass a smaller --num-envs") from error
+
+
+def says_so(error: BaseException) -> bool:
+    """True of an error whose message tells that memory ran out."""
+    text = str(error).lower()
+    return any(sign in text for sign in ("resource_exhausted", "out of memory", "failed to allocate"))
 
 
 def program_bytes(program: Any) -> int | None:

@@ -175,10 +175,9 @@ class Learner:
             sim = jax.vmap(lambda key: env.draw(key)[0])(keys)
             return jax.vmap(env.physics.step)(sim, sim.ctrl)
 
-        if self._axis:
-            step = jax.shard_map(step, mesh=self._mesh, in_specs=_SPREAD, out_specs=_SPREAD, check_vma=False)
         keys = jax.random.split(jax.random.PRNGKey(0), self.cfg.num_envs)
         if self._axis:
+            step = jax.shard_map(step, mesh=self._mesh, in_specs=_SPREAD, out_specs=_SPREAD, check_vma=False)
             keys = jax.device_put(keys, NamedSharding(self._mesh, _SPREAD))
         lowered = jax.jit(step).lower(keys)
         return lambda: jax.block_until_ready(lowered.compile()(keys))

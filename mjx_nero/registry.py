@@ -74,8 +74,8 @@ def make(
     Args:
         env: one of ``list_envs()``.
         preset: one of ``list_presets(env)``.
-        impl: physics, ``auto``, ``jax`` or ``warp``.
-        num_envs: how many copies will be stepped together (sizes Warp's buffers).
+        impl: physics, one of ``physics.IMPLS``.
+        num_envs: how many copies will be stepped together (as in ``ManipulationEnv``).
         robot: another than the environment's own: a config, a name or the folder of an imported one.
         overrides: config fields by dotted name.
 

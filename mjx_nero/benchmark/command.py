@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.table import Table
 
-from mjx_nero import cli, config, evaluation, ppo, registry, run_folder, training, wrappers
+from mjx_nero import cli, config, evaluation, memory, ppo, registry, run_folder, training, wrappers
 from mjx_nero.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
 from mjx_nero.benchmark.program import Row
 from mjx_nero.env import EnvCfg, ManipulationEnv
@@ -186,19 +186,12 @@ def _measured(jobs: Iterable[_Job]) -> Iterator[Row]:
             yield from job.rows()
             continue
         except (MemoryError, RuntimeError) as error:
-            if not _is_memory(error):
+            if not (isinstance(error, MemoryError) or memory.says_so(error)):
                 raise
             message = (str(error) or type(error).__name__).splitlines()[0]
         full[job.what, job.impl] = job.size
         gc.collect()  # the traceback held the arrays
         yield job.failed(f"out of memory: {message}")
-
-
-def _is_memory(error: Exception) -> bool:
-    text = str(error).lower()
-    return isinstance(error, MemoryError) or any(
-        sign in text for sign in ("resource_exhausted", "out of memory", "failed to allocate")
-    )
 
 
 def _check_files(rows: pathlib.Path | None, picture: pathlib.Path | None, whats: list[str]) -> None:
