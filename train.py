@@ -16,7 +16,7 @@ def main(argv):
     )
     parser.add_argument("--preset", default="default", help="of the environment's presets (default: %(default)s)")
     parser.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
-    parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 8192 on a GPU, 128 on a CPU)")
+    parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 8192 on a GPU, 256 on a CPU)")
     parser.add_argument(
         "--num-devices", type=cli.positive, default=1, help="GPUs to spread the environments over (default: %(default)s)"
     )
@@ -27,7 +27,10 @@ def main(argv):
     )
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
     parser.add_argument(
-        "--impl", choices=IMPLS, default="auto", help="physics (default: warp where there is a GPU for it, else jax)"
+        "--impl",
+        choices=IMPLS,
+        default="auto",
+        help="physics (default: the first of warp, jax and native that suits the machine)",
     )
     parser.add_argument("--out", type=pathlib.Path, help="run folder (default: runs/<env>_<time>)")
     parser.add_argument("--restore", type=pathlib.Path, help="run folder or checkpoint to go on from, or a policy to start from")

@@ -92,7 +92,28 @@ class Episodes:
         }
 
 
-Runner = Callable[[Any, int], Episodes]  # (parameters of the policy, seed) -> finished episodes
+class Runner:
+    """(parameters of the policy, seed) -> finished episodes, by one compiled program.
+
+    Args:
+        run: jitted, (parameters, keys of the episodes, key) -> what ``Episodes`` is made of.
+        episodes: how many.
+    """
+
+    def __init__(self, run: Any, episodes: int):
+        self._run, self._episodes = run, episodes
+
+    def __call__(self, params: Any, seed: int) -> Episodes:
+        return _collect(*self._run(params, *_keys(seed, self._episodes)))
+
+    def compiler(self, params: Any) -> Callable[[], None]:
+        """Traces the program; the call that comes back compiles it, in any thread."""
+        lowered = self._run.lower(params, *_keys(0, self._episodes))
+
+        def compile() -> None:
+            self._run = lowered.compile()
+
+        return compile
 
 
 def wilson(successes: float, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -145,7 +166,7 @@ def runner(env: ManipulationEnv, act: Act | Agent, episodes: int, record: int = 
         ((_, totals, _), memory), frames = jax.lax.scan(step, (start, agent.init(start[0])), keys)
         return totals, frames, memory
 
-    return lambda params, seed: _collect(*run(params, *_keys(seed, episodes)))
+    return Runner(run, episodes)
 
 
 def _keys(seed: int, episodes: int) -> tuple[Key, Key]:

@@ -3,11 +3,13 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import importlib
 import json
 import pathlib
 import shlex
 import signal
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,6 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from mjx_nero import checkpoint, config, memory, policy, registry, render, rollout, wrappers
 from mjx_nero.env import EnvCfg, ManipulationEnv
 from mjx_nero.physics import compiler_options
+from mjx_nero.physics.mjx_warp import WarpPhysics
 from mjx_nero.ppo import PRESETS, Learner, PpoCfg, TrainState
 from mjx_nero.run_folder import RunFolder
 from mjx_nero.types import UserError
@@ -96,18 +99,21 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         memory.in_one_line(learner),
         _threads() as side_by_side,  # compilers work without Python's lock
     ):
-        evaluate = _evaluator(run, learner)
-        loading = side_by_side.submit(learner.physics_loader()) if env.impl == "warp" else None
+        side_by_side.submit(importlib.import_module, "tensorboardX")  # seconds where it finds PyTorch
+        waiting = []
+        if isinstance(env.physics, WarpPhysics):
+            waiting.append(side_by_side.submit(env.physics.load, ppo.num_envs // run.num_devices, run.num_devices))
+        evaluate = Evaluator(run, learner)
         state = _initial_state(learner, run.seed, source)
         if state.iteration >= iterations:
             made = int(state.iteration) * learner.steps_per_iteration
             raise UserError(f"{source} has made its {made:,} steps already: pass a larger --num-timesteps")
-        playing = side_by_side.submit(evaluate, learner.on_one_device(state))
+        waiting.append(side_by_side.submit(evaluate.compiler(learner.on_one_device(state))))
         advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile(compiler_options(env.impl))
         memory.check_compiled(learner, advance)
-        first = playing.result()
-        if loading:
-            loading.result()
+        for work in waiting:
+            work.result()
+        first = evaluate(learner.on_one_device(state))
     compile_s = time.perf_counter() - started
     spread = f" on {run.num_devices} devices" if run.num_devices > 1 else ""
     console.print(
@@ -293,12 +299,20 @@ def _act(learner: Learner) -> rollout.Act:
     return lambda params, obs, _: policy.make_act(learner.networks, params)(obs)
 
 
-def _evaluator(run: RunCfg, learner: Learner):
+class Evaluator:
     """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo C where there is no accelerator."""
-    impl = "native" if jax.default_backend() == "cpu" else run.impl
-    env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
-    play = rollout.runner(env, _act(learner), run.eval_episodes)
-    return lambda state: play((state.normalizer, state.params), run.seed).summary()
+
+    def __init__(self, run: RunCfg, learner: Learner):
+        impl = "native" if jax.default_backend() == "cpu" else run.impl
+        env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
+        self._seed, self._runner = run.seed, rollout.runner(env, _act(learner), run.eval_episodes)
+
+    def compiler(self, state: TrainState) -> Callable[[], None]:
+        """See ``rollout.Runner.compiler``."""
+        return self._runner.compiler((state.normalizer, state.params))
+
+    def __call__(self, state: TrainState) -> dict[str, Any]:
+        return self._runner((state.normalizer, state.params), self._seed).summary()
 
 
 def _initial_state(learner: Learner, seed: int, source: pathlib.Path | None) -> TrainState:

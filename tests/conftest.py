@@ -30,6 +30,8 @@ _CHECKED = (
 )
 _CHECKED += ("physics.native", "robots", "rollout", "scene", "tasks", "terms", "urdf", "view")
 _CHECKED += ("control.controller", "control.gripper", "control.ik")
+# Most of the tests' time is XLA's. Set for the processes that tests start, too.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

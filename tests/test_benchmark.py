@@ -187,7 +187,7 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     """Evaluations come every 20 steps; of three seeds one succeeds at the second, one at the first, one never."""
     runs = Runs([[0.0, 0.5, 0.95, 1.0, 1.0], [0.2, 1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.2, 0.9, 0.94]])
     monkeypatch.setattr(learning, "make_learner", lambda run: runs)
-    monkeypatch.setattr(learning.training, "_evaluator", lambda run, learner: runs.evaluate)
+    monkeypatch.setattr(learning.training, "Evaluator", lambda run, learner: runs.evaluate)
     argv = ["--what", "learning", "--num-envs", 8, "--impl", "native", "--seeds", 3, "--num-timesteps", 70, "--eval-every", 29]
     code, out, _ = call("benchmark", *argv, "--json", "rows.json")
     *seeds, summary = json.loads((tmp_path / "rows.json").read_text())["rows"]

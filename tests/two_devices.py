@@ -105,23 +105,6 @@ def test_environments_are_spread_and_the_rest_is_everywhere(learners, after):
     assert all(len(x.devices()) == 1 for x in jax.tree.leaves((local.params, local.normalizer)))
 
 
-def test_every_device_loads_its_physics(env, learners, monkeypatch):
-    """By a step of its own share of the environments: there Warp loads its kernels, before training."""
-    called = []
-
-    class Counting(Kinematic):
-        def step(self, sim, ctrl):
-            jax.debug.callback(lambda index, _: called.append(int(index)), jax.lax.axis_index("devices"), sim.time)
-            return super().step(sim, ctrl)
-
-    monkeypatch.setattr(env.unwrapped, "physics", Counting())
-    load = learners[1].physics_loader()
-    assert called == []
-    load()
-    jax.effects_barrier()
-    assert sorted(called) == [0] * 4 + [1] * 4
-
-
 def test_devices_act_with_noise_of_their_own(env):
     learner = Learner(env, SMALL, 2)
     fresh = jax.jit(learner.init)(KEY)
@@ -145,11 +128,15 @@ def test_a_checkpoint_goes_on_with_as_many_devices_and_with_others(learners, run
 def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
     """Its evaluations get the policy on one device, as their program is for one."""
 
-    def evaluate(state):
-        assert all(len(x.devices()) == 1 for x in jax.tree.leaves((state.normalizer, state.params)))
-        return {"success_rate": 0.0, "return_mean": 0.0}
+    class Evaluator(training.Evaluator):
+        def __call__(self, state):
+            assert all(len(x.devices()) == 1 for x in jax.tree.leaves((state.normalizer, state.params)))
+            return {"success_rate": 0.0, "return_mean": 0.0}
 
-    monkeypatch.setattr(training, "_evaluator", lambda run, learner: evaluate)
+        def compiler(self, state):
+            return lambda: self(state)
+
+    monkeypatch.setattr(training, "Evaluator", Evaluator)
     monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
     sizes = {"num_envs": 16, "num_minibatches": 2, "unroll_length": 4, "network.actor": (8,), "network.critic": (8,)}
 

@@ -35,7 +35,7 @@ def measure_learning(run: training.RunCfg, seeds: int, target: float) -> Iterato
     state = learner.place(init(jax.random.PRNGKey(0)))
     lowered = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk)
     advance = lowered.compile(compiler_options(impl))
-    evaluate = training._evaluator(run, learner)
+    evaluate = training.Evaluator(run, learner)
     state, _ = jax.block_until_ready(advance(state))  # loads what the backend compiles at its first call
     evaluate(learner.on_one_device(state))
     compile_s = time.perf_counter() - begun

@@ -43,10 +43,7 @@ class WarpPhysics:
         # Called by XLA on the stream that it computes on. No graph mode of Warp's: it would capture these copies for every set of
         # addresses that XLA comes up with, where one graph of the steps between them does.
         def control_step(qpos, qvel, ctrl, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out):
-            key = (str(wp.get_device()), qpos.shape[0])
-            if key not in self._made:
-                self._made[key] = self._make(qpos.shape[0])
-            data, run, _ = self._made[key]
+            data, run, _ = self._get(qpos.shape[0])
             wp.copy(data.qpos, qpos)
             wp.copy(data.qvel, qvel)
             wp.copy(data.ctrl, ctrl)
@@ -93,6 +90,27 @@ class WarpPhysics:
             sizes = {"naconmax": cfg.contacts_per_env, "njmax": cfg.constraints_per_env}
             return size(mujoco_warp.make_data(self.model, 1, **sizes))
 
+    def load(self, n: int, num_devices: int = 1) -> None:
+        """Makes ready what ``step`` needs for ``n`` environments on each of the first GPUs.
+
+        ``step`` would do it, too, but inside a JAX program, and for as long as that runs XLA's autotuner lets no other program
+        for that GPU be compiled. This here may run in a thread beside it.
+        """
+        import warp as wp
+
+        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
+            with wp.ScopedDevice(device):
+                self._get(n)
+                wp.synchronize_device(device)
+
+    def _get(self, n: int) -> tuple[Any, Callable[[], None], Any]:
+        import warp as wp
+
+        key = (str(wp.get_device()), n)
+        if key not in self._made:
+            self._made[key] = self._make(n)
+        return self._made[key]
+
     def _make(self, n: int) -> tuple[Any, Callable[[], None], Any]:
         """MuJoCo Warp's data for ``n`` environments on the current device, what steps them, and what that needs to be kept."""
         import warp as wp
@@ -116,7 +134,17 @@ class WarpPhysics:
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, run, run
-        run()  # loads the kernels, which cannot be done while a graph is captured
+        _load_kernels()
+        run()  # loads those made for this model, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
         return data, lambda: wp.capture_launch(capture.graph), run
+
+
+def _load_kernels() -> None:
+    """Compiles the parts of MuJoCo Warp that every model needs side by side; a first run would do it one after another."""
+    import warp as wp
+    from mujoco.mjx.third_party.mujoco_warp._src import constraint, derivative, forward, passive, smooth, support
+
+    parts = (constraint, derivative, forward, passive, smooth, support)
+    wp.force_load(wp.get_device(), [wp.get_module(part.__name__) for part in parts], max_workers=len(parts))
