@@ -103,13 +103,17 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         waiting = []
         if isinstance(env.physics, WarpPhysics):
             waiting.append(side_by_side.submit(env.physics.load, ppo.num_envs // run.num_devices, run.num_devices))
-        evaluate = Evaluator(run, learner)
-        state = _initial_state(learner, run.seed, source)
+        starting = side_by_side.submit(_initial_state, learner, run.seed, source)
+        shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
+        program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
+        state = starting.result()
         if state.iteration >= iterations:
             made = int(state.iteration) * learner.steps_per_iteration
             raise UserError(f"{source} has made its {made:,} steps already: pass a larger --num-timesteps")
+        compiling = side_by_side.submit(program.compile, compiler_options(env.impl))
+        evaluate = Evaluator(run, learner)
         waiting.append(side_by_side.submit(evaluate.compiler(learner.on_one_device(state))))
-        advance = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(state, chunk).compile(compiler_options(env.impl))
+        advance = compiling.result()
         memory.check_compiled(learner, advance)
         for work in waiting:
             work.result()
@@ -300,10 +304,10 @@ def _act(learner: Learner) -> rollout.Act:
 
 
 class Evaluator:
-    """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo C where there is no accelerator."""
+    """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo's C library unless on Warp."""
 
     def __init__(self, run: RunCfg, learner: Learner):
-        impl = "native" if jax.default_backend() == "cpu" else run.impl
+        impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
         env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
         self._seed, self._runner = run.seed, rollout.runner(env, _act(learner), run.eval_episodes)
 

@@ -229,7 +229,7 @@ def drift(qpos) -> tuple[float, float]:
 
 
 def test_a_cube_at_rest_stays(env, native, reach):
-    """For three seconds. In single precision it turns and creeps a little while it settles, and may once be jolted into the air."""
+    """For three seconds. In single precision it turns and creeps a little while it settles, and may be jolted once."""
     _, sims = reach
     moved, turned = drift(sims.qpos)
     assert moved < 5e-4 and turned < 0.03

@@ -8,6 +8,7 @@ import signal
 import imageio.v3 as imageio
 import jax
 import mujoco
+import numpy as np
 import pytest
 
 from mjx_nero import checkpoint, cli, policy, render, training
@@ -171,7 +172,12 @@ def test_what_a_machine_without_a_gpu_trains():
 
 def test_ctrl_c_while_native_physics_runs(call, tmp_path, monkeypatch):
     """JAX wraps what happens in a callback in an error of its own."""
-    monkeypatch.setattr(NativePhysics, "_step", lambda self, packed: os.kill(os.getpid(), signal.SIGINT))
+
+    def step(self, packed):
+        os.kill(os.getpid(), signal.SIGINT)
+        return np.zeros((*packed.shape[:-1], self._sizes[2]), np.float32)
+
+    monkeypatch.setattr(NativePhysics, "_step", step)
     code, out, err = call("eval", "--agent", "zero", "--episodes", 8, "--impl", "native", "--json", "result.json")
     assert (code, out, list(tmp_path.iterdir())) == (130, "", [])
     assert err.endswith("interrupted\n") and "Traceback" not in err

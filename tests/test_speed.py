@@ -17,6 +17,7 @@ import mjx_nero
 from mjx_nero import ppo, training, wrappers
 from mjx_nero.benchmark import throughput
 from mjx_nero.benchmark.program import Program
+from mjx_nero.physics.mjx_jax import JaxPhysics
 
 NUM_ENVS, ROUNDS = 128, 9
 
@@ -29,10 +30,20 @@ class Still:
 
 
 @pytest.fixture(scope="module")
-def costs(env, mjx_step) -> dict[str, list[float]]:
+def optimised():
+    """XLA's optimisations, which the other tests do without."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(scope="module")
+def costs(env, optimised) -> dict[str, list[float]]:
     """CPU seconds an env step, one entry a round."""
     if jax.default_backend() != "cpu":
         pytest.skip("on an accelerator the CPU's seconds tell little")
+    mjx_step = jax.jit(jax.vmap(JaxPhysics(env.physics_model, env.cfg.sim).step))
     native = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
     still = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
     still.__dict__["physics"] = Still()
@@ -43,7 +54,7 @@ def costs(env, mjx_step) -> dict[str, list[float]]:
         "step": throughput.step(native, 25),
         "terms": throughput.step(still, 100),
         "ppo": throughput.training(ppo.Learner(wrappers.for_training(native), cfg), 1),
-        "mjx": Program(lambda sim, key: (mjx_step(sim, sim.ctrl), {}), sim, 8),
+        "mjx": Program(lambda sim, key: (mjx_step(sim, sim.ctrl)[0], {}), sim, 8),
     }
     programs["mjx"].run()  # compiles
     found: dict[str, list[float]] = {name: [] for name in programs}
