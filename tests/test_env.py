@@ -561,7 +561,7 @@ def test_observations_by_name(follow):
     state = follow.reset(jax.random.PRNGKey(0))
     named = follow.env.named_observations(state)
     assert list(named) == ["state"] and list(named["state"]) == list(follow.env.cfg.observations["state"])
-    np.testing.assert_allclose(jnp.concatenate(list(named["state"].values())), state.obs["state"], rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(jnp.concatenate(list(named["state"].values())), state.obs["state"])
     np.testing.assert_array_equal(named["state"]["target_orientation"], [0, 0, 1, 0])
 
 
