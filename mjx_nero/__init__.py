@@ -2,34 +2,74 @@
 
 import contextlib
 import ctypes
-import io
+import importlib
 import os
 import sys
 from importlib import metadata
+from typing import TYPE_CHECKING, Any
 
-# Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one batched
-# step takes seconds instead of milliseconds), and its concurrent scheduler can deadlock where physics and networks share a
-# loop. Later versions have neither, and the newest abort on the first flag, so both are set for the old ones alone, before the
-# first JAX computation.
-if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
-    for _flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
-        if _flag not in os.environ.get("XLA_FLAGS", ""):
-            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{_flag}=false".strip()
+if TYPE_CHECKING:
+    from mjx_nero.envs.env import ManipulationEnv
+    from mjx_nero.envs.registry import env_cfg, list_envs, list_presets, list_robots, make
+    from mjx_nero.envs.task import EnvCfg
+    from mjx_nero.errors import UserError
+    from mjx_nero.guests import register
 
-# MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
-if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
-    for _gl, _library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8"), ("osmesa", "libOSMesa.so.6")):
-        with contextlib.suppress(OSError):
-            ctypes.CDLL(_library)
-            os.environ["MUJOCO_GL"] = _gl
-            break
+__version__ = "0.5.0"
+__all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make", "register"]
 
-with contextlib.redirect_stdout(io.StringIO()):  # without Warp, which only GPUs need, MJX prints that it is missing
-    import mujoco.mjx  # noqa: F401
+# Public name -> the module that has it. Loaded at its first use: JAX, MuJoCo and Brax take seconds.
+_HOME = {
+    "EnvCfg": "mjx_nero.envs.task",
+    "ManipulationEnv": "mjx_nero.envs.env",
+    "UserError": "mjx_nero.errors",
+    "register": "mjx_nero.guests",
+    **dict.fromkeys(("env_cfg", "list_envs", "list_presets", "list_robots", "make"), "mjx_nero.envs.registry"),
+}
 
-from mjx_nero.env import EnvCfg, ManipulationEnv
-from mjx_nero.registry import env_cfg, list_envs, list_presets, list_robots, make
-from mjx_nero.types import UserError
 
-__version__ = "0.4.0"
-__all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make"]
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'mjx_nero' has no attribute {name!r}")
+    try:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+    except ModuleNotFoundError as error:
+        raise ImportError(missing(error), name=error.name) from None
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def missing(error: ModuleNotFoundError) -> str:
+    """What to do where a package is not installed; one line."""
+    package = (error.name or str(error)).partition(".")[0]
+    return (
+        f"{sys.executable} does not have the package {package!r}: activate the environment that mjx_nero was installed into "
+        "(. .venv/bin/activate), or install it (pip install -e .)"
+    )
+
+
+def _prepare() -> None:
+    """Sets what JAX and MuJoCo read from the environment when they start."""
+    # Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one
+    # batched step takes seconds instead of milliseconds), and its concurrent scheduler can deadlock where physics and networks
+    # share a loop. Later versions have neither, and the newest abort on the first flag, so both are set for the old ones alone,
+    # before the first JAX computation.
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
+            for flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
+                if flag not in os.environ.get("XLA_FLAGS", ""):
+                    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{flag}=false".strip()
+    # MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
+    if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
+        for gl, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8"), ("osmesa", "libOSMesa.so.6")):
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(library)
+                os.environ["MUJOCO_GL"] = gl
+                break
+
+
+_prepare()

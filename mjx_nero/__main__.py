@@ -1,37 +1,54 @@
-"""What a model needs before it learns: python -m mjx_nero COMMAND ... (each has its --help)."""
+"""All commands: python -m mjx_nero COMMAND ..., or mjx-nero COMMAND ... (each has its --help)."""
 
 import importlib
 from collections.abc import Sequence
+from typing import NoReturn
 
-from mjx_nero import cli, config
-from mjx_nero.types import UserError
+from mjx_nero import cli, values
+from mjx_nero.errors import UserError
 
 # command -> (module, function of the arguments, what it does)
 COMMANDS = {
-    "list-envs": ("mjx_nero.inspection.command", "list_envs_main", "the environments: task, robot, sizes"),
+    "train": ("mjx_nero.tools.train", "main", "train a policy"),
+    "eval": ("mjx_nero.tools.eval", "main", "play and measure a policy or a controller"),
+    "view": ("mjx_nero.tools.view", "main", "environments in a browser: watch them and take part"),
+    "export": ("mjx_nero.tools.export", "main", "a policy as ONNX, with all that a runtime has to know"),
+    "robustness": ("mjx_nero.tools.robustness", "main", "a policy's success over the range of each parameter of the world"),
+    "benchmark": ("mjx_nero.tools.benchmark", "main", "what this machine does in a second"),
+    "results": ("mjx_nero.tools.results", "main", "how every environment learns, and what the policies that ship achieve"),
+    "list-envs": ("mjx_nero.tools.inspection.command", "list_envs_main", "the environments: task, robot, sizes"),
     "inspect": (
-        "mjx_nero.inspection.command",
+        "mjx_nero.tools.inspection.command",
         "main",
         "a robot, a model folder or an environment: joints, gains, contacts",
     ),
-    "import-urdf": ("mjx_nero.urdf.command", "main", "a model folder from a URDF"),
-    "tune-gains": ("mjx_nero.tuning", "main", "stiffness and damping from step responses"),
+    "import-urdf": ("mjx_nero.tools.import_urdf", "main", "a model folder from a URDF"),
+    "tune-gains": ("mjx_nero.tools.tuning", "main", "stiffness and damping from step responses"),
+    "record": ("mjx_nero.tools.identification", "record_main", "a log of a simulated arm's drives"),
+    "identify": ("mjx_nero.tools.identification", "identify_main", "a real arm's gains, friction, delay and offsets, from a log"),
+    "gripper-demo": ("mjx_nero.tools.gripper_demo", "main", "open and close a gripper, and plot its gap"),
 }
 
 
 def main(argv: Sequence[str]) -> None:
     """Hands the arguments to a command."""
-    lines = "\n".join(f"  {name:<12} {what}" for name, (_, _, what) in COMMANDS.items())
+    lines = "\n".join(f"  {name:<{max(map(len, COMMANDS))}}  {what}" for name, (_, _, what) in COMMANDS.items())
     if not argv or argv[0] in ("-h", "--help"):
         print(f"usage: python -m mjx_nero COMMAND ...\n\ncommands:\n{lines}")
         if not argv:
             raise UserError(f"name a command: {', '.join(COMMANDS)}")
         return
     if argv[0] not in COMMANDS:
-        raise UserError(f"unknown command {argv[0]!r}{config.hint(argv[0], COMMANDS)}: choose one of {', '.join(COMMANDS)}")
+        near = values.hint(argv[0], COMMANDS)
+        raise UserError(f"unknown command {values.short(argv[0])}{near}: choose one of {', '.join(COMMANDS)}")
     module, function, _ = COMMANDS[argv[0]]
     getattr(importlib.import_module(module), function)(argv[1:])
 
 
+def program(*command: str) -> NoReturn:
+    """The console script ``mjx-nero``, or one of its commands as a program of its own."""
+    cli.run(lambda argv: main([*command, *argv]))
+
+
 if __name__ == "__main__":
-    cli.run(main)
+    program()

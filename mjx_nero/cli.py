@@ -1,17 +1,25 @@
-"""Command-line plumbing shared by train.py, eval.py and the benchmark."""
+"""Command-line plumbing that all commands share. Imports neither JAX nor rich before they are needed."""
 
 import argparse
+import contextlib
+import importlib
+import importlib.util
 import logging
 import os
 import pathlib
+import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NoReturn
+import textwrap
+import traceback
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from importlib import metadata
+from typing import Annotated, Any, NoReturn
 
-from rich.console import Console
+import mjx_nero
+from mjx_nero import bounds, cache, config, values
+from mjx_nero.errors import UserError
 
-from mjx_nero import config
-from mjx_nero.types import UserError
+LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 
 
 class Parser(argparse.ArgumentParser):
@@ -20,51 +28,164 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **kwargs: Any):
         super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
 
+    def add_environment(self, names: Iterable[str], default: str = "nero_lift") -> None:
+        """``--load``, ``--env``, ``--preset`` and ``--robot``: what an environment is made of.
+
+        Args:
+            names: of all environments.
+        """
+        self.add_load()
+        self.add_argument("--env", default=default, help=f"environment: {', '.join(names)} (default: %(default)s)")
+        self.add_argument("--preset", default="default", help="of the environment's presets (default: %(default)s)")
+        self.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
+
+    def add_load(self) -> None:
+        """``--load``: outside code, run before the other flags are read for what they name."""
+        self.add_argument(
+            "--load",
+            action="append",
+            default=[],
+            metavar="FILE_OR_MODULE",
+            help="Python code that registers environments, robots, ... of its own (mjx_nero.register); may be given again",
+        )
+
+    def add_impl(self) -> None:
+        """``--impl``: who computes the physics."""
+        text = "physics: warp or jax, which are MJX, or native, MuJoCo's C library (default: the fastest of this machine's)"
+        self.add_argument("--impl", default="auto", help=text)
+
+    def add_seed(self, default: int, several: bool = False) -> None:
+        """``--seed`` and, if several may be given, ``--seeds``."""
+        group = self.add_mutually_exclusive_group()
+        group.add_argument("--seed", type=seed, default=default, help="random seed (default: %(default)s)")
+        if several:
+            text = "several, as in 0-7 or 0,3,5: a run each, one after another, and a table"
+            group.add_argument("--seeds", type=seeds, help=text)
+
+    def add_video(self) -> None:
+        """What a video is like. Without these flags: as good as the machine draws within half a minute."""
+        self.add_argument("--video-size", type=size, help="width and height in pixels, as in 1280x720 (default: by the machine)")
+        text = "frames a second (default: 25, or what the machine draws)"
+        self.add_argument("--video-fps", type=positive_float, default=0.0, help=text)
+        text = "robots side by side in one picture (default: one by one)"
+        self.add_argument("--video-envs", type=at_most(256), default=1, help=text)
+
     def error(self, message: str) -> NoReturn:
+        message = re.sub(r"^argument ([^\s:]+): (?=takes|must)", r"\1 ", message)  # ours read on from the flag's name
         raise UserError(f"{message} (see --help)")
 
-    def parse(self, argv: Sequence[str], prefixes: Sequence[str] = ()) -> tuple[argparse.Namespace, dict[str, dict[str, str]]]:
-        """Flags, and for each prefix the dotted ones: ``--env.sim.dt 0.005`` -> ``{"env": {"sim.dt": "0.005"}}``."""
+    def parse(
+        self,
+        argv: Sequence[str],
+        prefixes: Sequence[str] | Callable[[], Sequence[str]] = (),
+        cfgs: Callable[[argparse.Namespace], Mapping[str, Any]] | None = None,
+    ) -> tuple[argparse.Namespace, dict[str, dict[str, str]]]:
+        """Flags, and for each prefix the dotted ones: ``--env.sim.dt 0.005`` -> ``{"env": {"sim.dt": "0.005"}}``.
+
+        Args:
+            prefixes: a function is called when outside code is loaded, which may bring some.
+            cfgs: of the other flags; their fields are listed at the end of the help.
+        """
+        if cfgs and {"-h", "--help"} & set(argv):
+            others, _ = self.parse([word for word in argv if word not in ("-h", "--help")], prefixes)
+            self.epilog = fields_help(cfgs(others))
         args, rest = self.parse_known_args(argv)
-        dotted: dict[str, dict[str, str]] = {prefix: {} for prefix in prefixes}
+        if hasattr(args, "load"):
+            load_guests(args.load)
+        dotted: dict[str, dict[str, str]] = {prefix: {} for prefix in (prefixes() if callable(prefixes) else prefixes)}
         while rest:
-            flag, _, value = rest.pop(0).partition("=")
+            flag, equals, value = rest.pop(0).partition("=")
             prefix, _, name = flag.removeprefix("--").partition(".")
             if not flag.startswith("--") or prefix not in dotted or not name:
-                self.error(f"unknown argument {flag!r}")
-            if not value:
+                self.error(f"unknown argument {values.short(flag)}")
+            if not equals:
                 if not rest:
-                    self.error(f"{flag} needs a value")
+                    self.error(f"{values.short(flag)[1:-1]} needs a value")
                 value = rest.pop(0)
             dotted[prefix][name] = value
         return args, dotted
 
+    def given(self, argv: Sequence[str]) -> set[str]:
+        """Names of the flags in ``argv``, as they are called in what ``parse`` gives; dotted ones apart."""
+        missing = object()
+        absent = {action.dest: None if isinstance(action.default, list) else missing for action in self._actions}  # lists grow
+        found, _ = self.parse_known_args(argv, argparse.Namespace(**absent))
+        return {name for name, value in absent.items() if getattr(found, name, value) is not value}
+
+
+def load_guests(names: Sequence[str] = ()) -> None:
+    """Runs outside code, each once: what installed packages offer under the entry point ``mjx_nero``, and files or modules.
+
+    Raises:
+        UserError: there is no such file or module, or it fails.
+    """
+    for entry in metadata.entry_points(group="mjx_nero"):
+        with _blamed(f"{entry.name} ({entry.value})"):
+            entry.load()
+    for name in names:
+        with _blamed(name):
+            if not name.endswith(".py"):
+                if os.getcwd() not in sys.path:  # a module beside the user, as for python -m
+                    sys.path.insert(0, os.getcwd())
+                importlib.import_module(name)
+            elif (module := f"mjx_nero_guest_{pathlib.Path(name).resolve()}") not in sys.modules:
+                spec = importlib.util.spec_from_file_location(module, name)
+                assert spec and spec.loader
+                sys.modules[module] = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(sys.modules[module])
+
+
+@contextlib.contextmanager
+def _blamed(name: str) -> Iterator[None]:
+    """What goes wrong in outside code is its author's: one line that says where."""
+    try:
+        yield
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        where = "" if isinstance(error, UserError | FileNotFoundError) else f" ({frame.filename}:{frame.lineno})"
+        kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+        raise UserError(f"cannot load {name}: {kind}{' '.join(str(error).split())}{where}") from error
+
 
 def fields_help(cfgs: Mapping[str, Any]) -> str:
-    """The dotted flags of the configs, for the end of a help text."""
+    """The dotted flags of the configs, each with its default and what it is, for the end of a help text."""
     lines = ["any config field, with its default:"]
     for prefix, cfg in cfgs.items():
-        lines += [f"  --{prefix}.{name} {value!r}" for name, value in config.flatten(cfg).items()]
+        about = config.describe(cfg)
+        for name, value in config.flatten(cfg).items():
+            lines.append(f"  --{prefix}.{name} {value!r}")
+            lines += textwrap.wrap(about[name], 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
     return "\n".join(lines)
 
 
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     """Runs a program: mistakes of the user end in one line on stderr and exit status 2, Ctrl-C in 130."""
     try:
+        cache.check_addresses()
         main(sys.argv[1:])
         code = 0
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         code = 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("mjx_nero"):
+            raise
+        print(f"error: {mjx_nero.missing(error)}", file=sys.stderr)
+        code = 2
     except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+    except OSError as error:  # of a path that the user gave: too long a name, no permission, a full disk
+        print(f"error: {UserError(str(error))}", file=sys.stderr)
+        code = 2
     except BaseException as error:
         if not interrupted(error):
             raise
         print("interrupted", file=sys.stderr, flush=True)
         sys.stdout.flush()
-        os._exit(130)  # threads may be compiling still, and JAX before 0.11 crashes at the end of an interrupted compilation
+        os._exit(
+            getattr(error, "code", 130)
+        )  # threads may be compiling still, and JAX before 0.11 crashes at the end of an interrupted compilation
     sys.exit(code)
 
 
@@ -73,33 +194,101 @@ def interrupted(error: BaseException) -> bool:
     return isinstance(error, KeyboardInterrupt) or "CpuCallback error" in str(error) and "KeyboardInterrupt" in str(error)
 
 
-def console(highlight: bool = True) -> Console:
-    """For tables: as wide as the terminal, and wide enough for names where there is none."""
-    console = Console(highlight=highlight)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = 160  # a pipe has no width of its own, and rich would take 80
-    return console
-
-
 def setup_jax() -> None:
     """Settings for programs: full float32 products, and compiled code kept in the user's cache folder between runs."""
     import jax
 
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 in the physics or the learner costs success
-    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "mjx_nero"
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        jax.config.update("jax_compilation_cache_dir", str(cache / "jax"))
-    os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))  # Warp reads it at its first use
+    kept = cache.folder()
+    if kept:
+        if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+            jax.config.update("jax_compilation_cache_dir", str(kept / "jax"))
+            cache.heal(kept / "jax")
+        os.environ.setdefault("WARP_CACHE_PATH", str(kept / "warp"))  # Warp reads it at its first use
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # a run has dozens of small programs
     logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)  # what it logs it raises as well: Ctrl-C, say
 
 
-def positive(text: str) -> int:
-    """Argparse type: a whole number above 0; 1e6 and 1_000_000 are fine."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
-    if value < 1 or value != int(value):
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(value)
+def called_as(command: str) -> str:
+    """How the user called a command, to start a line to type: by its own program, the console script or the package."""
+    name = pathlib.Path(sys.argv[0]).name
+    if name == f"{command}.py":
+        return f"python {name}"
+    return f"mjx-nero {command}" if name == "mjx-nero" else f"python -m mjx_nero {command}"
+
+
+def number(kind: Any) -> Callable[[str], Any]:
+    """Argparse type: what ``values.read`` takes for the annotation ``kind``, within its ``bounds``."""
+
+    def read(text: str) -> Any:
+        try:
+            return values.read(kind, text, "")
+        except UserError as error:
+            raise argparse.ArgumentTypeError(str(error).strip()) from None
+
+    return read
+
+
+positive = number(bounds.Count)  # a whole number from 1; 1e6 is one, 1_000 is none
+positive_float = number(bounds.Positive)
+non_negative = number(bounds.NonNegative)
+share = number(Annotated[float, bounds.Bounds(0.0, 1.0, above=True)])
+seed = number(Annotated[int, bounds.Bounds(0)])  # below 2^63, like every whole number
+
+
+def choices(text: str, what: str, valid: Collection[str]) -> list[str]:
+    """A list of names, each once, with commas between them.
+
+    Raises:
+        UserError: one that is not among the valid, or none at all.
+    """
+    chosen = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    unknown = [name for name in chosen if name not in valid]
+    if unknown or not chosen:
+        raise UserError(f"unknown {what} {', '.join(unknown) or '(none)'}: choose from {', '.join(valid)}")
+    return chosen
+
+
+def seeds(text: str) -> tuple[int, ...]:
+    """Argparse type: seeds and ranges of seeds, as in ``0-7`` or ``0,3,5``."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        if not (first.isdecimal() and (last.isdecimal() or not dash)) or int(last or first) - int(first) not in range(1000):
+            raise argparse.ArgumentTypeError(f"takes seeds as in 0-7 or 0,3,5, got {values.short(text)}")
+        found += range(seed(first), seed(last or first) + 1)
+    if len(set(found)) < len(found):
+        raise argparse.ArgumentTypeError(f"takes each seed once, got {values.short(text)}")
+    return tuple(found)
+
+
+def at_most(most: int) -> Callable[[str], int]:
+    """Argparse type: a whole number from 1 to ``most``."""
+    return number(Annotated[int, bounds.Bounds(1, most)])
+
+
+def path(*suffixes: str) -> Callable[[str], pathlib.Path]:
+    """Argparse type: a path that a file system takes, with one of these suffixes if any are given (``.mp4``)."""
+
+    def read(text: str) -> pathlib.Path:
+        found = pathlib.Path(text)
+        if (
+            not text
+            or "\0" in text
+            or len(os.fsencode(text)) > 4096
+            or any(len(os.fsencode(p)) > LONGEST_NAME for p in found.parts)
+        ):
+            raise argparse.ArgumentTypeError(f"takes a path with names of at most {LONGEST_NAME} bytes, got {values.short(text)}")
+        if suffixes and found.suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"takes a name that ends in {' or '.join(suffixes)}, got {values.short(text)}")
+        return found
+
+    return read
+
+
+def size(text: str) -> tuple[int, int]:
+    """Argparse type: width and height in pixels, even as encoders want them."""
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if not found or any(int(n) % 2 for n in found.groups()):
+        raise argparse.ArgumentTypeError(f"takes even numbers of pixels as in 1280x720, got {values.short(text)}")
+    return int(found[1]), int(found[2])

@@ -1,21 +1,37 @@
-"""Frozen configs: dotted names, overrides with clear errors, JSON."""
+"""Frozen configs: dotted names, overrides with clear errors, JSON.
 
-import ast
+Flags are made from the configs themselves, and not by a library for command lines: which there are depends on the environment
+(its terms, by name), and one set of names, readers and messages serves ``make(**fields)`` and the files of robots too.
+"""
+
 import dataclasses
-import difflib
+import types
 import typing
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, TypeVar
 
-from mjx_nero.types import UserError
+from mjx_nero import bounds, docs
+from mjx_nero.errors import UserError
+from mjx_nero.values import UNTYPED, hint, hints, read, short
 
 Cfg = TypeVar("Cfg")
 
 
 def _children(node: Any) -> dict[str, Any] | None:
-    if dataclasses.is_dataclass(node):
+    if dataclasses.is_dataclass(node) and not isinstance(node, type):
         return {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
     return dict(node) if isinstance(node, Mapping) else None
+
+
+def freeze(cfg: Any) -> None:
+    """Makes the mappings of a frozen config read-only copies, those within them, too; for its ``__post_init__``."""
+    for field in dataclasses.fields(cfg):
+        if isinstance(value := getattr(cfg, field.name), Mapping):
+            object.__setattr__(cfg, field.name, _read_only(value))
+
+
+def _read_only(value: Any) -> Any:
+    return types.MappingProxyType({k: _read_only(v) for k, v in value.items()}) if isinstance(value, Mapping) else value
 
 
 def flatten(cfg: Any, prefix: str = "") -> dict[str, Any]:
@@ -36,67 +52,99 @@ def to_dict(cfg: Any) -> Any:
         return {name: to_dict(value) for name, value in children.items()}
     if isinstance(cfg, tuple | list):
         return [to_dict(value) for value in cfg]
-    return f"{cfg.__module__}.{cfg.__qualname__}" if callable(cfg) else cfg
+    function = bounds.unwrapped(cfg)
+    return f"{function.__module__}.{function.__qualname__}" if callable(cfg) else cfg
+
+
+def describe(cfg: Any) -> dict[str, str]:
+    """Dotted name -> what the field is, of every field that ``flatten`` lists; empty where its class does not say.
+
+    From the lines under ``Attributes:`` in the docstring of a config's class, or the comment behind the field; of a term's
+    parameter from the lines under ``Args:`` in its function's docstring, else from that docstring's first line.
+    """
+    return dict(_described(cfg, "", docs.fields(type(cfg)), ""))
+
+
+def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str) -> Iterator[tuple[str, str]]:
+    """
+    Args:
+        texts: of the entries of ``node``, by name.
+        inherited: what the field is that holds ``node``, where ``texts`` lacks an entry.
+    """
+    for name, value in (_children(node) or {}).items():
+        text = texts.get(name, inherited)
+        if _children(value) is None:
+            if not callable(value):
+                yield prefix + name, text
+        elif name == "params" and callable(func := getattr(node, "func", None)):
+            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"of {docs.summary(func)}")
+        elif dataclasses.is_dataclass(value):
+            yield from _described(value, f"{prefix}{name}.", docs.fields(type(value)), "")
+        else:
+            yield from _described(value, f"{prefix}{name}.", {}, text)
 
 
 def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
-    """A copy of ``cfg`` with fields changed by dotted name; strings are read as Python literals.
+    """A copy of ``cfg`` with fields changed by dotted name; values are read as ``read`` does.
 
     Raises:
         UserError: no such field (the message names the nearest ones), or a value of another type.
     """
     for name, value in changes.items():
-        cfg = _replace(cfg, name.split("."), value, name)
+        cfg = _replace(cfg, type(cfg), name.split("."), value, name)
     return cfg
 
 
-def hint(name: str, valid: Iterable[str]) -> str:
-    """The nearest valid name, for the end of a message; empty if none is near."""
-    near = difflib.get_close_matches(name, list(valid), n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
-
-
-def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
+def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> Any:
     head, *rest = path
     children = _children(node)
     if children is None or head not in children:
         valid = list(children or ())
-        raise UserError(f"no field {name!r}: {head!r} is not one of {', '.join(valid) or 'no fields'}{hint(head, valid)}")
-    old = children[head]
+        raise UserError(
+            f"no field {short(name)}: {short(head)} is not one of {', '.join(valid) or 'no fields'}{hint(head, valid)}"
+        )
+    old, kind = children[head], _kind(node, kind, head, children[head])
     if rest:
-        new = _replace(old, rest, value, name)
+        new = _replace(old, kind, rest, value, name)
+    elif dataclasses.is_dataclass(old) and not isinstance(value, type(old)):
+        raise UserError(
+            f"{name} takes {type(old).__name__}, or set its fields one by one ({name}.{next(iter(hints(type(old))))})"
+        )
     else:
-        new = _coerce(old, value, name, any_length=head in _any_length(node))
+        new = read(kind, value, name)
     if dataclasses.is_dataclass(node):
         return dataclasses.replace(node, **{head: new})  # type: ignore[type-var]
     return {**children, head: new}
 
 
-def _any_length(node: Any) -> set[str]:
-    """Fields declared ``tuple[x, ...]``."""
-    if not dataclasses.is_dataclass(node):
-        return set()
-    return {f.name for f in dataclasses.fields(node) if typing.get_args(f.type)[-1:] == (...,)}
+def _kind(node: Any, kind: Any, name: str, old: Any) -> Any:
+    """The declared type of an entry of ``node``, itself of ``kind``; of its present value where nothing is declared."""
+    found: Any = Any
+    if dataclasses.is_dataclass(node):
+        found = hints(type(node))[name]
+        if name == "params" and callable(func := getattr(node, "func", None)):
+            return parameters(func)  # of a term: what its function declares
+    elif isinstance(kind, dict):
+        found = kind.get(name, Any)
+    elif isinstance(origin := typing.get_origin(kind), type) and issubclass(origin, Mapping):
+        found = typing.get_args(kind)[1]
+    return _kind_of(old) if found in UNTYPED else found
 
 
-def _coerce(old: Any, value: Any, name: str, any_length: bool = False) -> Any:
-    """``value`` as the type of ``old``, the field's present value."""
-    if _children(old) is not None and not isinstance(value, str):
-        if type(value) is not type(old):
-            raise UserError(f"{name} takes a {type(old).__name__}, got {value!r}")
-        return value
-    if isinstance(value, str) and not isinstance(old, str):
-        try:
-            value = ast.literal_eval(value.strip().capitalize() if value.strip().lower() in ("true", "false", "none") else value)
-        except (ValueError, SyntaxError):
-            raise UserError(f"{name} takes a value like {old!r}, got {value!r}") from None
-    if isinstance(value, list):
-        value = tuple(value)
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if isinstance(old, tuple) and isinstance(value, tuple) and old and value and (any_length or len(value) == len(old)):
-        like = old[:1] * len(value) if any_length else old
-        return tuple(_coerce(o, v, name) for o, v in zip(like, value, strict=True))
-    if old is not None and value is not None and (type(value) is not type(old) or isinstance(old, tuple)):
-        raise UserError(f"{name} takes a value like {old!r}, got {value!r}")
-    return value
+def parameters(func: Callable) -> dict[str, Any]:
+    """Name -> declared type of a function's parameters, of those that can be read."""
+    try:
+        found = typing.get_type_hints(bounds.unwrapped(func), include_extras=True)
+    except (TypeError, NameError, SyntaxError, AttributeError):  # no function, or annotations that are none
+        return {}
+    return {
+        name: kind
+        for name, kind in found.items()
+        if kind in (float, int, bool, str) or typing.get_origin(kind) in (tuple, Annotated)
+    }
+
+
+def _kind_of(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple[tuple(_kind_of(item) for item in value)] if value else tuple[Any, ...]  # type: ignore[misc]
+    return type(value) if isinstance(value, float | int | str) or dataclasses.is_dataclass(value) else Any

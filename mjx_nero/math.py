@@ -38,6 +38,12 @@ def quat_from_euler(roll: Float[Array, ""], pitch: Float[Array, ""], yaw: Float[
     return quat_mul(axis_angle(z, yaw), quat_mul(axis_angle(y, pitch), axis_angle(x, roll)))
 
 
+def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
+    """The turn about the vertical of a frame that stands upright, or nearly so [rad]."""
+    w, x, y, z = quat
+    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 def quat_conj(quat: Float[Array, "4"]) -> Float[Array, "4"]:
     """The inverse rotation."""
     return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
@@ -51,6 +57,16 @@ def quat_log(quat: Float[Array, "4"]) -> Float[Array, "3"]:
     small = square < 1e-8
     sine = jnp.sqrt(jnp.where(small, 1.0, square))
     return v * jnp.where(small, 2.0, 2.0 * jnp.arctan2(sine, quat[0]) / sine)
+
+
+def quat_exp(vec: Float[Array, "3"]) -> Float[Array, "4"]:
+    """The quaternion of a rotation vector (axis times angle) [rad]: the inverse of ``quat_log``."""
+    square = vec @ vec
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    return jnp.concatenate(
+        [jnp.where(small, 1.0, jnp.cos(angle / 2))[None], vec * jnp.where(small, 0.5, jnp.sin(angle / 2) / angle)]
+    )
 
 
 def rotation_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -83,3 +99,17 @@ def solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n
     for i in reversed(range(n)):
         x[i] = (y[i] - sum(low[k][i] * x[k] for k in range(i + 1, n))) / low[i][i]
     return jnp.stack(x)
+
+
+def box_distance(
+    point: Float[Array, "3"], pos: Float[Array, "3"], quat: Float[Array, "4"], size: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """From a point to the surface of a box, negative within [m].
+
+    Args:
+        pos, quat: where the box's centre is, and how it is turned (wxyz).
+        size: its edges [m].
+    """
+    beyond = jnp.abs(rotate(quat_conj(quat), point - pos)) - size / 2
+    outside = jnp.maximum(beyond, 0.0)
+    return jnp.sqrt(jnp.sum(outside**2) + 1e-12) + jnp.minimum(jnp.max(beyond), 0.0)

@@ -3,14 +3,14 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from mjx_nero.errors import UserError as UserError
+
 Key = jax.Array  # a JAX random key
-
-
-class UserError(ValueError):
-    """A mistake that the user can mend. Its message is one line that says what is wrong and what to do."""
+TARGET = "target"  # in ``View.objects``: the one of ``EnvCfg.targets`` that the episode commands
 
 
 @struct.dataclass
@@ -25,6 +25,10 @@ class Sim:
     ctrl: Float[Array, " nu"]  # the position targets now in force [rad or m]
     warmstart: Float[Array, " nv"]  # the solver's last acceleration, its next first guess
     time: Float[Array, ""]  # since the start of the episode [s]
+    # The model's fields that differ from world to world, by MuJoCo's names; the others are the compiled model's.
+    fields: dict[str, Array] = struct.field(default_factory=dict)
+    # What ``sim.touch`` measured in the last control step [N]; None: the scene does not ask for it.
+    touch: Float[Array, ""] | None = None
 
 
 @struct.dataclass
@@ -36,8 +40,45 @@ class Carry:
     action: Float[Array, " na"]  # the last action, as the policy gave it
     command: Float[Array, "3"]  # goal, robot root frame [m]
     command_quat: Float[Array, "4"]  # its orientation, wxyz
-    hold: Int[Array, ""]  # consecutive control steps, up to now, of success
-    grasp_time: Float[Array, ""]  # when the object was first held off the table [s]; inf: not yet
+    memory: dict[str, Any]  # of the terms that remember, by their dotted names in the task
+
+
+@struct.dataclass
+class DelayMemory:
+    """What ``mdp.memory.Delay`` remembers."""
+
+    rng: Key
+    lag: Int[Array, ""]  # [control steps]
+    past: Array  # [longest delay, ...], the newest first
+
+
+@struct.dataclass
+class Start:
+    """The start of an episode, as the reset events make it. Objects by name."""
+
+    joint_pos: Float[Array, " nj"]  # arm joints, then gripper joints [rad, m]
+    object_pos_w: dict[str, Float[Array, "3"]]  # [m]
+    object_quat_w: dict[str, Float[Array, "4"]]  # wxyz
+    target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``EnvCfg.targets``
+
+
+@struct.dataclass
+class ObjectView:
+    """An object of the scene, as terms may read it."""
+
+    pos_w: Float[Array, "3"]  # [m]
+    quat_w: Float[Array, "4"]  # wxyz
+    linvel_w: Float[Array, "3"]  # [m/s]
+    angvel_local: Float[Array, "3"]  # in the object's own frame [rad/s]
+
+
+@struct.dataclass
+class ObstacleView:
+    """A box that stands still, as terms may read it."""
+
+    pos_w: Float[Array, "3"]  # of its centre [m]
+    quat_w: Float[Array, "4"]  # wxyz
+    size: Float[Array, "3"]  # its edges [m]
 
 
 @struct.dataclass
@@ -54,10 +95,7 @@ class View:
     ctrl: Float[Array, " nu"]
     ee_pos_w: Float[Array, "3"]  # grasp point between the fingers [m]
     ee_quat_w: Float[Array, "4"]
-    object_pos_w: Float[Array, "3"]  # the cube; in a scene without one the goal itself is the object
-    object_quat_w: Float[Array, "4"]
-    object_linvel_w: Float[Array, "3"]  # [m/s]
-    object_angvel_local: Float[Array, "3"]  # in the object's own frame [rad/s]
+    objects: dict[str, ObjectView]  # by name; the one that is commanded, where an episode chooses one, as ``TARGET``, too
     root_pos_w: Float[Array, "3"]
     command: Float[Array, "3"]  # goal in the robot's root frame, as drawn [m]
     goal_pos_w: Float[Array, "3"]  # where it is now: a goal may move
@@ -66,7 +104,12 @@ class View:
     action: Float[Array, " na"]  # this step's action
     last_action: Float[Array, " na"]  # the step's before
     step: Int[Array, ""]  # control steps since the start of the episode
+    time: Float[Array, ""]  # since the start of the episode [s]
+    # What the encoders read beside ``joint_pos`` [rad, m]; None: nothing.
+    encoder_bias: Float[Array, " nj"] | None = None
+    obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
+    # The strongest contact with an obstacle, or of the robot with itself, in this step [N]; None: the scene does not ask for it.
+    touch: Float[Array, ""] | None = None
+    # Which of ``EnvCfg.targets`` is commanded; None: there are none.
+    target: Int[Array, ""] | None = None
     max_steps: int = struct.field(pytree_node=False, default=0)
-
-
-Params = dict[str, Any]

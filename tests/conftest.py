@@ -1,7 +1,7 @@
 """Shared by all tests: type checks at run time, a compilation cache, and the few compiled functions that cost time."""
 
+import functools
 import getpass
-import importlib.util
 import os
 import pathlib
 import sys
@@ -13,23 +13,28 @@ import pytest
 pytest.register_assert_rewrite("model_checks")  # a helper's assertions show their values, as a test's do
 
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
-# ``types``, ``ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes them
-# with a batch axis; and ``physics.mjx_warp``, of whose functions Warp reads the annotations.
+# ``types``, ``learn.ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes
+# them with a batch axis; and ``sim.physics.mujoco_warp``, of whose functions Warp reads the annotations.
 _CHECKED = (
-    "arms",
-    "checkpoint",
     "config",
-    "env",
-    "kinematics",
     "math",
     "mdp",
-    "physics.mjx_jax",
-    "policy",
-    "registry",
-    "robot_file",
+    "sim.robot",
+    "sim.robot_file",
+    "sim.scene",
+    "sim.linkage",
+    "sim.kinematics",
+    "sim.physics.mjx",
+    "sim.physics.native",
+    "control.controller",
+    "control.gripper",
+    "control.ik",
+    "envs",
+    "urdf",
+    "learn.checkpoint",
+    "learn.policy",
+    "learn.rollout",
 )
-_CHECKED += ("physics.native", "robots", "rollout", "scene", "tasks", "terms", "urdf", "view")
-_CHECKED += ("control.controller", "control.gripper", "control.ik")
 # Most of the tests' time is XLA's. Set for the processes that tests start, too.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
@@ -37,8 +42,9 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero import __main__, benchmark, cli, wrappers  # noqa: E402
-from mjx_nero.physics.mjx_jax import JaxPhysics  # noqa: E402
+from mjx_nero import __main__, cli  # noqa: E402
+from mjx_nero.envs import wrappers  # noqa: E402
+from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
@@ -111,16 +117,9 @@ def finish(env) -> Finish:
     return Finish(env)
 
 
-def load(name: str):
-    """The ``main`` of a program of the root folder."""
-    path = pathlib.Path(__file__).resolve().parents[1] / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(f"program_{name}", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main
-
-
-MAINS = {"train": load("train"), "eval": load("eval"), "benchmark": benchmark.main, "mjx_nero": __main__.main}
+PROGRAMS = ("train", "eval", "benchmark")
+MAINS = {"mjx_nero": __main__.main}
+MAINS |= {name: functools.partial(lambda name, argv: __main__.main([name, *argv]), name) for name in PROGRAMS}
 
 
 @pytest.fixture
@@ -132,7 +131,7 @@ def call(monkeypatch, capfd, tmp_path):
     monkeypatch.setenv("COLUMNS", "200")
 
     def run(program, *argv):
-        monkeypatch.setattr(sys, "argv", [program, *map(str, argv)])
+        monkeypatch.setattr(sys, "argv", [f"{program}.py" if program in PROGRAMS else program, *map(str, argv)])
         capfd.readouterr()
         with pytest.raises(SystemExit) as stop:
             cli.run(MAINS[program])

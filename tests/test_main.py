@@ -19,7 +19,7 @@ def test_commands_have_help_of_their_own(call, command):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "name a command: list-envs"),
+        ([], "name a command: train, eval"),
         (["inspct", "nero"], "unknown command 'inspct' (did you mean 'inspect'?)"),
         (["inspect"], "the following arguments are required: name"),
         (["inspect", "nero", "--rendr", "x"], "unknown argument '--rendr'"),

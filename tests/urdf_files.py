@@ -8,6 +8,9 @@ from lxml import etree
 
 NERO = Path(__file__).resolve().parents[1] / "assets" / "nero" / "nero.xml"
 
+ROOM = 'lower="-2.9" upper="2.9" effort="80" velocity="2"'
+SLIDE = {"type": "prismatic", "limit": 'lower="0.01" upper="0.05" effort="20" velocity="0.2"'}
+
 # Joint frames, axes, limits and masses of AgileX's Piper with gripper (piper_gripper.urdf of agilexrobotics/Agilex-College).
 # link, joint, type, parent, xyz, rpy, axis, limits, mass
 _PIPER = """
@@ -73,6 +76,36 @@ def arm(joints: int = 3, *more: str) -> str:
     axes = ("0 0 1", "0 1 0")
     chain = [joint(f"j{i + 1}", names[i], names[i + 1], xyz="0 0 0.2", axis=axes[i % 2]) for i in range(joints)]
     return robot(*links, *chain, *more)
+
+
+def six(root: str = "base", tag: str = "", foot: str = "0 0 0.1", elbow: str = ROOM) -> list[str]:
+    """Six joints ``a1`` ... with a wrist whose last axis runs along the tool: reach 0.7 m beyond the shoulder."""
+    axes = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+    frames = (foot, "0 0 0.1", "0 0 0.35", "0 0 0.15", "0 0 0.15", "0 0 0.05")
+    names = [root, *(f"{tag}link{i}" for i in range(1, 7))]
+    parts = []
+    for i in range(6):
+        parts.append(link(names[i + 1], inertial(1.0 - 0.1 * i), shape('<box size="0.05 0.05 0.08"/>')))
+        limit = elbow if i == 2 else ROOM
+        parts.append(joint(f"{tag}a{i + 1}", names[i], names[i + 1], xyz=frames[i], axis=axes[i], limit=limit))
+    return parts
+
+
+def fingers(folder: Path, palm: str, tag: str = "", at: str = "0 0 0.1") -> list[str]:
+    """Two slides ``left`` and ``right`` along y, the second by mimic; their inner faces 1 to 5 cm from the middle."""
+    box(folder / "in" / "left.stl", (-0.01, 0, 0), (0.01, 0.01, 0.06))
+    box(folder / "in" / "right.stl", (-0.01, -0.01, 0), (0.01, 0, 0.06))
+    follow = f'<mimic joint="{tag}left"/>'
+    return [
+        link(f"{tag}left_finger", inertial(0.05), mesh("left.stl")),
+        link(f"{tag}right_finger", inertial(0.05), mesh("right.stl")),
+        joint(f"{tag}left", palm, f"{tag}left_finger", xyz=at, axis="0 1 0", **SLIDE),
+        joint(f"{tag}right", palm, f"{tag}right_finger", xyz=at, axis="0 -1 0", inner=follow, **SLIDE),
+    ]
+
+
+def base(*shapes: str) -> str:
+    return link("base", inertial(5), *(shapes or (shape('<box size="0.1 0.1 0.1"/>', xyz="0 0 0.05"),)))
 
 
 def write(folder: Path, text: str, name: str = "robot.urdf") -> Path:

@@ -5,10 +5,12 @@ from typing import Any
 
 from mjx_nero import config
 from mjx_nero.control.controller import Controller
+from mjx_nero.control.detour import Carry, CarryCfg, Detour, DetourCfg
 from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
-from mjx_nero.robots import RobotCfg
+from mjx_nero.control.pick_up import PickUp, PickUpCfg
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 # name -> (class, its config); the class takes (robot, dt, config)
@@ -16,7 +18,21 @@ CONTROLLERS: dict[str, tuple[Any, Any]] = {
     "ik": (IkFollower, IkCfg()),
     "rmpflow": (RmpFollower, RmpCfg()),
     "pick_place": (PickPlace, PickPlaceCfg()),
+    "detour": (Detour, DetourCfg()),
+    "carry": (Carry, CarryCfg()),
+    "pick_up": (PickUp, PickUpCfg()),
 }
+
+
+def register(name: str, kind: Any, cfg: Any) -> None:
+    """Adds a controller: its class, which takes (robot, dt, config), and its config.
+
+    Raises:
+        UserError: there is one of this name.
+    """
+    if name in CONTROLLERS:
+        raise UserError(f"there is a controller {name!r} already: choose another name")
+    CONTROLLERS[name] = (kind, cfg)
 
 
 def make(name: str, robot: RobotCfg, dt: float, overrides: Mapping[str, Any] | None = None) -> Controller:

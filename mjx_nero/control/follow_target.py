@@ -13,17 +13,17 @@ from mjx_nero.control.controller import Memory
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
 from mjx_nero.mdp.actions import rate_limit
-from mjx_nero.robots import RobotCfg
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
 
 
 @dataclasses.dataclass(frozen=True)
 class RmpCfg:
-    """Files ("": the robot's own) and the longest integration step [s]."""
+    """Of RMPflow."""
 
-    descriptor: str = ""
-    config: str = ""
-    maximum_substep_size: float = 0.00334
+    descriptor: str = ""  # YAML file of joints and collision spheres; empty: the robot's own
+    config: str = ""  # YAML file of the policies' parameters; empty: the robot's own
+    maximum_substep_size: float = 0.00334  # longest integration step [s]
 
 
 @struct.dataclass
@@ -78,6 +78,29 @@ class IkFollower:
         )
 
 
+class IkArm:
+    """Keeps up with a slow target by inverse kinematics from the set-point on, without jumps, at the drives' speed limits.
+
+    Where the target is out of reach the arm comes as near as it gets.
+
+    Args:
+        robot: its ``ee_site`` follows.
+        dt: control step [s].
+        cfg: of the solver.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg):
+        self._ik, self.dt = InverseKinematics(robot, cfg=cfg), dt
+        self._max_step = np.array(robot.arm.speed, np.float32) * dt
+        self._lead = np.array(robot.arm.lead, np.float32)
+
+    def arm(self, q: Float[Array, " nj"], target: Target) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
+        """The set-point after ``q`` on the way to ``target``, and the drives' targets [rad]: ahead by what the drives lag."""
+        assert target.position is not None and target.orientation is not None
+        after = rate_limit(self._ik.local(target.position, target.orientation, q).q, q, step=jnp.asarray(self._max_step))
+        return after, after + self._lead * (after - q) / self.dt
+
+
 class RmpFollower:
     """RMPflow towards the target, from the measured joint state at every step.
 
@@ -85,7 +108,7 @@ class RmpFollower:
         robot: its ``ee_site`` follows.
         dt: control step [s].
         cfg: files and integration.
-        obstacles: what to keep clear of.
+        obstacles: what to keep clear of; None: the scene's.
 
     Raises:
         UserError: the robot has no RMPflow files, or they do not fit it.
@@ -94,7 +117,7 @@ class RmpFollower:
     def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg(), obstacles: Obstacles | None = None):
         descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
         self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
-        self.dt, self._obstacles = dt, Obstacles.none() if obstacles is None else obstacles
+        self.dt, self._obstacles = dt, obstacles
         self._lead = np.array(robot.arm.lead, np.float32)
         self._n = len(robot.arm.joints)
 
@@ -109,7 +132,8 @@ class RmpFollower:
 
     def arm(self, view: View, target: Target) -> Float[Array, " nj"]:
         """Targets of the arm's drives on the way to ``target`` [rad]."""
-        q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, self._obstacles, self.dt)
+        obstacles = Obstacles.seen(view) if self._obstacles is None else self._obstacles
+        q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, obstacles, self.dt)
         return q + self._lead * qd
 
     def warning(self, memory: Memory) -> str:

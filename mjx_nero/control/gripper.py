@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero import scene
 from mjx_nero.mdp.actions import rate_limit
-from mjx_nero.robots import RobotCfg
+from mjx_nero.sim import scene
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 Positions = Float[Array, " n"]

@@ -9,9 +9,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from mjx_nero import math, scene
-from mjx_nero.kinematics import Chain
-from mjx_nero.robots import RobotCfg
+from mjx_nero import math
+from mjx_nero.sim import scene
+from mjx_nero.sim.kinematics import Chain
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import Key
 
 _FAR = 1e3  # above any distance between two configurations
@@ -32,6 +33,7 @@ class IkCfg:
         restarts: rounds of descents from random starts, if the warm start fails; each ends as soon as all poses are solved.
         starts: descents in a round, or the number of poses where that is larger. The unsolved poses share them evenly.
         candidates: random configurations from which each start is chosen: the one closest to the target.
+        free_turn: turns about the vertical do not count: for arms of few joints, whose hand is turned as it points down.
         spread: share of the joint ranges, about their centres, that candidates are drawn from. Starts near a limit often get
             stuck there.
     """
@@ -46,6 +48,7 @@ class IkCfg:
     starts: int = 8
     candidates: int = 8
     spread: float = 0.8
+    free_turn: bool = False
 
 
 @struct.dataclass
@@ -200,13 +203,15 @@ class InverseKinematics:
         """How far ``q`` is from the target, and the configuration after one step."""
         at, turn, jacobian = (x[0] for x in self.chain.jacobians(q))
         linear, angular = _residual(at, turn, pos, quat)
+        counts = jnp.array([1.0, 1.0, 0.0 if self.cfg.free_turn else 1.0])
+        angular = angular * counts
         position, orientation = jnp.linalg.norm(linear), jnp.linalg.norm(angular)
         met = (position <= self.cfg.position_tolerance) & (orientation <= self.cfg.orientation_tolerance)
         weight = self.cfg.orientation_weight
         error = jnp.concatenate(
             [linear * jnp.minimum(1.0, self.cfg.max_distance / jnp.maximum(position, 1e-6)), weight * angular]
         )
-        jacobian = jacobian * jnp.array([1.0, 1.0, 1.0, weight, weight, weight])[:, None]
+        jacobian = jacobian * jnp.concatenate([jnp.ones(3), weight * counts])[:, None]
         uphill = error @ jacobian
         held = ((q <= self.chain.lower) & (uphill < 0)) | ((q >= self.chain.upper) & (uphill > 0))
         jacobian = jnp.where(held, 0.0, jacobian)

@@ -1,4 +1,4 @@
-"""Pick and place in ten phases over RMPflow, as Isaac Sim's controller of this name: purely by time, without any planning."""
+"""Pick and place in ten phases, as Isaac Sim's controller of this name: purely by time, without any planning."""
 
 import dataclasses
 
@@ -7,10 +7,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from mjx_nero.control.follow_target import RmpCfg, RmpFollower
+from mjx_nero import math
+from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
 from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.rmpflow import Target
-from mjx_nero.robots import RobotCfg
+from mjx_nero.mdp.towers import GOAL
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
 _FASTEST = 1.0  # [m/s]: a target that moves on faster has jumped
@@ -29,7 +32,12 @@ class PickPlaceCfg:
         end_effector_offset: of the grasp point from the cube's centre. The tutorial's 0.25 m counts from the flange and would
             press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
         arc: travel from pick to place about the robot's axis; False: on a straight line.
-        rmpflow: of the arm's motion.
+        motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
+        rmpflow, ik: of the arm's motion.
+        tower: what to pick, one after another, and where each goes: onto the one before, the first of which stays where it is or
+            is the goal (see ``mdp.towers``).
+        rise: from the centre of an object to that of the one on it.
+        turn: the hand is turned as the object is, and then as the goal is.
     """
 
     # The tutorial's shares work, too, but take 96 s at 50 Hz. These take 17 s: the arc to the tutorial's goal turns the base by
@@ -39,32 +47,45 @@ class PickPlaceCfg:
     end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # A straight line from the front to the tutorial's goal runs through the robot's base.
     arc: bool = True
+    motion: str = "rmpflow"
     rmpflow: RmpCfg = RmpCfg()
+    # Tight: what the solver leaves out it makes up for at once in a later step, and the drives' lead makes a kick of that.
+    ik: IkCfg = IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-4)
+    tower: tuple[str, ...] = (GOAL, "cube")
+    rise: float = 0.0
+    turn: bool = False
+
+
+Pose = Float[Array, "4"]  # position [m], and turn about the vertical [rad]
 
 
 @struct.dataclass
 class PickPlaceMemory:
     """Between two steps of ``PickPlace``."""
 
+    move: Int[Array, ""]  # which object, from 0
     phase: Int[Array, ""]  # 0 to 9; 10: done
     count: Int[Array, ""]  # steps made in this phase
-    pick: Float[Array, "3"]  # where the cube was when the fingers last went for it
-    grip: Float[Array, "3"]  # from the cube to the grasp point, while it is carried
-    target: Float[Array, "3"]  # of the grasp point
+    start: Pose  # of the grasp point, where the way to this object began
+    tilt: Float[Array, "3"]  # of the hand there, from pointing straight down: a rotation vector in its frame [rad]
+    pick: Pose  # where the object was when the fingers last went for it
+    grip: Float[Array, "3"]  # from the object to the grasp point, while it is carried, as if the hand were not turned
+    target: Pose  # of the grasp point
+    setpoint: Float[Array, " nj"]  # of the arm [rad]
 
 
 class PickPlace:
-    """Moves the object to the goal.
+    """Moves objects, one after another, to the goal or onto one another.
 
     | phase | 0 | 1 | 2 | 3 | 4 | 5 | 6 | 7 | 8 | 9 |
     | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
-    | grasp point over | pick | pick | stays | stays | pick | pick to place | place | stays | place | place |
-    | height | travel | down | stays | stays | up | travel | down | stays | up | travel |
+    | grasp point over | start to pick | pick | stays | stays | pick | pick to place | place | stays | place | place |
+    | height | start to travel | down | stays | stays | up | travel | down | stays | up | travel |
     | fingers | open | open | open | close | closed | closed | closed | open | open | open |
 
     Time alone changes phase. Not as in the tutorial: the height of the travel (0.6 m is out of reach over its goal), the arc, a
-    velocity target beside the position, and that the cube's own place in the grip is seen and made up for while it is carried,
-    since it slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
+    smooth start, a velocity target beside the position, and that the object's own place in the grip is seen and made up for while
+    it is carried, since it slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
 
     Args:
         robot: what picks, gripper straight down.
@@ -72,84 +93,138 @@ class PickPlace:
         cfg: see ``PickPlaceCfg``.
 
     Raises:
-        UserError: ``events_dt`` has not ten shares in 0 to 1.
+        UserError: ``events_dt`` has not ten shares in 0 to 1, ``motion`` is another, or ``tower`` has nothing to move.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: PickPlaceCfg = PickPlaceCfg()):
         if len(cfg.events_dt) != len(PHASES) or not all(0 < share <= 1 for share in cfg.events_dt):
             raise UserError(f"events_dt takes {len(PHASES)} shares above 0 and up to 1, got {cfg.events_dt}")
+        if cfg.motion not in ("rmpflow", "ik"):
+            raise UserError(f"motion must be rmpflow or ik, got {cfg.motion!r}")
+        if len(cfg.tower) < 2:
+            raise UserError(f"tower names what stays or {GOAL!r}, then one object or more to move there, got {cfg.tower}")
         self.dt, self.cfg = dt, cfg
         # Integers: adding up shares in float32 gives other counts. The small part forgives 1 / 0.05 = 20.000000000000004.
         self.steps = np.array([int(np.ceil(1 / share - 1e-6)) for share in cfg.events_dt], np.int32)
         self.gripper = ParallelGripper(robot)
-        self._arm = RmpFollower(robot, dt, cfg.rmpflow)
+        self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
+        self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None
         self._n, self._down = len(robot.arm.joints), np.array(robot.down, np.float32)
         self._offset = np.array(cfg.end_effector_offset, np.float32)
+        self._moves = len(cfg.tower) - 1
 
     def init(self, view: View) -> PickPlaceMemory:
-        """At the start of phase 0."""
-        zero = jnp.zeros((), jnp.int32)
-        return PickPlaceMemory(zero, zero, view.object_pos_w, jnp.asarray(self._offset), view.ee_pos_w)
+        """At the start of phase 0 of the first object."""
+        zero, start = jnp.zeros((), jnp.int32), jnp.append(view.ee_pos_w, 0.0)
+        return PickPlaceMemory(
+            move=zero,
+            phase=zero,
+            count=zero,
+            start=start,
+            tilt=math.quat_log(math.quat_mul(math.quat_conj(jnp.asarray(self._down)), view.ee_quat_w)),
+            pick=self._pose(view, self.cfg.tower[1]),
+            grip=jnp.asarray(self._offset),
+            target=start,
+            setpoint=view.joint_pos[: self._n],
+        )
 
     def is_done(self, memory: PickPlaceMemory) -> Bool[Array, ""]:
-        """All ten phases are over; the arm then stays where it is."""
+        """All ten phases are over for all objects; the arm then stays where it is."""
         return memory.phase >= len(PHASES)
 
     def step(self, memory: PickPlaceMemory, view: View) -> tuple[PickPlaceMemory, Float[Array, " nu"]]:
         """Targets of all drives."""
         phase = jnp.minimum(memory.phase, len(PHASES) - 1)
         steps = jnp.asarray(self.steps)[phase]
-        share = memory.count / steps
-        pick = jnp.where(phase <= 1, view.object_pos_w, memory.pick)
+        seen = jnp.stack([self._pose(view, name) for name in self.cfg.tower[1:]])[memory.move]
+        place = jnp.stack([self._place(view, below) for below in self.cfg.tower[:-1]])[memory.move]
+        memory = dataclasses.replace(memory, pick=jnp.where(phase <= 1, seen, memory.pick))
         # Only while it is carried, and only what can still be a grip.
         carried = (phase >= 4) & (phase <= 6)
-        slip = jnp.clip(view.ee_pos_w - view.object_pos_w, self._offset - 0.03, self._offset + 0.03)
+        slip = _turned(view.ee_pos_w - seen[:3], -memory.target[3])
+        slip = jnp.clip(slip, self._offset - 0.03, self._offset + 0.03)
         grip = memory.grip + jnp.where(carried, _GRIP_FILTER, 0.0) * (slip - memory.grip)
-        target = self._target(phase, share, pick, view.goal_pos_w, grip, view.root_pos_w)
+        s = (1 - jnp.cos(jnp.pi * memory.count / steps)) / 2
+        target = self._target(memory, s, place, grip, view.root_pos_w)
         stays = (phase == 2) | (phase == 3) | (phase == 7) | self.is_done(memory)
         target = jnp.where(stays, memory.target, target)
 
-        velocity = (target - memory.target) / self.dt
-        jump = jnp.linalg.norm(velocity) > _FASTEST
-        arm = self._arm.arm(view, Target(target, jnp.asarray(self._down), jnp.where(jump, 0.0, velocity)))
+        setpoint, arm = self._arm(memory, view, target, jnp.where(phase == 0, (1 - s) * memory.tilt, 0.0))
         closing = (phase >= 3) & (phase <= 6)
         fingers = self.gripper.forward(closing, view.joint_pos[self._n :], view.ctrl[self._n :], self.dt)
 
         over = memory.count + 1 >= steps
-        memory = PickPlaceMemory(
-            phase=jnp.minimum(memory.phase + over, len(PHASES)),
+        again = over & (phase == len(PHASES) - 1) & (memory.move + 1 < self._moves)
+        memory = dataclasses.replace(
+            memory,
+            move=memory.move + again,
+            phase=jnp.where(again, 0, jnp.minimum(memory.phase + over, len(PHASES))),
             count=jnp.where(over, 0, memory.count + 1),
-            pick=pick,
-            grip=grip,
+            start=jnp.where(again, target, memory.start),
+            tilt=jnp.where(again, 0.0, memory.tilt),
+            grip=jnp.where(again, self._offset, grip),
             target=target,
+            setpoint=setpoint,
         )
         return memory, jnp.concatenate([arm, fingers])
 
-    def _target(self, phase, share, pick, place, grip, root) -> Float[Array, "3"]:
-        s = (1 - jnp.cos(jnp.pi * share)) / 2
-        travel = root[2] + self.cfg.end_effector_initial_height
-        low_pick, low_place = pick[2] + self._offset[2], place[2] + grip[2]
-        over_pick = pick[:2] + self._offset[:2]
-        over_place = place[:2] + grip[:2]
-        across = _arc(over_pick, over_place, s, root[:2]) if self.cfg.arc else _mix(over_pick, over_place, s)
-        xy = jnp.where(phase <= 4, over_pick, jnp.where(phase == 5, across, over_place))
+    def _pose(self, view: View, name: str) -> Pose:
+        seen = view.objects[name]
+        return jnp.append(seen.pos_w, math.yaw(seen.quat_w) if self.cfg.turn else 0.0)
+
+    def _place(self, view: View, below: str) -> Pose:
+        if below == GOAL:
+            return jnp.append(view.goal_pos_w, math.yaw(view.goal_quat_w) if self.cfg.turn else 0.0)
+        return self._pose(view, below) + jnp.array([0.0, 0.0, self.cfg.rise, 0.0])
+
+    def _arm(self, memory: PickPlaceMemory, view: View, target: Pose, tilt) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
+        """The next set-point, where one is kept, and the targets of the arm's drives."""
+        down = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), target[3]), jnp.asarray(self._down))
+        velocity = (target - memory.target)[:3] / self.dt
+        jump = jnp.linalg.norm(velocity) > _FASTEST
+        wanted = Target(target[:3], math.quat_mul(down, math.quat_exp(tilt)), jnp.where(jump, 0.0, velocity))
+        if self._rmpflow:
+            return memory.setpoint, self._rmpflow.arm(view, wanted)
+        assert self._ik is not None
+        return self._ik.arm(memory.setpoint, wanted)
+
+    def _target(self, memory: PickPlaceMemory, s, place: Pose, grip, root) -> Pose:
+        phase, pick, start, center = memory.phase, memory.pick, memory.start, root[:2]
+        over_pick = pick + jnp.append(_turned(self._offset, pick[3]), 0.0)
+        over_place = place + jnp.append(_turned(grip, place[3]), 0.0)
+        near, across = (
+            _arc(a[:2], b[:2], s, center) if self.cfg.arc else _mix(a[:2], b[:2], s)
+            for a, b in ((start, over_pick), (over_pick, over_place))
+        )
+        xy = jnp.select([phase == 0, phase <= 4, phase == 5], [near, over_pick[:2], across], over_place[:2])
+        turn = jnp.select(
+            [phase == 0, phase <= 4, phase == 5],
+            [_mix(start[3], pick[3], s), pick[3], _mix(pick[3], place[3], s)],
+            place[3],
+        )
+        travel, low, put = root[2] + self.cfg.end_effector_initial_height, over_pick[2], over_place[2]
         height = jnp.select(
-            [phase == 1, phase == 4, phase == 6, phase == 8],
-            [_mix(travel, low_pick, s), _mix(low_pick, travel, s), _mix(travel, low_place, s), _mix(low_place, travel, s)],
+            [phase == k for k in (0, 1, 4, 6, 8)],
+            [_mix(a, b, s) for a, b in ((start[2], travel), (travel, low), (low, travel), (travel, put), (put, travel))],
             travel,
         )
-        return jnp.concatenate([xy, height[None]])
+        return jnp.concatenate([xy, jnp.stack([height, turn])])
 
     def warning(self, memory: PickPlaceMemory) -> str:
         """Says if the episodes were too short."""
         done = np.asarray(self.is_done(memory))
         if done.all():
             return ""
-        return f"{(~done).sum()} of {done.size} episodes ended before the ten phases ({self.steps.sum() * self.dt:.1f} s)"
+        long = self._moves * self.steps.sum() * self.dt
+        return f"{(~done).sum()} of {done.size} episodes ended before the ten phases ({long:.1f} s)"
 
 
 def _mix(a, b, s):
     return (1 - s) * a + s * b
+
+
+def _turned(vec, angle: Float[Array, ""]) -> Float[Array, "3"]:
+    return math.rotate(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), angle), jnp.asarray(vec))
 
 
 def _arc(a: Float[Array, "2"], b: Float[Array, "2"], s, center: Float[Array, "2"]) -> Float[Array, "2"]:

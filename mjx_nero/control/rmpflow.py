@@ -12,7 +12,6 @@ A reactive policy has no plan: a target on the other side of the base, or behind
 import dataclasses
 import math
 import pathlib
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,21 +20,26 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from mjx_nero import scene
+from mjx_nero.control import rmp
 from mjx_nero.control import rmpflow_config as cfg
-from mjx_nero.kinematics import Chain
-from mjx_nero.math import rotate, rotation_matrix, solve_spd
-from mjx_nero.robots import ASSETS, RobotCfg
-from mjx_nero.types import UserError
+from mjx_nero.math import rotate, rotation_matrix
+from mjx_nero.sim import scene
+from mjx_nero.sim.kinematics import Chain
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError, View
+from mjx_nero.values import unknown
 
 
 @struct.dataclass
 class Obstacles:
-    """Capsules in the world [m]; a sphere is a capsule whose ends coincide. Taken to stand still."""
+    """Capsules and boxes in the world [m]; a sphere is a capsule whose ends coincide. Taken to stand still."""
 
     pt1: Float[Array, "n 3"]
     pt2: Float[Array, "n 3"]
     radius: Float[Array, " n"]
+    center: Float[Array, "m 3"] | None = None  # of the boxes; None: there are none
+    quat: Float[Array, "m 4"] | None = None  # wxyz
+    size: Float[Array, "m 3"] | None = None  # edges
 
     @classmethod
     def none(cls) -> "Obstacles":
@@ -53,6 +57,23 @@ class Obstacles:
         pt1, pt2 = jnp.asarray(pt1, jnp.float32), jnp.asarray(pt2, jnp.float32)
         return cls(pt1, pt2, jnp.broadcast_to(jnp.asarray(radius, jnp.float32), pt1.shape[:1]))
 
+    @classmethod
+    def boxes(cls, center, quat, size) -> "Obstacles":
+        """Boxes with their centres at ``center`` [n, 3], turned by ``quat`` [n, 4] (wxyz), of edges ``size`` [n, 3]."""
+        center, quat, size = (jnp.asarray(x, jnp.float32) for x in (center, quat, size))
+        return dataclasses.replace(cls.none(), center=center, quat=quat, size=size)
+
+    @classmethod
+    def seen(cls, view: View) -> "Obstacles":
+        """Those of the scene."""
+        if not view.obstacles:
+            return cls.none()
+        boxes = view.obstacles.values()
+        return cls.boxes(*(jnp.stack([getattr(box, part) for box in boxes]) for part in ("pos_w", "quat_w", "size")))
+
+    def __len__(self) -> int:
+        return len(self.radius) + (0 if self.center is None else len(self.center))
+
 
 @struct.dataclass
 class Target:
@@ -68,121 +89,6 @@ class Target:
     position: Float[Array, "3"] | None = None  # [m]
     orientation: Float[Array, "4"] | None = None  # wxyz
     velocity: Float[Array, "3"] | None = None  # [m/s]
-
-
-class Rmp(NamedTuple):
-    """A policy in natural form: force f = M a, and metric M. Scalar and diagonal metrics have the force's shape."""
-
-    force: Array
-    metric: Array
-
-
-# Leaves, under the names of their groups in the parameter file, whose keys they read.
-
-
-def cspace_target_rmp(p: cfg.CspaceTargetCfg, q, qd, default_q) -> Rmp:
-    """Pull to the posture ``default_q``: constant from afar, linear within the threshold; and the joints' inertia. All [nj]."""
-    error = default_q - q
-    pull = error * jnp.minimum(1.0, p.robust_position_term_thresh / _length(error))
-    accel = p.position_gain * pull - p.damping_gain * qd
-    return Rmp(p.metric_scalar * accel, jnp.full_like(q, p.metric_scalar + p.inertia))
-
-
-def joint_limit_rmp(p: cfg.JointLimitCfg, x, xd) -> Rmp:
-    """Push away from a limit at distance ``x``, in parts of the joint's range; a damper that only acts on the way there."""
-    x = jnp.maximum(x, 0.0)
-    accel = p.accel_potential_gain / ((x / p.accel_potential_exploder_length_scale) ** 2 + p.accel_potential_exploder_eps)
-    accel = accel - p.accel_damper_gain * xd
-    gate = 1.0 - jax.nn.sigmoid(xd / p.metric_velocity_gate_length_scale)
-    metric = gate * p.metric_scalar / (x / p.metric_length_scale + p.metric_exploder_eps)
-    return Rmp(metric * accel, metric)
-
-
-def joint_velocity_cap_rmp(p: cfg.JointVelocityCapCfg, qd) -> Rmp:
-    """Brake on a joint within ``velocity_damping_region`` of the top speed, infinitely heavy at the top speed."""
-    region = p.velocity_damping_region
-    excess = jnp.abs(qd) - (p.max_velocity - region)
-    accel = -p.damping_gain * jnp.sign(qd) * excess
-    share = jnp.minimum(excess / region, 1.0 - 1e-4)
-    metric = jnp.where(excess < 0, 0.0, p.metric_weight / (1.0 - share**2))
-    return Rmp(metric * accel, metric)
-
-
-def target_rmp(p: cfg.TargetCfg, error: Float[Array, "3"], vel: Float[Array, "3"]) -> Rmp:
-    """Pull along ``error`` = target - position [m], damping of ``vel``, the velocity relative to the target [m/s].
-
-    From afar mainly the direction of the error matters, close to the target all directions, and close by more.
-    """
-    length = _length(error)
-    direction = error / length
-    accel = p.accel_p_gain * error / (length + p.accel_norm_eps) - p.accel_d_gain * vel
-    near = (1.0 - p.min_metric_alpha) * _bell(length, p.metric_alpha_length_scale) + p.min_metric_alpha
-    metric = near * p.max_metric_scalar * jnp.eye(3) + (1.0 - near) * p.min_metric_scalar * jnp.outer(direction, direction)
-    return _weighted(metric * _boost(p, length), accel)
-
-
-def axis_target_rmp(p: cfg.AxisTargetCfg, error: Float[Array, "3"], vel: Float[Array, "3"], distance) -> Rmp:
-    """Pull of one axis (a unit vector) along ``error`` = target - axis; heavier as the ``distance`` [m] to the target shrinks."""
-    metric = p.metric_scalar * (1.0 if distance is None else _boost(p, distance)) * jnp.eye(3)
-    return _weighted(metric, p.accel_p_gain * error - p.accel_d_gain * vel)
-
-
-def damping_rmp(p: cfg.DampingCfg, xd) -> Rmp:
-    """Quadratic drag and inertia on the distance to the target, which changes by ``xd`` [m/s]."""
-    metric = p.metric_scalar * jnp.abs(xd)
-    return Rmp(-metric * p.accel_d_gain * jnp.abs(xd) * xd, metric + p.inertia)
-
-
-def collision_rmp(p: cfg.CollisionCfg, x, xd) -> Rmp:
-    """Push away from a surface at distance ``x`` [m]; metric and damper only count on the way there."""
-    x = jnp.maximum(x, 0.0)
-    gate = 1.0 - jax.nn.sigmoid(xd / p.damping_velocity_gate_length_scale)
-    damper = p.damping_gain * gate * xd / (x / p.damping_std_dev + p.damping_robustness_eps)
-    accel = p.repulsion_gain * jnp.exp(-x / p.repulsion_std_dev) - damper
-    nearness = jnp.maximum(1.0 - x / p.metric_modulation_radius, 0.0) ** 2
-    metric = gate * nearness * p.metric_scalar / (x / p.metric_exploder_std_dev + p.metric_exploder_eps)
-    return Rmp(metric * accel, metric)
-
-
-# The tree.
-
-
-def along(direction: Float[Array, "*n 3"], curvature: Float[Array, "*n"], leaf: Rmp) -> Rmp:
-    """Pulls scalar leaves back to points, whose coordinate they see changes along ``direction``, its gradient.
-
-    ``curvature``: the coordinate's second derivative in time while the point moves straight on.
-    """
-    outer = direction[..., :, None] * direction[..., None, :]
-    return Rmp((leaf.force - leaf.metric * curvature)[..., None] * direction, leaf.metric[..., None, None] * outer)
-
-
-def clearance(point, vel, pt1, pt2) -> tuple[Array, Array, Array, Array]:
-    """Distance of a point to a segment [m], its gradient, its rate, its second derivative while the point moves straight on."""
-    axis = pt2 - pt1
-    square = jnp.maximum(_dot(axis, axis), 1e-12)
-    share = jnp.clip(_dot(point - pt1, axis) / square, 0.0, 1.0)
-    offset = point - pt1 - share * axis
-    distance = _length(offset)
-    direction = offset / distance
-    rate = _dot(direction, vel)
-    slide = jnp.where((share > 0) & (share < 1), _dot(axis, vel) ** 2 / square, 0.0)  # along a cylinder nothing turns
-    return distance, direction, rate, jnp.maximum(_dot(vel, vel) - rate**2 - slide, 0.0) / distance
-
-
-def pull_back(jac: Float[Array, "n 3 nj"], curvature: Float[Array, "n 3"], node: Rmp) -> Rmp:
-    """The sum at the root of policies on ``n`` points; ``curvature`` = Jdot qd."""
-    weighted = jnp.einsum("nab,nbj->naj", node.metric, jac, precision="highest")
-    force = node.force - jnp.sum(node.metric * curvature[:, None, :], axis=-1)
-    return Rmp(jnp.sum(jac * force[..., None], axis=(0, 1)), jnp.einsum("nai,naj->ij", jac, weighted, precision="highest"))
-
-
-def resolve(p: cfg.ResolveCfg, root: Rmp) -> Float[Array, " nj"]:
-    """The acceleration that the root asks for [rad/s^2], scaled down to the largest norm allowed (assumed: nothing says how)."""
-    metric = root.metric
-    # As large as the metric's rounding: keeps the root solvable where no leaf cares.
-    ridge = 1e-6 + float(jnp.finfo(metric.dtype).eps) * jnp.trace(metric)
-    accel = solve_spd(metric + ridge * jnp.eye(len(root.force)), root.force)
-    return accel * jnp.minimum(1.0, p.max_acceleration_norm / _length(accel))
 
 
 class RmpFlow:
@@ -214,7 +120,7 @@ class RmpFlow:
     ):
         if not maximum_substep_size > 0:
             raise UserError(f"maximum_substep_size takes a time above 0 s, got {maximum_substep_size!r}")
-        frame, folder = frame or robot.ee_site, ASSETS / robot.name / "rmpflow"
+        frame, folder = frame or robot.ee_site, robot.xml.parent / "rmpflow"
         descriptor = pathlib.Path(descriptor or folder / "robot_descriptor.yaml")
         config = pathlib.Path(config or folder / "rmpflow_common.yaml")
         arm, self.config = cfg.load_pair(descriptor, config, robot.arm.joints)
@@ -224,38 +130,46 @@ class RmpFlow:
         model = scene.robot_model(robot)
         frames = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(model.nbody)]
         if frame not in frames:
-            raise UserError(f"{robot.name}: {cfg.unknown('frame', frame, frames)}")
+            raise UserError(f"{robot.name}: {unknown('frame', frame, frames)}")
         if arm.root_link not in ("world", robot.base_link):
-            raise UserError(f"{descriptor}: root_link: {cfg.unknown('root', arm.root_link, ('world', robot.base_link))}")
+            raise UserError(f"{descriptor}: root_link: {unknown('root', arm.root_link, ('world', robot.base_link))}")
 
         # Spheres: those of the controllers, which also the base repels, then the descriptor's, which only obstacles do.
         controllers = self.config.body_collision_controllers
-        spheres = [(c.name, (0.0, 0.0, 0.0), c.radius) for c in controllers]
-        places = [f"{config}: body_collision_controllers[{i}].name" for i in range(len(controllers))]
+        spheres = [
+            (c.name, (0.0, 0.0, 0.0), c.radius, f"{config}: body_collision_controllers[{i}].name")
+            for i, c in enumerate(controllers)
+        ]
         for i, entry in enumerate(arm.collision_spheres):
-            for link, own in entry.items():
-                spheres += [(link, s.center, s.radius) for s in own]
-                places += [f"{descriptor}: collision_spheres[{i}]"] * len(own)
-        for (name, _, _), place in zip(spheres, places, strict=True):
+            place = f"{descriptor}: collision_spheres[{i}]"
+            spheres += [(link, s.center, s.radius, place) for link, own in entry.items() for s in own]
+        for name, _, _, place in spheres:
             if name not in frames:
-                raise UserError(f"{place}: {cfg.unknown('frame', name, frames)}")
+                raise UserError(f"{place}: {unknown('frame', name, frames)}")
         self._controllers = len(controllers)
-        self._radius = np.array([radius for _, _, radius in spheres], np.float32)
+        self._radius = np.array([radius for _, _, radius, _ in spheres], np.float32)
 
         # Nodes of the tree, each a vector in a frame: the steered frame's origin, its three axes, the spheres' centres.
-        used = list(dict.fromkeys([frame, *(name for name, _, _ in spheres)]))
+        used = list(dict.fromkeys([frame, *(name for name, *_ in spheres)]))
         self.chain = Chain(model, self.joints, used)
-        self._frame = np.array([0] * 4 + [used.index(name) for name, _, _ in spheres])
-        self._vector = np.array([(0, 0, 0), *np.eye(3), *(center for _, center, _ in spheres)], np.float32)
+        self._frame = np.array([0] * 4 + [used.index(name) for name, *_ in spheres])
+        self._vector = np.array([(0, 0, 0), *np.eye(3), *(center for _, center, _, _ in spheres)], np.float32)
         self._is_point = np.array([1.0] + [0.0] * 3 + [1.0] * len(spheres), np.float32)
 
-        base, cylinders = model.body(robot.base_link), self.config.body_cylinders
+        self._set_base(model.body(robot.base_link))
+        self._set_limits(config)
+
+    def _set_base(self, base) -> None:
+        """The cylinders around it, in the world."""
+        cylinders = self.config.body_cylinders
         ends = np.array([(c.pt1, c.pt2) for c in cylinders]).reshape(-1, 2, 3)
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, base.quat)
         self._cylinders = (base.pos + ends @ turn.reshape(3, 3).T).astype(np.float32)
         self._cylinder_radius = np.array([c.radius for c in cylinders], np.float32)
 
+    def _set_limits(self, config: pathlib.Path) -> None:
+        """The joints' ranges, less the parameters' buffers."""
         buffers = np.array(self.config.joint_limit_buffers, np.float32)
         lower, upper = self.chain.lower + buffers, self.chain.upper - buffers
         for name, low, high in zip(self.joints, lower, upper, strict=True):
@@ -270,13 +184,15 @@ class RmpFlow:
     ) -> Float[Array, " nj"]:
         """The policy: joint accelerations [rad/s^2] at positions [rad] and velocities [rad/s]."""
         # Without obstacles the spheres beyond the controllers' meet nothing.
-        count = 4 + (len(self._radius) if len(obstacles.radius) else self._controllers)
+        count = 4 + (len(self._radius) if len(obstacles) else self._controllers)
         x, xd, curvature, jac = self._nodes(q, qd, count)
         frame = self._frame_leaves(target, x[:4], xd[:4])
         spheres = self._sphere_leaves(obstacles, x[4:], xd[4:])
-        tasks = pull_back(jac, curvature, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), frame, spheres))
+        tasks = rmp.pull_back(jac, curvature, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), frame, spheres))
         joints = self._joint_leaves(q, qd)
-        return resolve(self.config.canonical_resolve, Rmp(tasks.force + joints.force, tasks.metric + jnp.diag(joints.metric)))
+        return rmp.resolve(
+            self.config.canonical_resolve, rmp.Rmp(tasks.force + joints.force, tasks.metric + jnp.diag(joints.metric))
+        )
 
     def step(
         self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles, dt: float
@@ -318,68 +234,53 @@ class RmpFlow:
         xd, curvature, (x, jac) = jax.jvp(moves, (q,), (qd,), has_aux=True)
         return x, xd, curvature, jac
 
-    def _frame_leaves(self, target: Target, x: Float[Array, "4 3"], xd: Float[Array, "4 3"]) -> Rmp:
+    def _frame_leaves(self, target: Target, x: Float[Array, "4 3"], xd: Float[Array, "4 3"]) -> rmp.Rmp:
         """On the steered frame's origin and its three axes."""
         p, distance = self.config.rmp_params, None
-        nodes = [Rmp(jnp.zeros((1, 3)), jnp.zeros((1, 3, 3))), Rmp(jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)))]
+        nodes = [rmp.Rmp(jnp.zeros((1, 3)), jnp.zeros((1, 3, 3))), rmp.Rmp(jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)))]
         if target.position is not None:
             error, vel = target.position - x[0], xd[0] if target.velocity is None else xd[0] - target.velocity
-            distance = _length(error)
+            distance = rmp.norm(error)
             away = -error / distance
-            rate = _dot(away, vel)
+            rate = rmp.dot(away, vel)
             # Closer than a millimetre the line to the target has no direction worth the name.
-            bend = jnp.maximum(_dot(vel, vel) - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
-            pull, drag = target_rmp(p.target_rmp, error, vel), along(away, bend, damping_rmp(p.damping_rmp, rate))
+            bend = jnp.maximum(rmp.dot(vel, vel) - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
+            pull, drag = rmp.target_rmp(p.target_rmp, error, vel), rmp.along(away, bend, rmp.damping_rmp(p.damping_rmp, rate))
             nodes[0] = jax.tree.map(lambda a, b: (a + b)[None], pull, drag)
         if target.orientation is not None:
             errors = rotation_matrix(target.orientation).T - x[1:]
-            nodes[1] = jax.vmap(lambda e, v: axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
+            nodes[1] = jax.vmap(lambda e, v: rmp.axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
 
-    def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> Rmp:
+    def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> rmp.Rmp:
         """On the spheres' centres: all of them with all obstacles, the controllers' with the base as well."""
         pt1 = jnp.concatenate([self._cylinders[:, 0], obstacles.pt1])
         pt2 = jnp.concatenate([self._cylinders[:, 1], obstacles.pt2])
         radius = jnp.concatenate([self._cylinder_radius, obstacles.radius])
-        pairs = jax.vmap(jax.vmap(clearance, (None, None, 0, 0)), (0, 0, None, None))
-        distance, direction, rate, curvature = pairs(x, xd, pt1, pt2)
+        pairs = jax.vmap(jax.vmap(rmp.clearance, (None, None, 0, 0)), (0, 0, None, None))
+        found = pairs(x, xd, pt1, pt2)
+        if obstacles.center is not None:
+            assert obstacles.quat is not None and obstacles.size is not None
+            turn = jax.vmap(rotation_matrix)(obstacles.quat)
+            boxes = jax.vmap(jax.vmap(rmp.box_clearance, (None, None, 0, 0, 0)), (0, 0, None, None, None))
+            theirs = boxes(x, xd, obstacles.center, turn, obstacles.size)
+            found = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), found, theirs)
+            radius = jnp.concatenate([radius, jnp.zeros(len(obstacles.center))])
+        distance, direction, rate, curvature = found
         gap = distance - radius - self._radius[: len(x), None]
         meets = np.ones(gap.shape, np.float32)
         meets[self._controllers :, : len(self._cylinders)] = 0.0
-        leaf = collision_rmp(self.config.rmp_params.collision_rmp, gap, rate)
-        pushes = along(direction, curvature, Rmp(leaf.force * meets, leaf.metric * meets))
-        return Rmp(pushes.force.sum(axis=1), pushes.metric.sum(axis=1))
+        leaf = rmp.collision_rmp(self.config.rmp_params.collision_rmp, gap, rate)
+        pushes = rmp.along(direction, curvature, rmp.Rmp(leaf.force * meets, leaf.metric * meets))
+        return rmp.Rmp(pushes.force.sum(axis=1), pushes.metric.sum(axis=1))
 
-    def _joint_leaves(self, q, qd) -> Rmp:
+    def _joint_leaves(self, q, qd) -> rmp.Rmp:
         """On the joints themselves; the metric is diagonal."""
         p = self.config.rmp_params
-        leaves = [cspace_target_rmp(p.cspace_target_rmp, q, qd, self.default_q)]
-        leaves.append(joint_velocity_cap_rmp(p.joint_velocity_cap_rmp, qd))
+        leaves = [rmp.cspace_target_rmp(p.cspace_target_rmp, q, qd, self.default_q)]
+        leaves.append(rmp.joint_velocity_cap_rmp(p.joint_velocity_cap_rmp, qd))
         per_range = jnp.asarray(self._per_range)
         for limit, jac in zip(self._limits, (per_range, -per_range), strict=True):
-            leaf = joint_limit_rmp(p.joint_limit_rmp, jac * (q - limit), jac * qd)
-            leaves.append(Rmp(jac * leaf.force, jac**2 * leaf.metric))
+            leaf = rmp.joint_limit_rmp(p.joint_limit_rmp, jac * (q - limit), jac * qd)
+            leaves.append(rmp.Rmp(jac * leaf.force, jac**2 * leaf.metric))
         return jax.tree.map(lambda *parts: sum(parts), *leaves)
-
-
-def _dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
-    """Inner product in full precision: ``@`` takes the default of the device, on a GPU 10 bits."""
-    return jnp.sum(a * b)
-
-
-def _length(vec: Float[Array, " n"]) -> Float[Array, ""]:
-    """Euclidean norm, with a derivative also at zero."""
-    return jnp.sqrt(_dot(vec, vec) + 1e-12)
-
-
-def _bell(x, width):
-    return jnp.exp(-0.5 * (x / width) ** 2)
-
-
-def _boost(p: cfg.TargetCfg | cfg.AxisTargetCfg, distance):
-    beta = _bell(distance, p.proximity_metric_boost_length_scale)
-    return beta * p.proximity_metric_boost_scalar + 1.0 - beta
-
-
-def _weighted(metric: Float[Array, "3 3"], accel: Float[Array, "3"]) -> Rmp:
-    return Rmp(jnp.sum(metric * accel, axis=-1), metric)

@@ -6,20 +6,16 @@ symbols of ``mjx_nero.control.rmpflow``'s formulas are these keys. Lengths in m,
 
 import dataclasses
 import pathlib
-import re
-import typing
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, TypeVar
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
-import yaml
-
-from mjx_nero import config
-from mjx_nero.types import UserError
+from mjx_nero import files
+from mjx_nero.bounds import NonNegative, Positive, Share
+from mjx_nero.errors import UserError
+from mjx_nero.values import read, unknown
 
 Cfg = TypeVar("Cfg")
-Gain = Annotated[float, "a number of at least 0", lambda x: x >= 0]
-Positive = Annotated[float, "a number above 0", lambda x: x > 0]  # stands in a denominator
-Fraction = Annotated[float, "a number from 0 to 1", lambda x: 0 <= x <= 1]
+Gain = NonNegative
 Point = tuple[float, float, float]
 
 
@@ -84,7 +80,7 @@ class TargetCfg:
     accel_d_gain: Gain
     accel_norm_eps: Positive
     metric_alpha_length_scale: Positive
-    min_metric_alpha: Fraction
+    min_metric_alpha: Share
     max_metric_scalar: Gain
     min_metric_scalar: Gain
     proximity_metric_boost_scalar: Gain
@@ -221,16 +217,9 @@ def load(cls: type[Cfg], path: pathlib.Path) -> Cfg:
     Raises:
         UserError: no such file, no YAML, or an entry that is missing, unknown or of another type.
     """
+    node = files.read_yaml(path)
     try:
-        node = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as e:
-        raise UserError(f"{path}: cannot be read ({e.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        mark = getattr(e, "problem_mark", None)
-        line = f" in line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}: not valid YAML{line}: {getattr(e, 'problem', None) or ' '.join(str(e).split())}") from None
-    try:
-        return _read(cls, node, "")
+        return read(cls, node, "")
     except UserError as e:
         raise UserError(f"{path}: {e}") from None
 
@@ -267,61 +256,3 @@ def load_pair(descriptor: pathlib.Path, config: pathlib.Path, arm: Iterable[str]
         key = "rmp_params.joint_velocity_cap_rmp.velocity_damping_region"
         raise UserError(f"{config}: {key} takes a number up to max_velocity, {cap.max_velocity:g}")
     return robot, cfg
-
-
-def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
-    """Message: there is no such ``kind``, with a close match and all valid names."""
-    valid = list(valid)
-    return f"no {kind} {str(name)!r}{config.hint(str(name), valid)}; valid: {', '.join(valid)}"
-
-
-# YAML 1.1 wants a dot and a signed exponent in a float, so that ``1e-3``, as people and the tutorial write it, is a string.
-_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
-
-
-def _read(kind: Any, node: Any, key: str) -> Any:
-    """``node`` as a value of the annotation ``kind``; ``key`` is its dotted name."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
-        return _read_group(kind, node, key)
-    if origin is Annotated:
-        value = _read(args[0], node, key)
-        if not args[2](value):
-            raise UserError(f"{key} takes {args[1]}, got {node!r}")
-        return value
-    if origin is tuple:
-        size = None if args[-1] is ... else len(args)
-        if not isinstance(node, list) or size not in (None, len(node)):
-            raise UserError(f"{key} takes a list{f' of {size} numbers' if size else ''}, got {node!r}")
-        return tuple(_read(args[0], value, f"{key}[{i}]") for i, value in enumerate(node))
-    if origin is dict:
-        if not isinstance(node, Mapping) or not all(isinstance(name, str) for name in node):
-            raise UserError(f"{key} takes an entry 'name: value', got {node!r}")
-        return {name: _read(args[1], value, f"{key}.{name}") for name, value in node.items()}
-    if kind is float:
-        return _number(node, key)
-    if kind is not Any and not isinstance(node, kind):
-        raise UserError(f"{key} takes {'true or false' if kind is bool else 'a name'}, got {node!r}")
-    return node
-
-
-def _number(node: Any, key: str) -> float:
-    if isinstance(node, str) and _EXPONENT.fullmatch(node):
-        node = float(node)
-    if isinstance(node, bool) or not isinstance(node, int | float) or not abs(node) < 1e30:  # nan and inf fail it too
-        raise UserError(f"{key} takes a finite number, got {node!r}")
-    return float(node)
-
-
-def _read_group(cls: Any, node: Any, key: str) -> Any:
-    if not isinstance(node, Mapping):
-        raise UserError(f"{key or 'the file'} takes entries 'key: value', got {type(node).__name__} {str(node)[:40]!r}")
-    kinds = typing.get_type_hints(cls, include_extras=True)
-    prefix = f"{key}." if key else ""
-    for name in node:
-        if name not in kinds:
-            raise UserError(f"{prefix}{name}: {unknown('key', name, kinds)}")
-    for field in dataclasses.fields(cls):
-        if field.default is dataclasses.MISSING and field.name not in node:
-            raise UserError(f"{prefix}{field.name} is missing; {key or 'the file'} takes: {', '.join(kinds)}")
-    return cls(**{name: _read(kinds[name], value, prefix + name) for name, value in node.items()})

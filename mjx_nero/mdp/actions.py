@@ -1,17 +1,239 @@
-"""Actions: from the policy's output to position targets."""
+"""Action terms: from the policy's output to the drives' position targets, one after another as a task lists them.
 
+A term is a class, made as ``Term(drives, **params)``. ``home`` are the entries of the action that it reads, as they are at home;
+``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import jax
 import jax.numpy as jnp
+import numpy as np
+from flax import struct
 from jaxtyping import Array, Float
 
+from mjx_nero.bounds import NonNegative, Positive, Share, Steps
+from mjx_nero.mdp import memory as memories
+from mjx_nero.types import Key, UserError
 
-def joint_targets(action: Float[Array, " n"], *, scale: float, offset: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Absolute joint targets: ``offset + scale * action`` [rad]. Isaac Lab's ``JointPositionAction``."""
-    return offset + scale * action
+Memory = Any
 
 
-def binary_gripper(action: Float[Array, ""], *, open: Float[Array, " n"], close: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Closed for a negative action, else open [rad or m]. Isaac Lab's ``BinaryJointPositionAction``."""
-    return jnp.where(action < 0, close, open)
+@dataclasses.dataclass(frozen=True)
+class Drives:
+    """A group of drives, arrays along its joints [rad or m]; ``step`` is how far targets move in a control step."""
+
+    home: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    step: np.ndarray
+    open: np.ndarray
+    close: np.ndarray
+
+
+Groups = Mapping[str, Drives]  # ``arm`` and ``gripper``
+
+
+@struct.dataclass
+class Act:
+    """An action on its way to the drives. Positions and targets by group of drives [rad or m]."""
+
+    action: Float[Array, " na"]  # all of it, bounded
+    joint_pos: dict[str, Float[Array, " n"]]
+    ctrl: dict[str, Float[Array, " n"]]  # the targets now in force
+    targets: dict[str, Float[Array, " n"]]  # what comes of the action: at first, home
+
+    def to(self, group: str, targets: Float[Array, " n"]) -> "Act":
+        """With other targets of a group."""
+        return dataclasses.replace(self, targets={**self.targets, group: targets})
+
+
+class ActionTerm(Protocol):
+    """See above."""
+
+    home: np.ndarray
+
+    def init(self, key: Key, act: Act) -> Memory: ...
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Plain:
+    """What terms have in common that read no entry and remember nothing."""
+
+    groups: Groups
+
+    @property
+    def home(self) -> np.ndarray:
+        """No entry."""
+        return np.zeros(0, np.float32)
+
+    def init(self, key: Key, act: Act) -> Memory:
+        """Nothing."""
+        return ()
+
+
+@dataclasses.dataclass(frozen=True)
+class JointPosition(Plain):
+    """One entry a joint: ``home + scale * action`` [rad], within the joints' ranges. Isaac Lab's ``JointPositionAction``."""
+
+    scale: float = dataclasses.field(kw_only=True)
+    group: str = dataclasses.field(default="arm", kw_only=True)
+
+    @property
+    def home(self) -> np.ndarray:
+        """Zero."""
+        return np.zeros_like(self.groups[self.group].home)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of the group."""
+        drives = self.groups[self.group]
+        return memory, act.to(self.group, jnp.clip(drives.home + self.scale * own, drives.low, drives.high))
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveTargets(Plain):
+    """One entry a drive: its position target itself [rad or m], within the joints' ranges. For controllers."""
+
+    @property
+    def home(self) -> np.ndarray:
+        """The robot's."""
+        return np.concatenate([drives.home for drives in self.groups.values()])
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of all groups."""
+        for group, drives in self.groups.items():
+            targets, own = own[: len(drives.home)], own[len(drives.home) :]
+            act = act.to(group, jnp.clip(targets, drives.low, drives.high))
+        return memory, act
+
+
+@dataclasses.dataclass(frozen=True)
+class BinaryGripper(Plain):
+    """One entry, if there is a gripper: closed where negative, else open. Isaac Lab's ``BinaryJointPositionAction``."""
+
+    @property
+    def home(self) -> np.ndarray:
+        """Open."""
+        return np.zeros(int(len(self.groups["gripper"].home) > 0), np.float32)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of the gripper."""
+        drives = self.groups["gripper"]
+        if not len(own):
+            return memory, act
+        return memory, act.to("gripper", jnp.clip(jnp.where(own[0] < 0, drives.close, drives.open), drives.low, drives.high))
+
+
+@dataclasses.dataclass(frozen=True)
+class SpeedLimit(Plain):
+    """Targets move at most as fast as the drives."""
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of all groups, nearer to those in force."""
+        targets = {g: rate_limit(t, act.ctrl[g], step=jnp.asarray(self.groups[g].step)) for g, t in act.targets.items()}
+        return memory, dataclasses.replace(act, targets=targets)
+
+
+@dataclasses.dataclass(frozen=True)
+class Delay(Plain):
+    """The terms after this one get the action of some control steps ago (see ``memory.Delay``)."""
+
+    steps: Steps = dataclasses.field(kw_only=True)
+    hold: Share = dataclasses.field(default=1.0, kw_only=True)
+
+    def init(self, key: Key, act: Act) -> Memory:
+        """It has been home's."""
+        return memories.Delay(self.steps, self.hold).init(key, act.action)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """An action late."""
+        memory, action = memories.Delay(self.steps, self.hold).step(memory, act.action)
+        return memory, dataclasses.replace(act, action=action)
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise(Plain):
+    """The arm's targets are off by up to ``amount`` in every step [rad or m], uniformly, within the joints' ranges."""
+
+    amount: NonNegative = dataclasses.field(kw_only=True)
+
+    def init(self, key: Key, act: Act) -> Memory:
+        """Its own random key."""
+        return key
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of the arm."""
+        memory, k_noise = jax.random.split(memory)
+        drives, targets = self.groups["arm"], act.targets["arm"]
+        off = jax.random.uniform(k_noise, targets.shape, minval=-self.amount, maxval=self.amount)
+        return memory, act.to("arm", jnp.clip(targets + off, drives.low, drives.high))
+
+
+@dataclasses.dataclass(frozen=True)
+class LowPass(Plain):
+    """The terms after this one get the action smoothed by a first-order filter of time constant ``time`` [s], steps of ``dt``."""
+
+    time: Positive = dataclasses.field(kw_only=True)
+    dt: Positive = dataclasses.field(kw_only=True)
+
+    def init(self, key: Key, act: Act) -> Memory:
+        """It has been home's."""
+        return act.action
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """An action nearer to the last one."""
+        memory = memory + (1.0 - np.exp(-self.dt / self.time)) * (act.action - memory)
+        return memory, dataclasses.replace(act, action=memory)
+
+
+class Chain:
+    """All action terms of a task, in their order.
+
+    Args:
+        terms: by name.
+        groups: the robot's drives, in the order of ``ctrl``.
+
+    Attributes:
+        home: the action that keeps the robot at home [na].
+
+    Raises:
+        UserError: no term reads the action.
+    """
+
+    def __init__(self, terms: Mapping[str, Any], groups: Groups):
+        self.terms: dict[str, ActionTerm] = {name: term.func(groups, **term.params) for name, term in terms.items()}
+        self._groups, sizes = groups, [len(term.home) for term in self.terms.values()]
+        self._splits = np.cumsum(sizes)[:-1]
+        if not sum(sizes):
+            raise UserError(f"none of the actions {', '.join(terms) or '(there are none)'} reads the policy's output")
+        self.home = np.concatenate([np.asarray(term.home, np.float32) for term in self.terms.values()])
+
+    def init(self, key: Key, joint_pos: Float[Array, " nj"]) -> dict[str, Memory]:
+        """What the terms remember at the start, by their dotted names in the task; those that remember nothing are left out."""
+        act = self._act(jnp.asarray(self.home), joint_pos, joint_pos)
+        memory = {f"actions.{n}": term.init(jax.random.fold_in(key, i), act) for i, (n, term) in enumerate(self.terms.items())}
+        return {name: value for name, value in memory.items() if jax.tree.leaves(value)}
+
+    def step(
+        self, memory: Mapping[str, Memory], action: Float[Array, " na"], joint_pos: Float[Array, " nj"], ctrl: Float[Array, " nu"]
+    ) -> tuple[dict[str, Memory], Float[Array, " nu"]]:
+        """The drives' targets for an action; of the episode's memory, what is the terms' changes."""
+        act, after = self._act(action, joint_pos, ctrl), dict(memory)
+        for i, (name, term) in enumerate(self.terms.items()):
+            own = jnp.split(act.action, self._splits)[i]
+            remembered, act = term.step(memory.get(f"actions.{name}", ()), own, act)
+            if f"actions.{name}" in memory:
+                after[f"actions.{name}"] = remembered
+        return after, jnp.concatenate(list(act.targets.values()))
+
+    def _act(self, action, joint_pos, ctrl) -> Act:
+        ends = np.cumsum([len(drives.home) for drives in self._groups.values()])[:-1]
+        joints, now = (dict(zip(self._groups, jnp.split(x, ends), strict=True)) for x in (joint_pos, ctrl))
+        targets = {g: jnp.asarray(np.clip(drives.home, drives.low, drives.high)) for g, drives in self._groups.items()}
+        return Act(action, joints, now, targets)
 
 
 def rate_limit(target: Float[Array, " n"], ctrl: Float[Array, " n"], *, step: Float[Array, " n"]) -> Float[Array, " n"]:

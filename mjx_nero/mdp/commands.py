@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
+from mjx_nero.bounds import Range
 from mjx_nero.types import Key
 
-Range = tuple[float, float]
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
 
@@ -15,6 +15,11 @@ def uniform_position(key: Key, *, x: Range, y: Range, z: Range) -> Float[Array, 
     """A point drawn uniformly from a box in the robot's root frame [m]."""
     low, high = jnp.array([x, y, z]).T
     return jax.random.uniform(key, (3,), minval=low, maxval=high)
+
+
+def nothing(key: Key) -> Float[Array, "3"]:
+    """No goal: the robot's root."""
+    return jnp.zeros(3)
 
 
 def pose(key: Key, *, x: Range, y: Range, z: Range, quat: tuple[float, float, float, float]) -> Pose:

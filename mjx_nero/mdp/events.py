@@ -1,26 +1,120 @@
-"""Reset events: (key, joint_pos, object_pos, *, params) -> (joint_pos, object_pos), applied in order at every reset."""
+"""Reset events: (key, start, *, params) -> start, applied in order at every reset."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from mjx_nero.types import Key
-
-Start = tuple[Float[Array, " nj"], Float[Array, "3"]]
-Range = tuple[float, float]
+from mjx_nero import math
+from mjx_nero.bounds import Counts, NonNegative, Positive, Range
+from mjx_nero.types import Key, Start, UserError
 
 
-def object_position_uniform(key: Key, joint_pos, object_pos, *, x: Range, y: Range, z: Range) -> Start:
-    """Moves the object by a uniform offset from where it was [m]."""
+def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Range, object: str = "cube") -> Start:
+    """Puts the object at a uniform ``x`` and ``y`` of the world, ``z`` above where it was [m]."""
     low, high = jnp.array([x, y, z]).T
-    return joint_pos, object_pos + jax.random.uniform(key, (3,), minval=low, maxval=high)
+    height = start.object_pos_w[object] * jnp.array([0.0, 0.0, 1.0])
+    pos = height + jax.random.uniform(key, (3,), minval=low, maxval=high)
+    return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
 
 
-def joints_by_scale(key: Key, joint_pos, object_pos, *, low: float, high: float) -> Start:
+def scatter(
+    key: Key,
+    start: Start,
+    *,
+    objects: tuple[str, ...],
+    count: Counts,
+    x: Range,
+    y: Range,
+    pitch: Positive,
+    jitter: NonNegative,
+    away: tuple[float, float],
+) -> Start:
+    """Puts some of the objects on the table and chooses the one that is commanded; the others are parked far away.
+
+    The commanded one lies anywhere in a box of the world, the others in cells around it, of a grid of which it is the centre; all
+    are turned about the vertical at random. Which come, where, and which is commanded are equally likely for all.
+
+    Args:
+        objects: up to nine; the index of the commanded one is ``start.target``.
+        count: the least and the most of them that come.
+        x, y: of the commanded one [m].
+        pitch: from one cell to the next [m].
+        jitter: how far from the middle of its cell an object may lie, along x and y [m]: two of them are at least ``pitch - 2
+            jitter`` apart.
+        away: x and y where the first of the parked objects would lie; the next ones ``pitch`` further along x [m].
+
+    Raises:
+        UserError: there are more objects than cells, or fewer objects than may come.
+    """
+    n = len(objects)
+    if not 1 <= count[0] <= count[1] <= n <= 9:
+        raise UserError(
+            f"scatter takes up to 9 objects and a count from 1 to their number, got {n} objects and the count {count}"
+        )
+    k_rank, k_count, k_at, k_cell, k_jitter, k_turn = jax.random.split(key, 6)
+    rank = jnp.argsort(jax.random.uniform(k_rank, (n,)))  # the first is commanded, the next ones come
+    there = rank < jax.random.randint(k_count, (), count[0], count[1] + 1)
+    low, high = jnp.array([x, y]).T
+    at = jax.random.uniform(k_at, (2,), minval=low, maxval=high)
+    cells = jnp.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j], jnp.float32)
+    cells = pitch * cells[jnp.argsort(jax.random.uniform(k_cell, (8,)))]
+    cells += jax.random.uniform(k_jitter, (8, 2), minval=-jitter, maxval=jitter)
+    lying = at + jnp.concatenate([jnp.zeros((1, 2)), cells])[rank]
+    parked = jnp.array(away) + pitch * jnp.stack([jnp.arange(n), jnp.zeros(n)], axis=1)
+    place = jnp.where(there[:, None], lying, parked)
+    turns = jax.random.uniform(k_turn, (n,), minval=-jnp.pi, maxval=jnp.pi)
+    pos, quat = dict(start.object_pos_w), dict(start.object_quat_w)
+    for i, name in enumerate(objects):
+        pos[name] = jnp.append(place[i], pos[name][2])
+        quat[name] = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), turns[i]), quat[name])
+    return dataclasses.replace(start, object_pos_w=pos, object_quat_w=quat, target=jnp.argmin(rank))
+
+
+def objects_apart(key: Key, start: Start, *, objects: tuple[str, ...], x: Range, y: Range, apart: Positive) -> Start:
+    """Puts objects at uniform ``x`` and ``y`` of the world, at least ``apart`` from one another along the longer of the two [m].
+
+    Exact and without a second try: uniform points on what is left of that side without the gaps, in order, with the gaps put back
+    in, for the objects in random order.
+
+    Raises:
+        UserError: there is no room for that many.
+    """
+    sides, n = (x, y), len(objects)
+    along = int(y[1] - y[0] > x[1] - x[0])
+    free = sides[along][1] - sides[along][0] - (n - 1) * apart
+    if free < 0:
+        raise UserError(f"{n} objects {apart:g} m apart take {(n - 1) * apart:g} m, and x {x} and y {y} are shorter")
+    k_along, k_aside, k_order = jax.random.split(key, 3)
+    place = sides[along][0] + free * jnp.sort(jax.random.uniform(k_along, (n,))) + apart * jnp.arange(n)
+    aside = jax.random.uniform(k_aside, (n,), minval=sides[1 - along][0], maxval=sides[1 - along][1])
+    at = jnp.stack([place, aside][:: 1 - 2 * along])[:, jax.random.permutation(k_order, n)]
+    pos = {name: jnp.append(at[:, i], start.object_pos_w[name][2]) for i, name in enumerate(objects)}
+    return dataclasses.replace(start, object_pos_w={**start.object_pos_w, **pos})
+
+
+def object_yaw_uniform(key: Key, start: Start, *, yaw: Range, object: str = "cube") -> Start:
+    """Turns the object about the vertical by a uniform angle [rad]."""
+    angle = jax.random.uniform(key, (), minval=yaw[0], maxval=yaw[1])
+    quat = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), angle), start.object_quat_w[object])
+    return dataclasses.replace(start, object_quat_w={**start.object_quat_w, object: quat})
+
+
+def joints_by_scale(key: Key, start: Start, *, low: float, high: float) -> Start:
     """Multiplies every joint position by a uniform factor from ``low`` to ``high``. Isaac Lab's ``reset_joints_by_scale``."""
-    return joint_pos * jax.random.uniform(key, joint_pos.shape, minval=low, maxval=high), object_pos
+    joint_pos = start.joint_pos
+    return dataclasses.replace(start, joint_pos=joint_pos * jax.random.uniform(key, joint_pos.shape, minval=low, maxval=high))
 
 
-def joints_offset_uniform(key: Key, joint_pos, object_pos, *, offset: float) -> Start:
+def joints_offset_uniform(key: Key, start: Start, *, offset: NonNegative) -> Start:
     """Moves every joint by a uniform offset of at most ``offset`` [rad or m]; ranges are kept by the caller."""
-    return joint_pos + jax.random.uniform(key, joint_pos.shape, minval=-offset, maxval=offset), object_pos
+    joint_pos = start.joint_pos
+    return dataclasses.replace(
+        start, joint_pos=joint_pos + jax.random.uniform(key, joint_pos.shape, minval=-offset, maxval=offset)
+    )
+
+
+def joint_turned(key: Key, start: Start, *, joint: int, by: Range) -> Start:
+    """Moves one joint, counted from 0, by a uniform offset [rad or m]; ranges are kept by the caller."""
+    offset = jax.random.uniform(key, minval=by[0], maxval=by[1])
+    return dataclasses.replace(start, joint_pos=start.joint_pos.at[joint].add(offset))

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
+from mjx_nero.bounds import Count, Positive
+from mjx_nero.mdp import success
 from mjx_nero.types import View
 
 
@@ -22,9 +24,9 @@ def joint_vel_rel(view: View) -> Float[Array, " nj"]:
     return view.joint_vel
 
 
-def object_position(view: View) -> Float[Array, "3"]:
+def object_position(view: View, *, object: str = "cube") -> Float[Array, "3"]:
     """Object in the robot's root frame [m]."""
-    return view.object_pos_w - view.root_pos_w
+    return view.objects[object].pos_w - view.root_pos_w
 
 
 def command(view: View) -> Float[Array, "3"]:
@@ -47,14 +49,21 @@ def ee_position(view: View) -> Float[Array, "3"]:
     return view.ee_pos_w - view.root_pos_w
 
 
-def ee_to_object(view: View) -> Float[Array, "3"]:
+def ee_to_object(view: View, *, object: str = "cube") -> Float[Array, "3"]:
     """From the grasp point to the object [m]."""
-    return view.object_pos_w - view.ee_pos_w
+    return view.objects[object].pos_w - view.ee_pos_w
 
 
-def object_to_goal(view: View) -> Float[Array, "3"]:
+def ee_to_objects(view: View, *, objects: tuple[str, ...], limit: Positive) -> Float[Array, " n"]:
+    """From the grasp point to each of the objects, one after another; to what is further away than ``limit``, only so far [m]."""
+    ways = jnp.stack([view.objects[name].pos_w - view.ee_pos_w for name in objects])
+    far = jnp.linalg.norm(ways, axis=1, keepdims=True)
+    return (ways * jnp.minimum(1.0, limit / jnp.maximum(far, 1e-6))).reshape(-1)
+
+
+def object_to_goal(view: View, *, object: str = "cube") -> Float[Array, "3"]:
     """From the object to the commanded point [m]."""
-    return view.goal_pos_w - view.object_pos_w
+    return view.goal_pos_w - view.objects[object].pos_w
 
 
 def target_error(view: View) -> Float[Array, " nj"]:
@@ -62,14 +71,25 @@ def target_error(view: View) -> Float[Array, " nj"]:
     return view.ctrl - view.joint_pos
 
 
-def object_velocity(view: View) -> Float[Array, "6"]:
+def object_velocity(view: View, *, object: str = "cube") -> Float[Array, "6"]:
     """Linear [m/s] and angular [rad/s] velocity of the object."""
-    return jnp.concatenate([view.object_linvel_w, view.object_angvel_local])
+    seen = view.objects[object]
+    return jnp.concatenate([seen.linvel_w, seen.angvel_local])
 
 
-def object_orientation(view: View) -> Float[Array, "4"]:
+def object_orientation(view: View, *, object: str = "cube") -> Float[Array, "4"]:
     """Orientation of the object, wxyz."""
-    return view.object_quat_w
+    return view.objects[object].quat_w
+
+
+def object_heading(view: View, *, object: str = "cube") -> Float[Array, "2"]:
+    """Where the object's x axis points, seen from above: its x and y in the world."""
+    return math.rotate(view.objects[object].quat_w, jnp.array([1.0, 0.0, 0.0]))[:2]
+
+
+def object_turn_to_goal(view: View, *, fold: Count = 1, object: str = "cube") -> Float[Array, "3"]:
+    """The rotation vector that turns the object to the goal's orientation (see ``success.object_turn``) [rad]."""
+    return success.object_turn(view, fold=fold, object=object)
 
 
 def ee_to_goal(view: View) -> Float[Array, "3"]:
@@ -90,6 +110,12 @@ def ee_orientation(view: View) -> Float[Array, "4"]:
 def goal_position(view: View) -> Float[Array, "3"]:
     """Where the goal is now, in the robot's root frame [m]."""
     return view.goal_pos_w - view.root_pos_w
+
+
+def obstacle(view: View, *, obstacle: str) -> Float[Array, "10"]:
+    """Position in the robot's root frame [m], orientation (wxyz) and edges [m] of an obstacle."""
+    box = view.obstacles[obstacle]
+    return jnp.concatenate([box.pos_w - view.root_pos_w, box.quat_w, box.size])
 
 
 def goal_orientation(view: View) -> Float[Array, "4"]:

@@ -3,43 +3,45 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjx_nero import math
+from mjx_nero.bounds import Count, Positive
 from mjx_nero.mdp import success
 from mjx_nero.types import View
 
 
-def _ee_distance(view: View) -> Float[Array, ""]:
-    return jnp.linalg.norm(view.object_pos_w - view.ee_pos_w)
+def _ee_distance(view: View, object: str) -> Float[Array, ""]:
+    return jnp.linalg.norm(view.objects[object].pos_w - view.ee_pos_w)
 
 
-def held(view: View, *, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
+def held(view: View, *, minimal_height: float, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
     """The object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
     A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point.
     """
-    return (view.object_pos_w[2] > minimal_height) & (_ee_distance(view) < grasp_radius)
+    return (view.objects[object].pos_w[2] > minimal_height) & (_ee_distance(view, object) < grasp_radius)
 
 
-def object_ee_distance(view: View, *, std: float) -> Float[Array, ""]:
+def object_ee_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:
     """1 - tanh(d / std), d the distance from the grasp point to the object [m]. Isaac Lab's lift task."""
-    return 1.0 - jnp.tanh(_ee_distance(view) / std)
+    return 1.0 - jnp.tanh(_ee_distance(view, object) / std)
 
 
-def object_is_lifted(view: View, *, minimal_height: float) -> Float[Array, ""]:
+def object_is_lifted(view: View, *, minimal_height: float, object: str = "cube") -> Float[Array, ""]:
     """1 while the object's centre is above ``minimal_height`` [m]. Isaac Lab's lift task."""
-    return (view.object_pos_w[2] > minimal_height).astype(jnp.float32)
+    return (view.objects[object].pos_w[2] > minimal_height).astype(jnp.float32)
 
 
-def object_goal_distance(view: View, *, std: float, minimal_height: float) -> Float[Array, ""]:
+def object_goal_distance(view: View, *, std: Positive, minimal_height: float, object: str = "cube") -> Float[Array, ""]:
     """1 - tanh(distance to the commanded point / std), while lifted. Isaac Lab's lift task."""
-    return object_is_lifted(view, minimal_height=minimal_height) * (1.0 - jnp.tanh(success.object_distance(view) / std))
+    return object_is_lifted(view, minimal_height=minimal_height, object=object) * goal_distance(view, std=std, object=object)
 
 
-def goal_distance(view: View, *, std: float) -> Float[Array, ""]:
+def goal_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:
     """1 - tanh(distance of the object to the goal / std)."""
-    return 1.0 - jnp.tanh(success.object_distance(view) / std)
+    return 1.0 - jnp.tanh(success.object_distance(view, object=object) / std)
 
 
-def ee_goal_distance(view: View, *, std: float) -> Float[Array, ""]:
+def ee_goal_distance(view: View, *, std: Positive) -> Float[Array, ""]:
     """1 - tanh(distance of the end effector to the goal / std)."""
     return 1.0 - jnp.tanh(success.ee_distance(view) / std)
 
@@ -54,7 +56,7 @@ def ee_orientation_error(view: View) -> Float[Array, ""]:
     return success.ee_angle(view)
 
 
-def ee_goal_pose(view: View, *, std: float, angle_std: float) -> Float[Array, ""]:
+def ee_goal_pose(view: View, *, std: Positive, angle_std: Positive) -> Float[Array, ""]:
     """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), from the end effector to the goal.
 
     As a sum, a turn that is right in the wrong place would hold the arm there.
@@ -62,21 +64,40 @@ def ee_goal_pose(view: View, *, std: float, angle_std: float) -> Float[Array, ""
     return ee_goal_distance(view, std=std) * (1.0 - jnp.tanh(success.ee_angle(view) / angle_std))
 
 
-def object_is_held(view: View, *, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+def object_is_held(view: View, *, minimal_height: float, grasp_radius: Positive, object: str = "cube") -> Float[Array, ""]:
     """1 while the object is held (see ``held``)."""
-    return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius).astype(jnp.float32)
+    return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object).astype(jnp.float32)
 
 
-def held_goal_distance(view: View, *, std: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+def held_goal_distance(
+    view: View, *, std: Positive, minimal_height: float, grasp_radius: Positive, object: str = "cube"
+) -> Float[Array, ""]:
     """1 - tanh(distance to the commanded point / std), while held."""
-    gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
-    return gate * (1.0 - jnp.tanh(success.object_distance(view) / std))
+    gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)
+    return gate * (1.0 - jnp.tanh(success.object_distance(view, object=object) / std))
 
 
-def held_at_goal(view: View, *, threshold: float, minimal_height: float, grasp_radius: float) -> Float[Array, ""]:
+def held_at_goal(
+    view: View, *, threshold: Positive, minimal_height: float, grasp_radius: Positive, object: str = "cube"
+) -> Float[Array, ""]:
     """1 while the object is held within ``threshold`` [m] of the commanded point."""
-    gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius)
-    return (gate & success.object_at_goal(view, threshold=threshold)).astype(jnp.float32)
+    gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)
+    return (gate & success.object_at_goal(view, threshold=threshold, object=object)).astype(jnp.float32)
+
+
+def object_goal_pose(
+    view: View, *, std: Positive, angle_std: Positive, fold: Count = 1, object: str = "cube"
+) -> Float[Array, ""]:
+    """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), object to goal (see ``success.object_turn``)."""
+    angle = jnp.linalg.norm(success.object_turn(view, fold=fold, object=object))
+    return goal_distance(view, std=std, object=object) * (1.0 - jnp.tanh(angle / angle_std))
+
+
+def object_at_pose(
+    view: View, *, threshold: Positive, angle: Positive, fold: Count = 1, object: str = "cube"
+) -> Float[Array, ""]:
+    """1 while the object is within ``threshold`` [m] and ``angle`` [rad] of the goal (``success.object_turn``)."""
+    return success.object_at_pose(view, threshold=threshold, angle=angle, fold=fold, object=object).astype(jnp.float32)
 
 
 def action_rate_l2(view: View) -> Float[Array, ""]:
@@ -87,3 +108,14 @@ def action_rate_l2(view: View) -> Float[Array, ""]:
 def joint_vel_l2(view: View) -> Float[Array, ""]:
     """Squared joint speeds, all joints of the robot [rad^2/s^2, m^2/s^2]."""
     return jnp.sum(jnp.square(view.joint_vel))
+
+
+def touching(view: View) -> Float[Array, ""]:
+    """1 while an obstacle is touched, or the robot touches itself."""
+    return success.touched(view).astype(jnp.float32)
+
+
+def obstacle_nearness(view: View, *, margin: Positive) -> Float[Array, ""]:
+    """How far the end effector has come into the ``margin`` [m] about an obstacle: 0 at its edge, 1 at the obstacle's surface."""
+    far = [math.box_distance(view.ee_pos_w, box.pos_w, box.quat_w, box.size) for box in view.obstacles.values()]
+    return jnp.clip(1.0 - jnp.min(jnp.stack(far)) / margin, 0.0, 1.0)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from mjx_nero.bounds import Positive
 from mjx_nero.types import View
 
 
@@ -11,12 +12,23 @@ def time_out(view: View) -> Bool[Array, ""]:
     return view.step >= view.max_steps
 
 
-def object_below(view: View, *, minimum_height: float) -> Bool[Array, ""]:
+def object_below(view: View, *, minimum_height: float, object: str = "cube") -> Bool[Array, ""]:
     """The object's centre is below ``minimum_height`` [m]. Isaac Lab's ``root_height_below_minimum``."""
-    return view.object_pos_w[2] < minimum_height
+    return view.objects[object].pos_w[2] < minimum_height
 
 
-def object_off_table(view: View, *, center: tuple[float, float], size: tuple[float, float]) -> Bool[Array, ""]:
+def object_off_table(
+    view: View, *, center: tuple[float, float], size: tuple[Positive, Positive], object: str = "cube"
+) -> Bool[Array, ""]:
     """The object's centre has left the table top, where it would fall (the plane that carries it has no edge) [m]."""
-    offset = jnp.abs(view.object_pos_w[:2] - jnp.asarray(center))
+    offset = jnp.abs(view.objects[object].pos_w[:2] - jnp.asarray(center))
     return jnp.any(offset > jnp.asarray(size) / 2)
+
+
+def any_off_table(
+    view: View, *, center: tuple[float, float], size: tuple[Positive, Positive], objects: tuple[str, ...], parked: Positive
+) -> Bool[Array, ""]:
+    """One of the objects has left the table top (see ``object_off_table``); those further than ``parked`` from its centre along x
+    or y have never been on it [m]."""
+    offset = jnp.stack([jnp.abs(view.objects[name].pos_w[:2] - jnp.asarray(center)) for name in objects])
+    return jnp.any((offset > jnp.asarray(size) / 2).any(axis=1) & (offset < parked).all(axis=1))

@@ -1,27 +1,34 @@
 """Which links collide, with what, and by which shape."""
 
 import numpy as np
+from jaxtyping import Float
 
-from mjx_nero.urdf import fit, mjcf, reach
+from mjx_nero.urdf import mjcf, primitives
+from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.fingers import Hand
-from mjx_nero.urdf.looks import Look, Looks
-from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf.geometry import Look, Looks
+from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Pose, Tree
 
 SMALL = 0.05  # of the largest collision shape of a body: others below this volume are left out
+FEW = 3  # collisions of a link, up to which each may have a shape of its own
 NEAR = 0.02  # [m] links that stay this far above the table never meet it
-_CUBE = {"sphere": 1, "capsule": 2, "box": 8}  # contacts of a shape with a cube; with the table: fit.CONTACTS
-Collisions = dict[str, list[tuple[str, fit.Primitive, int]]]  # link -> (name, shape in its frame, contact bits)
+FEW_POINTS = 20  # of a link's surface, that no shape is fitted to
+_CUBE = {"sphere": 1, "capsule": 2, "box": 8}  # contacts of a shape with a cube; with the table: primitives.CONTACTS
+Vec4 = Float[np.ndarray, "4"]
+Collisions = dict[str, list[tuple[str, primitives.Primitive, int]]]  # link -> (name, shape in its frame, contact bits)
 
 
-def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, cloud: reach.Cloud, notes: Notes) -> Collisions:
+def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, cloud: Cloud, notes: Notes) -> Collisions:
     """Link -> its collision shapes. The gripper's pads meet table and cube, links that get near the table meet that.
 
-    The base has none, and the inner links of a gripper have none: the pads get to things first.
+    The base has none, and the inner links of a gripper have none: the pads get to things first. For the same reason what is
+    around the palm ends where the pads begin; descriptions put hulls there that reach beyond the fingers, to plan with.
     """
     out: Collisions = {name: [] for name in tree.links}
     for body in parts.values():
-        done: list[tuple[fit.Primitive, Pose]] = []
+        done: list[tuple[primitives.Primitive, Pose]] = []
+        balls: list[Vec4] = []  # about each of them, in the body: centre and radius
         fitted = {
             link: _shapes(look.surfaces, look.exact)
             for link, look in ((link, looks.of[link]) for link in body.links)
@@ -37,7 +44,9 @@ def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, clo
             if link not in fitted:
                 continue
             shapes, points = fitted[link], looks.of[link].points
-            hidden = points is not None and any(_within(points, at, shape, other) for shape, other in done)
+            if points is not None and hand.link in body.links and hand.joints:
+                shapes = _palm(shapes, points, np.linalg.inv(at) @ body.links[hand.link] @ hand.site, hand, link, notes)
+            hidden = points is not None and _hidden(points, at, done, balls)
             if hidden or sum(shape.volume for shape in shapes) < SMALL * largest:
                 notes.add("note", "link", link, "small beside, or within, the collision shape of what it is fixed to: has none")
                 continue
@@ -50,34 +59,67 @@ def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, clo
                     notes.add("note", "link", link, "never leaves the table, as a base: does not collide")
                 out[link].append((link if len(shapes) == 1 else f"{link}_{i + 1}", shape, bits))
                 done.append((shape, at))
+                balls.append(np.append((at @ shape.pose)[:3, 3], shape.radius))
     return out
 
 
-def _shapes(surfaces: list[tuple[Points, float]], exact: list[fit.Primitive | None]) -> list[fit.Primitive]:
+def _shapes(surfaces: list[tuple[Points, float]], exact: list[primitives.Primitive | None]) -> list[primitives.Primitive]:
     """One shape for all collisions of a link, or one each if that is much tighter and they are few."""
-    each = [e or fit.best(points, volume) for e, (points, volume) in zip(exact, surfaces, strict=True)]
+    few = len(surfaces) <= FEW
+    each = [e or primitives.best(points, volume) for e, (points, volume) in zip(exact, surfaces, strict=True) if few]
     if len(each) == 1:
         return each
     points = np.concatenate([p for p, _ in surfaces])
-    whole = fit.best(points, fit.hull(points))
-    return each if len(each) <= 3 and sum(s.volume for s in each) < 0.6 * whole.volume else [whole]
+    whole = primitives.best(points, primitives.hull(points))
+    return each if few and sum(s.volume for s in each) < 0.6 * whole.volume else [whole]
 
 
-def _within(points: Points, at: Pose, shape: fit.Primitive, other: Pose) -> bool:
-    """Whether 95% of a link's points, the link at ``at`` in its body, lie inside another link's shape."""
-    pose = np.linalg.inv(other) @ at
-    return bool(shape.contains(points @ pose[:3, :3].T + pose[:3, 3]).mean() > 0.95)
+def _palm(
+    shapes: list[primitives.Primitive], points: Points, site: Pose, hand: Hand, link: str, notes: Notes
+) -> list[primitives.Primitive]:
+    """The shapes of a link beside the gripper; if one reaches beyond the pads a box around what lies behind them, if any.
+
+    Args:
+        points: of its surface [n, 3]; ``site``: the grasp point's pose [4, 4], both in the link.
+    """
+    approach = site[:3, :3] @ hand.approach
+    middle = approach @ (site[:3, 3] + site[:3, :3] @ hand.grip)
+    row = np.append(-approach, 0.0)[None]
+    if max(-float(shape.lowest(row)[0]) for shape in shapes) <= middle + hand.pad[0] / 2:
+        return shapes
+    behind = points[points @ approach < middle - hand.pad[0] / 2]
+    across = site[:3, :3] @ hand.opening
+    notes.add("repaired", "link", link, "its collision shape reached beyond the fingers: ends where their pads begin")
+    if len(behind) < FEW_POINTS:
+        return []
+    box = primitives.box(behind, np.column_stack([approach, across, np.cross(approach, across)]))
+    return [primitives.measured(box, points, primitives.hull(points))]
+
+
+def _hidden(points: Points, at: Pose, done: list[tuple[primitives.Primitive, Pose]], balls: list[Vec4]) -> bool:
+    """Whether 95% of a link's points, the link at ``at`` in its body, lie inside one of the shapes in other links."""
+    if not done:
+        return False
+    points = points @ at[:3, :3].T + at[:3, 3]
+    # Half of the coordinates lie on either side of their median, so with most of the points it is near the shape, too.
+    around = np.array(balls)
+    away = np.abs(around[:, :3] - np.median(points, axis=0)).max(1)
+    for i in np.flatnonzero(away <= around[:, 3]):
+        shape, other = done[i]
+        if shape.contains((points - other[:3, 3]) @ other[:3, :3]).mean() > 0.95:
+            return True
+    return False
 
 
 def contacts(found: Collisions) -> dict[str, int]:
     """Most contacts of the robot with the table, and of table, robot and one cube together."""
     shapes = [(s.kind, bits) for items in found.values() for _, s, bits in items]
-    table = sum(fit.CONTACTS[kind] for kind, bits in shapes if bits & mjcf.TABLE)
+    table = sum(primitives.CONTACTS[kind] for kind, bits in shapes if bits & mjcf.TABLE)
     cube = sum(_CUBE[kind] for kind, bits in shapes if bits & mjcf.CUBE)
     return {"table": table, "table_and_cube": table + cube + 4}
 
 
-def covered(look: Look, shapes: list[fit.Primitive]) -> float | None:
+def covered(look: Look, shapes: list[primitives.Primitive]) -> float | None:
     """Share of the link's surface inside any of its collision shapes; None without either."""
     if look.points is None or look.guessed or not shapes:
         return None

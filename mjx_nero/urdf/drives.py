@@ -1,28 +1,30 @@
 """Drives of an imported robot: gains from a file, or worked out from the inertia that each joint moves."""
 
-import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
-from mjx_nero import config
+from mjx_nero import files
+from mjx_nero.sim.gains import critical_damping
+from mjx_nero.sim.robot_file import COLUMNS, MAX_NUMBER
 from mjx_nero.types import UserError
-from mjx_nero.urdf import files
 from mjx_nero.urdf.fingers import Hand
-from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint
+from mjx_nero.values import hint, read, short
 
 FREQUENCY = 20.0  # [rad/s] natural frequency of the arm's drives: a tenth of what 100 physics steps a second can follow
 STRETCH = 0.05  # [rad, m] position error at which a drive gives its full effort, at the least
+STUCK = 0.01  # [rad, m] most that dry friction keeps a joint from where it should be
+DT = 1 / 60  # [s] longest physics step of the tasks
 SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
 FORCE = 60.0  # [N] most that a finger gives
+PLACEHOLDER = 1.0  # [N m, N] exporters write it where nobody gave an effort
 FINGER = 0.3  # [kg] rotor inertia of a sliding finger, or at the end of a turning one (why: assets/nero/nero.xml)
-_COLUMNS = ("stiffness", "damping", "effort", "speed")
 Rows = dict[str, dict[str, float]]
 
 
@@ -30,25 +32,21 @@ def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
     """``joint -> {stiffness, damping, effort, speed}``, the last two optional, from a YAML file.
 
     Raises:
-        UserError: no such file, no YAML, an unknown joint or column, or a value that is not above 0 (damping: below 0).
+        UserError: no such file, no YAML, an unknown joint or column, or a value that is not above 0 (damping: below 0) or is
+            beyond ``robot_file.MAX_NUMBER``.
     """
-    try:
-        raw = yaml.safe_load(files.read(path, 1_000_000))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from None
+    raw = files.read_yaml(path)
     if not isinstance(raw, Mapping) or not raw:
         raise UserError(f"{path} takes joint: {{stiffness: .., damping: ..}} for each joint, got {type(raw).__name__}")
     out: Rows = {}
     for name, row in raw.items():
         if name not in joints:
-            raise UserError(f"{path} names joint {name!r}{config.hint(str(name), joints)}: choose from {', '.join(joints)}")
-        if not isinstance(row, Mapping) or not {"stiffness", "damping"} <= set(row) or not set(row) <= set(_COLUMNS):
-            raise UserError(f"{path}: {name} takes stiffness and damping, and at will effort and speed; got {str(row)[:80]}")
-        for column, value in row.items():
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value < 0 or value == 0 and column != "damping":
-                raise UserError(f"{path}: {name}.{column} has to be a number above 0, got {str(value)[:80]}")
-        out[str(name)] = {column: float(value) for column, value in row.items()}
+            raise UserError(f"{path} names joint {short(name)}{hint(str(name), joints)}: choose from {', '.join(joints)}")
+        if not isinstance(row, Mapping) or not {"stiffness", "damping"} <= set(row) or not set(row) <= set(COLUMNS):
+            raise UserError(f"{path}: {name} takes stiffness and damping, and at will effort and speed; got {short(row)}")
+        out[str(name)] = {
+            column: read(kind, row[column], f"{path}: {name}.{column}") for column, kind in COLUMNS.items() if column in row
+        }
     return out
 
 
@@ -93,34 +91,40 @@ def rows(
 ) -> Rows:
     """Stiffness, damping, effort and speed of every driven joint: as given, else by rule.
 
-    Effort and speed are the URDF's limits, the latter at most ``SPEED``. An arm's drive has the natural frequency ``FREQUENCY``
-    with the most inertia that the joint moves, or less if it would reach its full effort within ``STRETCH``; a finger's gives its
-    full effort (at most ``FORCE`` at its end) at ``SQUEEZE``. Damping is critical.
+    Effort and speed are the URDF's limits, the latter at most ``SPEED``; an effort of 1 that all joints have, or that hardly
+    moves its joint, is none. An arm's drive has the natural frequency ``FREQUENCY`` with the most inertia that the joint moves,
+    more if the joint's own damping would make it creep or its friction stop it more than ``STUCK`` away, less if it would reach
+    its full effort within ``STRETCH``; a finger's gives its full effort (at most ``FORCE`` at its end) at ``SQUEEZE``. Damping is
+    what the joint lacks to critical, at the package's longest physics step too.
     """
     out: Rows = {}
-    for body in parts.values():
-        joint = body.joint
-        if joint is None or joint.mimic:
-            continue
-        total = inertia[joint.name] + rotors[joint.name]
+    driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
+    unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
+    followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic]
+    for joint in driven:
+        moved = [(joint.name, 1.0), *((j.name, j.mimic[1]) for j in followers if j.mimic and j.mimic[0] == joint.name)]
+        total = float(sum(ratio**2 * (inertia[name] + rotors[name]) for name, ratio in moved))
         finger = joint.name in hand.joints
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
-        effort, speed = joint.effort, min(joint.velocity or 1.5, SPEED)
+        effort, speed = joint.effort and min(joint.effort, MAX_NUMBER), min(joint.velocity or 1.5, SPEED)
         if finger:
-            effort = min(effort or FORCE / 3 * lever, FORCE * lever)
+            effort = min(FORCE / 3 * lever if unsaid or not effort else effort, FORCE * lever)
             stiffness = effort * lever / SQUEEZE if joint.type != "prismatic" else effort / SQUEEZE
             if joint.effort and joint.effort > effort:
                 notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
         else:
-            stiffness = FREQUENCY**2 * total
-            if effort is None:
+            stiffness = max(FREQUENCY**2 * total, FREQUENCY / 2 * joint.damping, joint.friction / STUCK)
+            stiffness = min(stiffness, MAX_NUMBER)  # what robot.yaml may hold
+            if effort is None or (effort == PLACEHOLDER and (unsaid or effort / total < 2.0)):
+                kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} is a placeholder: now ")
                 effort = stiffness * 0.5
-                notes.add("guessed", "joint", joint.name, f"effort {effort:.3g}: the drive's at half a radian or metre")
+                notes.add(kind, "joint", joint.name, f"{why}effort {effort:.3g}, the drive's at half a radian or metre")
             elif effort / total < 2.0:
                 text = f"effort {effort:g} moves its load at no more than {effort / total:.2g} rad/s2 or m/s2: check it"
                 notes.add("warning", "joint", joint.name, text)
             stiffness = min(stiffness, effort / STRETCH)
-        row = {"stiffness": stiffness, "damping": 2 * math.sqrt(stiffness * total), "effort": effort, "speed": speed}
+        damping = max(critical_damping(stiffness, total, DT) - joint.damping, 0.0)
+        row = {"stiffness": stiffness, "damping": damping, "effort": effort, "speed": speed}
         if joint.name in given:
             row |= given[joint.name]
         else:

@@ -9,13 +9,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_nero.robots import DriveCfg, GripperCfg, RobotCfg
+from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
-from mjx_nero.urdf import collide, drives, files, inertia, mjcf, output, reach
+from mjx_nero.urdf import chain as chain_of
+from mjx_nero.urdf import collide, drives, files, folder, inertia, meshes, mjcf, regions, rest, workspace
 from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import read as reader
-from mjx_nero.urdf.looks import Drawn, Looks
-from mjx_nero.urdf.notes import Notes, Report
+from mjx_nero.urdf.cloud import Cloud
+from mjx_nero.urdf.geometry import Drawn, Looks
+from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
 
@@ -26,6 +28,9 @@ def import_urdf(
     packages: Mapping[str, pathlib.Path] | None = None,
     gains: pathlib.Path | None = None,
     *,
+    args: Mapping[str, str] | None = None,
+    chain: str | None = None,
+    fix: Mapping[str, float | None] | None = None,
     gripper: Sequence[str] | None = None,
     ee: str | None = None,
     home: Mapping[str, float] | None = None,
@@ -33,6 +38,8 @@ def import_urdf(
     force: bool = False,
 ) -> Report:
     """Makes a model folder of a URDF (or xacro file), for ``mjx_nero.make(..., robot=out)``.
+
+    All stages stand here, in their order: that makes it long.
 
     The folder appears whole or not at all. Meshes are read from the URDF's own folder (``files.Roots`` says which others) and
     from ``packages``, from nowhere else. In place of a missing mesh the link's other one is drawn or fitted, or a stand-in, with
@@ -43,74 +50,49 @@ def import_urdf(
         out: folder to make; empty, absent, or with ``force`` an earlier import.
         packages: name -> folder of ``package://name/...``.
         gains: YAML file, joint -> stiffness, damping and at will effort and speed; the rest is worked out (``drives.rows``).
-        gripper: joints that drive the gripper, in place of the guess (``hand.find``); empty for none.
+        args: values of a xacro file's arguments, in place of their defaults.
+        chain: ``BASE:TIP``, links, of a robot that is more than an arm; what is not between them is held still.
+        fix: joint -> position to hold it at [rad, m]; None: the one nearest to 0.
+        gripper: joints that drive the gripper, in place of the guess (``hand.choose``); empty for none.
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
-        home: positions of some joints [rad, m], in place of the guess (``reach.first_home``).
+        home: positions of some joints [rad, m], in place of the guess (``rest.home``).
         strict: warnings become an error.
 
     Raises:
         UserError: the input cannot be used; one line that says what is wrong and what to do.
     """
     path, out = pathlib.Path(path), pathlib.Path(out)
-    output.check(out, force)
+    folder.check(out, force)
     notes = Notes()
     roots = files.Roots(path, packages or {})
-    tree, mount = reader.read(path, roots, notes)
-    parts = bodies(tree)
-    looks = Looks(tree, parts, files.Meshes(roots), notes)
-    seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
-    filled = {n: dataclasses.replace(link, mass=inertia.filled(link.mass, seen[n], n, notes)) for n, link in tree.links.items()}
+    tree, mount = reader.read(path, roots, notes, args or {})
     read_mass = sum(link.mass.mass for link in tree.links.values())
-    tree = dataclasses.replace(tree, links=filled)
+    tree = chain_of.selected(tree, chain, fix or {}, notes)
+    looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
+    tree, grips, fork = hands.choose(_filled(tree, looks, notes), looks.of, gripper, notes)
     parts = bodies(tree)
-    masses = {n: inertia.body_mass(b, notes) if b.joint else b.mass for n, b in parts.items()}
-
-    hand = hands.find(tree, parts, looks.of, gripper, ee, notes)
-    joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
-    start = reach.first_home(parts, hand, home or {})
-    cloud = reach.Cloud(parts, hand, mount, start)
+    hand = hands.find(tree, parts, looks.of, (grips, fork), ee, notes)
+    stand = rest.stand(parts, looks.of, hand, mount, tree.name, notes)
+    start = workspace.first_home(parts, hand, home or {})
+    cloud = Cloud(parts, hand, stand.mount, start)
     collisions = collide.collisions(tree, parts, looks, hand, cloud, notes)
-    hit = [(link, shape) for link, items in collisions.items() for _, shape, bits in items if bits]
-    at_home = reach.clear_home(hand, cloud, start, home or {}, hit, tree.name, notes)
-    box = reach.workspace(cloud, tree.name, notes)
-
-    site = _free("ee", [link for b in parts.values() for link in b.links])
-    rest = {n: float(q[0]) for n, q in positions(parts, {n: np.array([v]) for n, v in at_home.items()}, 1).items()}
-
-    def model(drawn: Mapping[str, list[Drawn]], rotors: Mapping[str, float]) -> str:
-        return mjcf.document(tree.name, parts, masses, drawn, collisions, (site, hand.link, hand.site), rotors, rest)
-
-    draft = model(dict.fromkeys(tree.links, []), dict.fromkeys(joints, 0.0))
-    moved = drives.carried(_compiled(draft))
-    levers = _levers(parts, hand)
-    rotors = {n: drives.armature(j, moved[n], levers.get(n)) for n, j in joints.items()}
-    for name, value in rotors.items():
-        notes.add("guessed", "joint", name, f"rotor inertia (armature) {value:.3g}: URDFs have none")
-    driven = {n: j for n, j in joints.items() if not j.mimic}
-    given = {} if gains is None else drives.load_gains(pathlib.Path(gains), driven)
-    rows = drives.rows(parts, hand, moved, rotors, levers, given, notes)
-    arm = [n for n in driven if n not in hand.joints]
-    robot = RobotCfg(
-        name=tree.name,
-        arm=DriveCfg(**_columns(arm, rows, at_home)),
-        gripper=GripperCfg(**_columns(hand.joints, rows, at_home), open=hand.open, close=hand.close),
-        ee_site=site,
-        base_link=tree.root,
-        base_pos=_floats(mount[:3, 3]),
-        base_quat=_floats(_quat(mount)),
-        down=reach.down(cloud, hand, box),
-        gravity_compensation=True,
-        workspace=box,
-        folder=str(out),
-    )
-    text = model({name: look.drawn for name, look in looks.of.items()}, rotors)
+    work = workspace.workspace(cloud, tree.name, notes)
+    shapes = [(link, shape, bits > 0) for link, items in collisions.items() for _, shape, bits in items]
+    at_home = rest.home(parts, looks.of, hand, cloud, start, home or {}, shapes, work, tree.name, notes)
+    down = workspace.down(cloud, hand, work[0])
+    low = [(link, shape) for link, shape, meets in shapes if meets]
+    pick, hold, down = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
+    made = _Model(tree, parts, hand, collisions, at_home, notes)
+    rotors, rows = _drives(made, gains, notes)
+    robot = _robot(made, stand, rows, down, (work[0], pick, hold), out)
+    text = made.xml({name: look.drawn for name, look in looks.of.items()}, rotors)
     report = Report(
         source=path.name,
         folder=out,
         robot=robot,
         links=_link_rows(tree, parts, looks, collisions),
         joints=_joint_rows(tree, rotors, rows, at_home),
-        mass=float(sum(m.mass for m in masses.values())),
+        mass=float(sum(m.mass for m in made.masses.values())),
         mass_read=float(read_mass),
         contacts=collide.contacts(collisions),
         notes=notes,
@@ -118,8 +100,94 @@ def import_urdf(
     if strict and report.warnings:
         more = f" (and {len(report.warnings) - 1} more)" if len(report.warnings) > 1 else ""
         raise UserError(f"--strict: {report.warnings[0]}{more}")
-    output.write(out, text, looks.stl, robot, report, force)
+    folder.write(out, text, looks.stl, robot, report, force)
     return report
+
+
+def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
+    """With inertia tensors from the links' shapes where the URDF has none, and masses where no link has any."""
+    seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
+    masses = {n: link.mass for n, link in tree.links.items()}
+    if sum(m.mass for m in masses.values()) < inertia.LIGHTEST * len(masses):
+        masses = {n: inertia.weighed(m, seen[n] if looks.of[n].drawn else None) for n, m in masses.items()}
+        total = sum(m.mass for m in masses.values())
+        notes.add("guessed", "robot", tree.name, f"no link has a mass: now {total:.3g} kg, the shapes filled with water")
+    links = {n: dataclasses.replace(tree.links[n], mass=inertia.filled(m, seen[n], n, notes)) for n, m in masses.items()}
+    return dataclasses.replace(tree, links=links)
+
+
+class _Model:
+    """What ``model.xml`` is written from."""
+
+    def __init__(
+        self,
+        tree: Tree,
+        parts: dict[str, Body],
+        hand: hands.Hand,
+        collisions: collide.Collisions,
+        at_home: Mapping[str, float],
+        notes: Notes,
+    ):
+        self.tree, self.parts, self.hand, self.collisions, self.at_home = tree, parts, hand, collisions, at_home
+        self.masses = {n: inertia.body_mass(b, notes) if b.joint else b.mass for n, b in parts.items()}
+        self.joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
+        self.site = _free("ee", [link for b in parts.values() for link in b.links])
+
+    def xml(self, drawn: Mapping[str, list[Drawn]], rotors: Mapping[str, float]) -> str:
+        at_home = positions(self.parts, {n: np.array([v]) for n, v in self.at_home.items()}, 1)
+        return mjcf.document(
+            self.tree.name,
+            self.parts,
+            self.masses,
+            drawn,
+            self.collisions,
+            (self.site, self.hand.link, self.hand.site),
+            rotors,
+            {n: float(q[0]) for n, q in at_home.items()},
+        )
+
+
+def _drives(made: _Model, gains: pathlib.Path | None, notes: Notes) -> tuple[dict[str, float], drives.Rows]:
+    """Rotor inertia [kg m2, kg] of every joint, and stiffness, damping, effort and speed of the driven ones."""
+    bare = made.xml(dict.fromkeys(made.tree.links, []), dict.fromkeys(made.joints, 0.0))
+    moved = drives.carried(_compiled(bare))
+    levers = _levers(made.parts, made.hand)
+    rotors = {n: drives.armature(j, moved[n], levers.get(n)) for n, j in made.joints.items()}
+    for name, value in rotors.items():
+        notes.add("guessed", "joint", name, f"rotor inertia (armature) {value:.3g}: URDFs have none")
+    driven = {n: j for n, j in made.joints.items() if not j.mimic}
+    given = {} if gains is None else drives.load_gains(pathlib.Path(gains), driven)
+    return rotors, drives.rows(made.parts, made.hand, moved, rotors, levers, given, notes)
+
+
+def _robot(
+    made: _Model,
+    stand: rest.Stand,
+    rows: drives.Rows,
+    down: tuple[float, float, float, float],
+    boxes: tuple[workspace.Box | None, ...],
+    out: pathlib.Path,
+) -> RobotCfg:
+    arm = [n for n, j in made.joints.items() if not j.mimic and n not in made.hand.joints]
+    return RobotCfg(
+        name=made.tree.name,
+        arm=DriveCfg(**_columns(arm, rows, made.at_home)),
+        gripper=GripperCfg(**_columns(made.hand.joints, rows, made.at_home), open=made.hand.open, close=made.hand.close),
+        ee_site=made.site,
+        base_link=made.tree.root,
+        base_pos=_floats(stand.mount[:3, 3]),
+        base_quat=_floats(_quat(stand.mount)),
+        down=down,
+        gravity_compensation=True,
+        workspace=boxes[0],
+        pick=boxes[1],
+        hold=boxes[2],
+        floor=stand.floor,
+        opening=made.hand.gap,
+        pad=made.hand.pad,
+        grip=_floats(made.hand.grip),
+        folder=str(out),
+    )
 
 
 def _compiled(text: str) -> mujoco.MjModel:

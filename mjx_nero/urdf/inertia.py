@@ -3,7 +3,8 @@
 import numpy as np
 import yourdfpy
 
-from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf import primitives
+from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Mass, Matrix, Points, Vec
 
 PLACEHOLDER = 1e-4  # [kg] lighter links are placeholders: exporters write 1e-6 or 1e-9 for parts that nobody weighed
@@ -73,6 +74,13 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     if mass.mass >= PLACEHOLDER:
         notes.add("repaired", "link", name, f"the inertia was zero: now that of {what}")
     return Mass(mass.mass, mass.com, tensor)
+
+
+def weighed(mass: Mass, points: Points | None) -> Mass:
+    """Of a link of a robot that says no masses: that of the convex hull of its shape's ``points`` [n, 3], as heavy as water."""
+    if points is None:
+        return mass
+    return Mass(DENSITY * primitives.hull(points), points.mean(0), np.zeros((3, 3)))
 
 
 def body_mass(body: Body, notes: Notes) -> Mass:

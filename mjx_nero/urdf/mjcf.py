@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from lxml import etree
 
-from mjx_nero.urdf import fit
-from mjx_nero.urdf.looks import Drawn
+from mjx_nero.urdf import primitives
+from mjx_nero.urdf.geometry import Drawn
 from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
 
 TABLE, CUBE = 1, 2  # contact bits of the scenes
@@ -26,7 +26,7 @@ def document(
     parts: Mapping[str, Body],
     masses: Mapping[str, Mass],
     drawn: Mapping[str, list[Drawn]],
-    collisions: Mapping[str, list[tuple[str, fit.Primitive, int]]],
+    collisions: Mapping[str, list[tuple[str, primitives.Primitive, int]]],
     site: tuple[str, str, Pose],
     armature: Mapping[str, float],
     rest: Mapping[str, float],
@@ -58,43 +58,51 @@ def document(
             frame = frame @ body.joint.motion(np.array([rest[body.joint.name]]))[0]
         element = etree.SubElement(elements[body.parent], "body", name=body.name, **_pose(frame))
         elements[body.name] = element
-        mass = masses[body.name]
-        if mass.mass > 0:
-            moments, axes = np.linalg.eigh(mass.inertia)
-            axes = axes * np.sign(np.linalg.det(axes))
-            # Rounding leaves the largest moment of a flat body a hair above the sum of the others, which MuJoCo refuses.
-            moments[2] = min(moments[2], moments[0] + moments[1])
-            place = _pose(fit.pose(axes, mass.com))
-            figures = {"mass": repr(float(mass.mass)), "diaginertia": _text(moments), "pos": "0 0 0", **place}
-            etree.SubElement(element, "inertial", **figures)
+        _inertial(element, masses[body.name])
         if body.joint:
             _joint(element, body.joint, armature[body.joint.name], rest)
         for link, at in body.links.items():
             for item in drawn[link]:
                 _drawn(element, item, at)
             for label, shape, bits in collisions[link]:
-                geom = {"name": label, "type": shape.kind, "size": _text(shape.size), **_pose(at @ shape.pose)}
-                geom |= {"group": "3", "contype": "0", "conaffinity": str(bits), "mass": "0", "rgba": "0.9 0.3 0.2 0.5"}
-                etree.SubElement(element, "geom", **geom, **(_PAD if bits & CUBE else {}))
+                _collision(element, label, shape, bits, at)
             if link != body.name:
                 etree.SubElement(element, "site", name=link, group="5", size="0.002", **_pose(at))
             if link == site[1]:
                 look = {"size": "0.004", "group": "4", "rgba": "0.1 0.8 0.3 0.3"}
                 etree.SubElement(element, "site", name=site[0], **look, **_pose(at @ site[2]))
-    mimics = {b.joint.name: b.joint.mimic for b in parts.values() if b.joint and b.joint.mimic}
+    mimics = [b.joint for b in parts.values() if b.joint and b.joint.mimic]
     if mimics:
         equality = etree.SubElement(root, "equality")
-        for name, (source, multiplier, offset) in mimics.items():
-            both = {"joint1": name} | ({"joint2": source} if source else {})
-            terms = (
-                offset - rest[name],
-                multiplier if source else 0.0,
-                0.0,
-                0.0,
-                0.0,
-            )  # from reference to reference; a source's is 0
-            etree.SubElement(equality, "joint", **both, polycoef=_text(terms), solref="0.02 1", solimp="0.95 0.99 0.001")
+        for joint in mimics:
+            _mimic(equality, joint, rest)
     return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _inertial(element: etree._Element, mass: Mass) -> None:
+    if mass.mass <= 0:
+        return
+    moments, axes = np.linalg.eigh(mass.inertia)
+    axes = axes * np.sign(np.linalg.det(axes))
+    # Rounding leaves the largest moment of a flat body a hair above the sum of the others, which MuJoCo refuses.
+    moments[2] = min(moments[2], moments[0] + moments[1])
+    place = _pose(primitives.pose(axes, mass.com))
+    figures = {"mass": repr(float(mass.mass)), "diaginertia": _text(moments), "pos": "0 0 0", **place}
+    etree.SubElement(element, "inertial", **figures)
+
+
+def _collision(element: etree._Element, label: str, shape: primitives.Primitive, bits: int, at: Pose) -> None:
+    geom = {"name": label, "type": shape.kind, "size": _text(shape.size), **_pose(at @ shape.pose)}
+    geom |= {"group": "3", "contype": "0", "conaffinity": str(bits), "mass": "0", "rgba": "0.9 0.3 0.2 0.5"}
+    etree.SubElement(element, "geom", **geom, **(_PAD if bits & CUBE else {}))
+
+
+def _mimic(element: etree._Element, joint: Joint, rest: Mapping[str, float]) -> None:
+    assert joint.mimic is not None
+    source, multiplier, offset = joint.mimic
+    both = {"joint1": joint.name} | ({"joint2": source} if source else {})
+    terms = (offset - rest[joint.name], multiplier if source else 0.0, 0.0, 0.0, 0.0)  # between references; a source's is 0
+    etree.SubElement(element, "joint", **both, polycoef=_text(terms), solref="0.02 1", solimp="0.95 0.99 0.001")
 
 
 def _joint(element: etree._Element, joint: Joint, armature: float, rest: Mapping[str, float]) -> None:

@@ -4,6 +4,8 @@ import io
 import logging
 import math
 import pathlib
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 import yourdfpy
@@ -11,8 +13,8 @@ from lxml import etree
 
 from mjx_nero import config
 from mjx_nero.types import UserError
-from mjx_nero.urdf import check, expand, files, inertia
-from mjx_nero.urdf.notes import Notes
+from mjx_nero.urdf import files, inertia, validate, xacro
+from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import MOVING, Joint, Link, Mass, Pose, Shape, Tree
 
 MAX_MOVING = 100  # MuJoCo's XML reader nests no deeper than a few hundred bodies
@@ -20,7 +22,9 @@ RESERVED = {"link": ("world", "cube", "goal"), "joint": ("cube",)}  # names that
 logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
 
 
-def read(path: pathlib.Path, roots: files.Roots, notes: Notes) -> tuple[Tree, Pose]:
+def read(
+    path: pathlib.Path, roots: files.Roots, notes: Notes, args: Mapping[str, str] = MappingProxyType({})
+) -> tuple[Tree, Pose]:
     """The robot that the file describes, and where its root stands in the world [4, 4].
 
     An empty root link ``world`` with one fixed joint is that joint's pose; it is left out of the tree.
@@ -30,13 +34,16 @@ def read(path: pathlib.Path, roots: files.Roots, notes: Notes) -> tuple[Tree, Po
             prismatic joints.
     """
     root = files.parse_xml(files.read(path, files.MAX_URDF), str(path))
-    if expand.is_xacro(root):
-        root = expand.expand(root, path, roots)
+    if xacro.is_xacro(root):
+        root = xacro.expand(root, path, roots, args, notes)
+    elif args:
+        raise UserError(f"--arg {next(iter(args))}: {path} is no xacro file")
     if root.tag != "robot":
         raise UserError(f"{path} is no URDF: its outermost element is <{root.tag}>, not <robot>")
     if not (root.get("name") or "").strip():
         root.set("name", path.stem)
-    check.check(root, notes)
+    root.set("name", "".join(c for c in root.get("name") if c.isprintable())[: validate.MAX_NAME].strip() or "robot")
+    validate.check(root, notes)
     try:
         urdf = yourdfpy.URDF.load(
             io.BytesIO(etree.tostring(root)),
@@ -148,7 +155,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
     for field in ("damping", "friction"):
         text = None if joint.dynamics is None else getattr(joint.dynamics, field)
         value = 0.0 if text is None else float(text)
-        if not 0 <= value <= check.MAX_NUMBER:
+        if not 0 <= value <= validate.MAX_NUMBER:
             notes.add("repaired", "joint", name, f"{field} was {value:g}, now 0")
             value = 0.0
         losses[field] = value
@@ -158,7 +165,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
 
 def _positive(limit: yourdfpy.urdf.Limit | None, field: str, name: str, notes: Notes) -> float | None:
     value = None if limit is None else getattr(limit, field)
-    if value is not None and 0 < value <= check.MAX_NUMBER:
+    if value is not None and 0 < value <= validate.MAX_NUMBER:
         return value
     notes.add("note", "joint", name, f"{field} limit: {'none' if value is None else f'{value:g}'}")
     return None
@@ -172,7 +179,7 @@ def _limits(joint: yourdfpy.Joint, name: str, notes: Notes) -> tuple[float, floa
     lower, upper = (None if limit is None else getattr(limit, side) for side in ("lower", "upper"))
     lower = 0.0 if lower is None and upper is not None else lower  # URDF's default
     upper = 0.0 if upper is None and lower is not None else upper
-    usable = lower is not None and upper is not None and max(abs(lower), abs(upper)) <= check.MAX_NUMBER and lower != upper
+    usable = lower is not None and upper is not None and max(abs(lower), abs(upper)) <= validate.MAX_NUMBER and lower != upper
     if not usable:
         got = "has no limits" if lower is None else f"has the limits {lower:g} .. {upper:g}"
         if joint.type == "prismatic":
@@ -207,8 +214,8 @@ def _with_mimics(joints: list[Joint], robot: yourdfpy.Robot, rename: dict[str, s
                 if source not in by_name:
                     hint = config.hint(str(source), by_name)
                     raise UserError(f"joint {seen[-1]!r} mimics joint {source!r}, which is not there{hint}")
-            if not (abs(multiplier) <= check.MAX_NUMBER and abs(offset) <= check.MAX_NUMBER):
-                raise UserError(f"joint {joint.name!r} mimics {source!r} by a factor beyond {check.MAX_NUMBER:g}: correct it")
+            if not (abs(multiplier) <= validate.MAX_NUMBER and abs(offset) <= validate.MAX_NUMBER):
+                raise UserError(f"joint {joint.name!r} mimics {source!r} by a factor beyond {validate.MAX_NUMBER:g}: correct it")
             if not by_name[source].moves:
                 notes.add("warning", "joint", joint.name, f"mimics the fixed joint {source!r}: held at {offset:g}")
                 source = ""

@@ -1,0 +1,88 @@
+"""The pictures that are not a command's own: python docs/make_pictures.py
+
+docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and
+docs/gallery/, every environment; a name makes one of the three.
+"""
+
+import dataclasses
+import pathlib
+import sys
+
+import mjx_nero  # first: it chooses MuJoCo's OpenGL
+
+# isort: split
+import mujoco
+import numpy as np
+from PIL import Image
+
+from mjx_nero import cli
+from mjx_nero.envs import registry
+from mjx_nero.learn import policy, rollout
+from mjx_nero.sim import render
+from mjx_nero.tools.inspection.report import find, picture
+
+HERE = pathlib.Path(__file__).parent
+STEPS = 150  # of an episode are shown: the cube is up by then
+PICTURES = {  # name -> robots, width and height, steps between frames, quality of the WebP
+    "lift": (1, (640, 400), 4, 60),
+    "thousand": (1000, (640, 360), 5, 45),
+}
+
+
+def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
+    """Qpos [steps, num_envs, nq] and goals [steps, num_envs, 7] of the shipped policy's episodes."""
+    shipped = policy.load_for(env, "nero_lift", None)
+    run = rollout.runner(env, lambda params, obs, *_: shipped.act(obs), env.num_envs, record=env.num_envs)
+    found = run(None, 1)
+    print(f"{env.num_envs} episodes: success {found.summary()['success_rate']:.1%}")
+    return np.asarray(found.qpos), np.asarray(found.goals)
+
+
+def write(path: pathlib.Path, frames: list[Image.Image], seconds: float, quality: int) -> None:
+    """An animated WebP."""
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=round(1e3 * seconds), loop=0, quality=quality, method=4
+    )
+    print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1e6:.2f} MB")
+
+
+def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
+    """Low before the first row of a thousand robots, so that the near ones are seen to work and the far ones to be many."""
+    model.vis.map.zfar = model.vis.map.fogend = 100.0  # of the scene's extent: the last row is 50 m away
+    model.vis.quality.numslices, model.vis.quality.numstacks = 12, 6  # of round shapes: robots of a few pixels need no more
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = (16.0, 0.0, 0.2)
+    camera.distance, camera.azimuth, camera.elevation = 10.0, 165.0, -20.0
+    return camera
+
+
+def gallery(folder: pathlib.Path) -> None:
+    """A small picture of every environment that has a robot of its own."""
+    folder.mkdir(exist_ok=True)
+    for name in mjx_nero.list_envs():
+        if registry.robot_of(name):
+            image = Image.fromarray(picture(*find(name), width=640, height=480)).resize((320, 240))
+            image.save(folder / f"{name}.webp", quality=75)
+
+
+def main() -> None:
+    """All pictures, or those named."""
+    cli.setup_jax()
+    for name in sys.argv[1:] or ("gallery", *PICTURES):
+        if name == "gallery":
+            gallery(HERE / name)
+            continue
+        robots, (width, height), every, quality = PICTURES[name]
+        cfg = dataclasses.replace(mjx_nero.env_cfg("nero_lift"), corruption=False)
+        env = mjx_nero.ManipulationEnv(cfg, impl="native", num_envs=robots)
+        qpos, goals = play(env)
+        how = {} if robots == 1 else {"camera": amid(env.mj_model), "samples": 0, "shadows": 0}
+        with render.Renderer(env.mj_model, 2 * width, 2 * height, envs=robots, **how) as renderer:  # twice: edges become smooth
+            shot = renderer.render_all if robots > 1 else lambda q, g: renderer.render(q[0], g[0])
+            drawn = (Image.fromarray(shot(qpos[t], goals[t])) for t in range(0, STEPS, every))
+            frames = [frame.resize((width, height), Image.Resampling.BOX) for frame in drawn]
+        write(HERE / f"{name}.webp", frames, every * env.dt, quality)
+
+
+if __name__ == "__main__":
+    main()

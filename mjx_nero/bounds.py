@@ -1,0 +1,103 @@
+"""Bounds of values, declared where a config's field or a term's parameter is (``dt: Positive``), and one check of them all."""
+
+import dataclasses
+import functools
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from mjx_nero.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """From ``low`` (where ``above`` is set, above it) to ``high``."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+
+    def fault(self, value: float) -> str:
+        """What is wrong with a value; empty if nothing is."""
+        if self.low < value <= self.high or value == self.low and not self.above:
+            return ""
+        low = f"above {self.low:g}" if self.above else f"at least {self.low:g}"
+        return f"must be {low}" + (f" and at most {self.high:g}" if self.high < math.inf else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Ascending:
+    """Two numbers, the lower first."""
+
+    def fault(self, value: tuple[float, float]) -> str:
+        """See ``Bounds.fault``."""
+        return "" if value[0] <= value[1] else "is a range and must run from low to high"
+
+
+Positive = Annotated[float, Bounds(0.0, above=True)]
+NonNegative = Annotated[float, Bounds(0.0)]
+Share = Annotated[float, Bounds(0.0, 1.0)]
+Count = Annotated[int, Bounds(1)]
+Range = Annotated[tuple[float, float], Ascending()]
+NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
+PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]
+Counts = Annotated[tuple[Count, Count], Ascending()]  # a range of whole numbers from 1 on
+Steps = Annotated[tuple[Annotated[int, Bounds(0)], Annotated[int, Bounds(0)]], Ascending()]  # a range of whole steps
+
+
+def check(value: Any, hint: Any = Any, name: str = "") -> None:
+    """Checks all of a config: every number is finite and within the bounds that its field declares.
+
+    Args:
+        value: a config, or a field's value.
+        hint: the field's type; of a mapping, perhaps types by key.
+        name: the field's dotted name.
+
+    Raises:
+        UserError: a value is not; the message has its dotted name.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"{name} must be a finite number, got {value!r}")
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        hint = next((h for h in typing.get_args(hint) if h is not type(None)), Any) if value is not None else Any
+    bounds: tuple = ()
+    if typing.get_origin(hint) is Annotated:
+        bounds, hint = hint.__metadata__, typing.get_args(hint)[0]
+    inner = typing.get_args(hint)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        hints = {**_hints(type(value)), **getattr(value, "hints", dict)()}
+        for field in dataclasses.fields(value):
+            check(getattr(value, field.name), hints.get(field.name, Any), f"{name}.{field.name}" if name else field.name)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            check(item, hint.get(key, Any) if isinstance(hint, Mapping) else (*inner, Any, Any)[1], f"{name}.{key}")
+    elif isinstance(value, tuple):
+        each = inner[:1] * len(value) if inner[1:] == (...,) else inner if len(inner) == len(value) else (Any,) * len(value)
+        for item, one in zip(value, each, strict=True):
+            check(item, one, name)
+    for bound in bounds:
+        if fault := bound.fault(value):
+            raise UserError(f"{name} {fault}, got {value!r}")
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """Annotations of a config or of a function's parameters; none where they name what is not there."""
+    try:
+        return typing.get_type_hints(kind, include_extras=True)
+    except (NameError, TypeError):
+        return {}
+
+
+def unwrapped(function: Any) -> Any:
+    """What a ``functools.partial`` is made of; others as they are."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return function
+
+
+def parameter_hints(function: Any) -> dict[str, Any]:
+    """Annotations of a function's parameters, or of a class's fields."""
+    return _hints(unwrapped(function))

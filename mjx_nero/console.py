@@ -1,0 +1,161 @@
+"""What programs tell people: lines and tables, in which no word is broken however narrow the terminal, and progress."""
+
+import contextlib
+import dataclasses
+import math
+import os
+import pathlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from rich import box, table
+from rich.console import Console, ConsoleOptions
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+_GAP = 3  # between two columns of a table, at most
+_BAR = (BarColumn(bar_width=14), TextColumn("{task.percentage:3.0f}%  {task.fields[text]}"))  # 80 columns hold it all
+
+
+def screen(stderr: bool = False, quiet: bool = False) -> Console:
+    """Where tables and lines go: as wide as the terminal, and wide enough for names where there is none."""
+    console = Console(stderr=stderr, quiet=quiet)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = 160  # a pipe has no width of its own, and rich would take 80
+    return console
+
+
+def line(console: Console, text: str, style: str = "") -> None:
+    """A line as it stands: neither wrapped nor coloured by what is in it."""
+    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def wrote(console: Console, what: str, path: pathlib.Path) -> None:
+    """Says where a file went."""
+    line(console, f"{what}: {path}")
+
+
+@dataclasses.dataclass
+class Table:
+    """Cells of text. Print it on a ``screen()``; where it is too wide, it becomes several with the first column in each.
+
+    Attributes:
+        columns: their heads; all empty: no line of heads.
+        left: columns whose cells begin at the left; the first one always does.
+    """
+
+    title: str
+    columns: Sequence[str]
+    left: Sequence[str] = ()
+    caption: str = ""
+    rows: list[tuple[str, ...]] = dataclasses.field(default_factory=list)
+
+    def add(self, *cells: str) -> None:
+        """A row."""
+        self.rows.append(cells)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[table.Table]:
+        parts = self._parts(options.max_width)
+        for part in parts:
+            view = table.Table(
+                title=Text(self.title if part is parts[0] else f"{self.title}, continued") if self.title else None,
+                caption=Text(self.caption) if self.caption and part is parts[-1] else None,
+                box=box.SIMPLE_HEAD,
+                title_justify="left",
+                caption_justify="left",
+                collapse_padding=True,
+                pad_edge=False,
+                show_header=any(self.columns),
+            )
+            for i in part:
+                name = self.columns[i]
+                view.add_column(
+                    Text(name), justify="left" if name in self.left or not i else "right", no_wrap=not i, overflow="fold"
+                )
+            for row in self.rows:
+                view.add_row(*(Text(row[i]) for i in part))
+            yield view
+
+    def _parts(self, width: int) -> list[list[int]]:
+        """Columns that fit side by side."""
+        widths = [
+            max(len(line) for row in (self.columns, *self.rows) for line in row[i].split("\n")) for i in range(len(self.columns))
+        ]
+        parts, used = [[0]], widths[0]
+        for i in range(1, len(widths)):
+            if len(parts[-1]) > 1 and used + _GAP + widths[i] > width:
+                parts.append([0])
+                used = widths[0]
+            parts[-1].append(i)
+            used += _GAP + widths[i]
+        return parts
+
+
+def compiling(impl: str) -> str:
+    """What to say of the wait before training."""
+    if impl == "native":  # a program that calls back is none that JAX keeps
+        return "compiling (half a minute or so; programs that call MuJoCo's C library are compiled at every start) ..."
+    return "compiling (a minute or two the first time, a few seconds once the compiled programs are kept) ..."
+
+
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds."""
+    seconds = round(seconds)
+    minutes = f"{seconds % 3600 // 60:02}:{seconds % 60:02}"
+    return f"{seconds // 3600}:{minutes}" if seconds >= 3600 else minutes
+
+
+def time_left(steps: int, steps_per_s: float, minutes: float, wall: float) -> float:
+    """Until the steps are made or the minutes are over, whichever comes first [s].
+
+    Args:
+        steps: still to make.
+        minutes: a run's limit; 0: none.
+        wall: how long it has been training [s].
+    """
+    left = steps / steps_per_s if steps_per_s else math.inf
+    return max(0.0, min(left, 60 * minutes - wall) if minutes else left)
+
+
+class Show:
+    """The progress line of training."""
+
+    def __init__(self, console: Console, total: int, max_minutes: float):
+        self._console, self._total, self._max_minutes = console, total, max_minutes
+        self._bar = Progress(*_BAR, console=console, disable=not console.is_terminal)
+        self._task = self._bar.add_task("", total=1.0, text="")
+
+    def __enter__(self) -> "Show":
+        self._bar.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._bar.__exit__(*error)
+
+    def update(self, steps: int, wall: float, steps_per_s: float, success: float | None) -> None:
+        """After a chunk; the part that is done is that of the steps or that of the minutes, whichever is more."""
+        left = time_left(self._total - steps, steps_per_s, self._max_minutes, wall)
+        text = f"{steps / 1e6:.1f}/{self._total / 1e6:.1f} M steps  {steps_per_s:,.0f}/s"
+        text += "" if success is None else f"  success {success:.2f}"
+        done = max(steps / self._total, wall / (60 * self._max_minutes) if self._max_minutes else 0.0)
+        self._bar.update(self._task, completed=min(1.0, done), text=f"{text}  ETA {clock(left)}")
+
+    def evaluated(self, steps: int, wall: float, evaluation: dict[str, Any]) -> None:
+        """A line, for logs."""
+        if not self._console.is_terminal:
+            text = f"{steps:>12,} steps {wall:7.1f} s  return {evaluation['return_mean'] or 0.0:8.2f}"
+            line(self._console, f"{text}  success {evaluation['success_rate']:.3f}")
+
+
+@contextlib.contextmanager
+def drawing(console: Console, name: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress line for a video: call what comes with frames drawn and frames in all."""
+    with Progress(*_BAR, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task, begun = bar.add_task("", total=1.0, text=f"drawing {name}"), time.monotonic()
+
+        def update(done: int, total: int) -> None:
+            left = (time.monotonic() - begun) / done * (total - done) if done else 0.0
+            bar.update(task, completed=done / total, text=f"drawing {name}, {done}/{total} frames  ETA {clock(left)}")
+
+        yield update

@@ -1,0 +1,211 @@
+"""Over what stands in the way, by RMPflow: a target that runs up, across and down, while the whole arm keeps clear of the boxes.
+
+RMPflow has no plan: straight towards a goal behind a wall it would stay before the wall. The way over it is the plan.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from mjx_nero.control.follow_target import RmpCfg, RmpFollower
+from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.rmpflow import Target
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import View
+
+Corners = Float[Array, "n 3"]
+_GRIP_FILTER = 0.05  # as of ``pick_place``
+
+
+@dataclasses.dataclass(frozen=True)
+class DetourCfg:
+    """Of the way and of the arm's motion; lengths in m.
+
+    Attributes:
+        clearance: of the end effector above the highest obstacle, while it goes across.
+        speed: of the target along the way [m/s].
+        ramp: so far from a corner it is as fast as that, at the corner nearly at rest: a jerk would shake the object off.
+        lead: the target waits where it is further than this from the end effector.
+        rmpflow: of the arm's motion.
+    """
+
+    clearance: float = 0.12
+    speed: float = 0.2
+    ramp: float = 0.04
+    lead: float = 0.08
+    rmpflow: RmpCfg = RmpCfg()
+
+
+@struct.dataclass
+class Way:
+    """Straight legs from corner to corner, and how far along them the target is [m]."""
+
+    corners: Corners
+    travelled: Float[Array, ""]
+
+    @classmethod
+    def through(cls, *corners: Float[Array, "3"]) -> "Way":
+        """At its beginning."""
+        return cls(jnp.stack(corners), jnp.zeros(()))
+
+    @property
+    def ends(self) -> Float[Array, " n"]:
+        """How far along it the corners are [m]."""
+        return jnp.append(0.0, jnp.cumsum(jnp.linalg.norm(jnp.diff(self.corners, axis=0), axis=1)))
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """All of it [m]."""
+        return self.ends[-1]
+
+    def to_corner(self) -> Float[Array, ""]:
+        """From the target to the nearest corner [m]."""
+        return jnp.min(jnp.abs(self.travelled - self.ends))
+
+    def target(self) -> Float[Array, "3"]:
+        """Where it is."""
+        legs, lengths = jnp.diff(self.corners, axis=0), jnp.diff(self.ends)
+        done = jnp.clip(self.travelled - self.ends[:-1], 0.0, lengths)
+        return self.corners[0] + jnp.sum((done / jnp.maximum(lengths, 1e-6))[:, None] * legs, axis=0)
+
+    def on(self, by) -> "Way":
+        """A little further along, up to the end [m]."""
+        return dataclasses.replace(self, travelled=jnp.minimum(self.travelled + by, self.length))
+
+
+def over(start: Float[Array, "3"], goal: Float[Array, "3"], view: View, clearance: float) -> Way:
+    """From start to goal, in between ``clearance`` above the highest of the obstacles' tops (they stand upright)."""
+    tops = [jnp.where(box.pos_w[2] > 0, box.pos_w[2] + box.size[2] / 2, -jnp.inf) for box in view.obstacles.values()]
+    height = jnp.maximum(jnp.max(jnp.stack(tops)) + clearance, jnp.maximum(start[2], goal[2]))
+    return Way.through(start, start.at[2].set(height), goal.at[2].set(height), goal)
+
+
+class Detour:
+    """Brings the end effector to the goal, over the obstacles; how it is turned there is left to the arm.
+
+    Args:
+        robot: its ``ee_site`` goes.
+        dt: control step [s].
+        cfg: see ``DetourCfg``.
+
+    Raises:
+        UserError: the robot has no RMPflow files, or they do not fit it.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: DetourCfg = DetourCfg()):
+        self.dt, self.cfg, self._n = dt, cfg, len(robot.arm.joints)
+        self._arm = RmpFollower(robot, dt, cfg.rmpflow)
+
+    def init(self, view: View) -> Way:
+        """The way from where the end effector is."""
+        return over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance)
+
+    def step(self, memory: Way, view: View) -> tuple[Way, Float[Array, " nu"]]:
+        """Targets of the arm's drives; the gripper's stay."""
+        memory, targets = self._follow(memory, view, jnp.zeros(3), None)
+        return memory, jnp.concatenate([targets, view.ctrl[self._n :]])
+
+    def _follow(self, way: Way, view: View, offset, orientation) -> tuple[Way, Float[Array, " nj"]]:
+        """One step along a way; ``offset`` is from it to where the end effector has to be [m]."""
+        position = way.target()
+        goes = jnp.linalg.norm(position + offset - view.ee_pos_w) < self.cfg.lead
+        # Under a constant acceleration up to ``ramp``; at a corner a tenth of the speed, or it would stay there.
+        speed = self.cfg.speed * jnp.clip(jnp.sqrt(way.to_corner() / self.cfg.ramp), 0.1, 1.0)
+        after = way.on(jnp.where(goes, speed * self.dt, 0.0))
+        velocity = (after.target() - position) / self.dt
+        return after, self._arm.arm(view, Target(position + offset, orientation, velocity))
+
+    def warning(self, memory: Way) -> str:
+        """Says where the target never got to the goal."""
+        left = _lengths(memory) - np.asarray(memory.travelled)
+        late = left > 1e-3
+        return f"{late.sum()} of {late.size} episodes ended on the way" if late.any() else ""
+
+
+def _lengths(ways: Way) -> np.ndarray:
+    """Of a batch."""
+    return np.linalg.norm(np.diff(np.asarray(ways.corners), axis=-2), axis=-1).sum(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class CarryCfg(DetourCfg):
+    """``DetourCfg``, and of the grasp.
+
+    Attributes:
+        approach: height above the object from which the gripper comes down [m].
+        end_effector_offset: of the grasp point from the object's centre [m].
+        near: the end effector has arrived where it is so near to its place in the grasp [m].
+        settling: from then on until the gripper closes [s]: moving fingers would push the object out.
+        closing: from then on until the object is carried off [s]. The fingers take no less to close: quick ones would drive into
+            the object before contact stops them, and shoot it out.
+        object: what to carry.
+    """
+
+    approach: float = 0.12
+    end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    near: float = 0.008
+    settling: float = 0.4
+    closing: float = 0.6
+    object: str = "cube"
+
+
+@struct.dataclass
+class CarryMemory:
+    """Between two steps of ``Carry``."""
+
+    way: Way  # to the object, then the object's to the goal
+    there: Int[Array, ""]  # steps since the end effector arrived at the object; 0: not yet
+    grip: Float[Array, "3"]  # from the object to the grasp point
+
+
+class Carry(Detour):
+    """Picks the object up with the gripper straight down, and carries it to the goal over the obstacles.
+
+    Args:
+        robot: what picks.
+        dt: control step [s].
+        cfg: see ``CarryCfg``.
+    """
+
+    cfg: CarryCfg
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: CarryCfg = CarryCfg()):
+        super().__init__(robot, dt, cfg)
+        self._gripper, self._down = ParallelGripper(robot), np.array(robot.down, np.float32)
+        self._settled = max(1, round(cfg.settling / dt))
+        self._closed = self._settled + max(1, round(cfg.closing / dt))
+        way = np.abs(np.subtract(robot.gripper.close, robot.gripper.open)) / np.array(robot.gripper.speed)
+        self._pace = min(1.0, float(np.max(way, initial=0.0)) / cfg.closing)
+        self._offset = np.array(cfg.end_effector_offset, np.float32)
+
+    def init(self, view: View) -> CarryMemory:  # type: ignore[override]
+        """The way to the object, from above."""
+        at = view.objects[self.cfg.object].pos_w + self._offset
+        above = at + jnp.array([0.0, 0.0, self.cfg.approach])
+        way = Way.through(view.ee_pos_w, above, above, at)  # as many corners as the way over obstacles
+        return CarryMemory(way, jnp.zeros((), jnp.int32), jnp.asarray(self._offset))
+
+    def step(self, memory: CarryMemory, view: View) -> tuple[CarryMemory, Float[Array, " nu"]]:  # type: ignore[override]
+        """Targets of all drives."""
+        at, holds = view.objects[self.cfg.object].pos_w, memory.there >= self._closed
+        off = over(at, view.goal_pos_w, view, self.cfg.clearance)
+        way = jax.tree.map(lambda new, old: jnp.where(memory.there == self._closed, new, old), off, memory.way)
+        arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
+        slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)
+        grip = memory.grip + jnp.where(holds, _GRIP_FILTER, 0.0) * (slip - memory.grip)
+        # A hand that is to be turned as it is turns freely: nothing pulls it anywhere.
+        turn = jnp.where(holds, view.ee_quat_w, jnp.asarray(self._down))
+        way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), turn)
+        there = memory.there + (arrived | (memory.there > 0))
+        fingers = self._gripper.forward(
+            there > self._settled, view.joint_pos[self._n :], view.ctrl[self._n :], self._pace * self.dt
+        )
+        return CarryMemory(way, there, grip), jnp.concatenate([targets, fingers])
+
+    def warning(self, memory: CarryMemory) -> str:  # type: ignore[override]
+        """Says where the object never got to the goal."""
+        return super().warning(memory.way)

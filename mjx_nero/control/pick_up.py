@@ -1,0 +1,224 @@
+"""Picks an object up from above, with the hand turned to fit it, and holds it at the goal."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from mjx_nero import math
+from mjx_nero.bounds import Positive
+from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError, View
+
+ABOVE, DOWN, CLOSE, UP, CARRY = range(5)
+_CHOICES = 8  # ways to turn the hand that are looked at
+_SMOOTH = 0.15  # [s] the arm's set-point comes to rest in about this time
+_FASTEST = 10.0  # [rad/s2] what it is accelerated by at most: drives that are asked for more fall behind, and swing
+_UNREACHABLE = 100.0  # counts as so many radians to move
+# Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
+_GRIP_FILTER = 0.05
+_ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
+_LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
+_SLOW = 0.2  # [rad/s]
+
+
+@dataclasses.dataclass(frozen=True)
+class PickUpCfg:
+    """How to grasp, and how fast; lengths in m.
+
+    Attributes:
+        object: what to pick up.
+        heading: of each object that may be it (``View.target``), which of its axes lies across the opening of the hand when the
+            fingers fit: 0, 1 or 2.
+        turns: likewise, how many turns about the vertical in a full one look the same; 0: it is round.
+        lowest: height of the grasp point above the robot's table, at least.
+        above: the hand comes down from so high over the object, and lifts it so high before it carries it away.
+        speed: of the grasp point [m/s].
+        closing: how long the fingers take [s].
+        ik: of the arm's motion. Orientation weighs little: where a goal cannot be reached with the hand pointing down, it tilts.
+    """
+
+    object: str = "cube"
+    heading: tuple[int, ...] = (0,)
+    turns: tuple[int, ...] = (4,)
+    lowest: float = 0.0
+    above: Positive = 0.08
+    speed: Positive = 0.3
+    closing: Positive = 0.3
+    ik: IkCfg = IkCfg(orientation_weight=0.03, restarts=3)
+
+
+@struct.dataclass
+class PickUpMemory:
+    """Between two steps of ``PickUp``."""
+
+    phase: Int[Array, ""]
+    count: Int[Array, ""]  # steps made in this phase
+    q: Float[Array, " nj"]  # the arm's set-point [rad]
+    qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
+    above: Float[Array, " nj"]  # the arm over the object [rad]
+    pos: Float[Array, "3"]  # where the grasp point is on its way from there
+    pick: Float[Array, "3"]  # and has to be to grasp
+    yaw: Float[Array, ""]  # how the hand is turned about the vertical [rad]
+    grip: Float[Array, "3"]  # from the object to the set-point, while it is carried
+    tries: Int[Array, ""]
+
+
+class PickUp:
+    """Grasps the object from above and holds it at the goal; if it slips out, once more.
+
+    | phase | above | down | close | up | to the goal |
+    | --- | --- | --- | --- | --- | --- |
+    | grasp point | over the object | at the object | stays | over where that lay | carries it to the goal |
+    | fingers | open | open | close | closed | closed |
+
+    A phase ends when the arm is where it ought to be, or after a time in which it should be. Of the ways to turn the hand that
+    fit the object and that the arm can reach, it takes one with much room for the fingers beside others and little way to go.
+
+    Args:
+        robot: what picks.
+        dt: control step [s].
+        cfg: see ``PickUpCfg``.
+
+    Raises:
+        UserError: ``heading`` and ``turns`` differ in length, or name no axis.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: PickUpCfg = PickUpCfg()):
+        if len(cfg.heading) != len(cfg.turns) or not set(cfg.heading) <= {0, 1, 2} or min(cfg.turns, default=-1) < 0:
+            raise UserError(f"heading and turns are an axis (0, 1, 2) and a number an object, got {cfg.heading} and {cfg.turns}")
+        self.dt, self.cfg = dt, cfg
+        self.gripper, self._ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
+        self._n = len(robot.arm.joints)
+        self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
+        self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
+        travel = np.abs(self.gripper.opened - self.gripper.closed)
+        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / cfg.closing).astype(np.float32) * dt
+        self._lost = float(np.linalg.norm(robot.grip)) + _LOST
+        self._reach = robot.opening / 2  # of a finger from the grasp point
+        # From an object's heading; a round one has none.
+        angles = [np.arange(_CHOICES) * 2 * np.pi / (turns or _CHOICES) for turns in cfg.turns]
+        self._choices = np.array(angles, np.float32)
+
+    def init(self, view: View) -> PickUpMemory:
+        """At the start of the first phase."""
+        q, zero = view.joint_pos[: self._n], jnp.zeros((), jnp.int32)
+        angles = self._angles(view)
+        quats = jax.vmap(self._hand)(angles)
+        picks = jax.vmap(self._pick, (None, 0))(view, angles)
+        starts = jnp.broadcast_to(q, (_CHOICES, self._n))
+        over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
+        low = jax.vmap(self._ik.local)(picks, quats, over.q)
+        way = jnp.linalg.norm(over.q - q, axis=1) + _UNREACHABLE * ~(over.success & low.success)
+        best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
+        above, pick, yaw = over.q[best], picks[best], angles[best]
+        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), above, pick + self._up, pick, yaw, jnp.zeros(3), zero)
+
+    def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
+        """Targets of all drives."""
+        phase, seen = memory.phase, view.objects[self.cfg.object].pos_w
+        # From the set-point, while the arm hardly moves: what it is off is made up for as well.
+        off, slow = memory.pos - seen, jnp.max(jnp.abs(memory.qd)) < _SLOW
+        grip = jnp.where(phase == CLOSE, off, memory.grip)
+        grip += jnp.where((phase == CARRY) & slow, _GRIP_FILTER, 0.0) * (off - grip)
+
+        over = memory.pick + self._up
+        wanted = jnp.select([phase == CARRY, (phase == DOWN) | (phase == CLOSE)], [view.goal_pos_w + grip, memory.pick], over)
+        way = wanted - memory.pos
+        far = jnp.linalg.norm(way)
+        pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
+        found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
+        q, qd = self._follow(memory, jnp.where(phase == ABOVE, memory.above, found))
+        ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
+        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+
+        lost = (phase >= UP) & (jnp.linalg.norm(view.ee_pos_w - seen) > self._lost)
+        ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - wanted), far < 1e-3)
+        memory = dataclasses.replace(
+            self._again(memory, view, lost),
+            phase=jnp.where(lost, ABOVE, phase + ended),
+            count=jnp.where(lost | ended, 0, memory.count + 1),
+            q=q,
+            qd=qd,
+            pos=pos,
+            grip=grip,
+            tries=memory.tries + lost,
+        )
+        return memory, jnp.concatenate([q + self._lead * qd, fingers])
+
+    def _ended(self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""]) -> Bool[Array, ""]:
+        """Whether the phase is: what was to be done is done, or there has been time enough.
+
+        Args:
+            error: of the grasp point [m].
+            arrived: the set-point has.
+        """
+        time = (memory.count + 1) * self.dt
+        still = jnp.max(jnp.abs(memory.qd)) < 0.1
+        return jnp.select(
+            [memory.phase == ABOVE, memory.phase == DOWN, memory.phase == CLOSE, memory.phase == UP],
+            [
+                still & (error < 0.01) | (time > 2.5),
+                arrived & still & (error < 0.004) | (time > 1.2),
+                time > self.cfg.closing + 0.15,
+                arrived | (time > 1.0),
+            ],
+            False,
+        )
+
+    def _follow(self, memory: PickUpMemory, wanted: Float[Array, " nj"]) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
+        """The set-point and its speed a step later: on the way to ``wanted``, all joints in step, without jumps."""
+        speed = (wanted - memory.q) / _SMOOTH
+        speed /= jnp.maximum(1.0, jnp.max(jnp.abs(speed) / self._speed))
+        qd = rate_limit(speed, memory.qd, step=jnp.full(self._n, _FASTEST * self.dt))
+        return memory.q + qd * self.dt, qd
+
+    def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
+        """With a new plan for an object that has been lost: the hand turned as little as may be, without a search."""
+        angles = self._angles(view)
+        off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
+        yaw = memory.yaw + off[jnp.argmin(jnp.abs(off))]
+        pick = self._pick(view, yaw)
+        new = pick, yaw, self._ik.local(pick + self._up, self._hand(yaw), memory.above).q
+        pick, yaw, above = (jnp.where(lost, a, b) for a, b in zip(new, (memory.pick, memory.yaw, memory.above), strict=True))
+        return dataclasses.replace(memory, pick=pick, yaw=yaw, above=above)
+
+    @property
+    def _up(self) -> Float[Array, "3"]:
+        return jnp.array([0.0, 0.0, self.cfg.above])
+
+    def _angles(self, view: View) -> Float[Array, " n"]:
+        """Turns of the hand about the vertical that fit the object [rad]."""
+        index = 0 if view.target is None else view.target
+        axis = math.rotation_matrix(view.objects[self.cfg.object].quat_w)[:, jnp.array(self.cfg.heading)[index]]
+        round = jnp.array(self.cfg.turns)[index] == 0
+        return jnp.where(round, 0.0, jnp.arctan2(axis[1], axis[0])) + jnp.asarray(self._choices)[index]
+
+    def _pick(self, view: View, yaw: Float[Array, ""]) -> Float[Array, "3"]:
+        """Where the grasp point has to be."""
+        seen = view.objects[self.cfg.object].pos_w
+        height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest)
+        return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
+
+    def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
+        """From the open fingers to the nearest of the other objects' centres [m]; more than the hand is wide counts no more."""
+        middle = view.objects[self.cfg.object].pos_w[:2]
+        tips = self._reach * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=1)  # the fingers open along the hand's y
+        others = jnp.stack([other.pos_w for other in view.objects.values()])[:, :2] - middle
+        far = jnp.linalg.norm(others[:, None, None] - jnp.stack([tips, -tips]), axis=-1)
+        itself = jnp.linalg.norm(others, axis=1) < 1e-3
+        return jnp.min(jnp.where(itself[:, None, None], jnp.inf, far), axis=(0, 1), initial=self._reach)
+
+    def _hand(self, yaw: Float[Array, ""]) -> Float[Array, "4"]:
+        return math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw), jnp.asarray(self._down))
+
+    def warning(self, memory: PickUpMemory) -> str:
+        """Says how many objects were lost."""
+        tries = np.asarray(memory.tries)
+        return f"{(tries > 0).sum()} of {tries.size} episodes lost the object and tried again" if tries.any() else ""

@@ -1,0 +1,1 @@
+"""Tasks, arms, and the environment that runs them."""

@@ -1,0 +1,388 @@
+"""The manipulation environment: single, pure ``reset`` and ``step``, compatible with ``brax.envs.base.Env``.
+
+One class, longer than others, because both are made of the same parts, and what one writes the other reads.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs.base import Env, State
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero.envs import identified
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.envs.view import Viewer
+from mjx_nero.mdp import terms
+from mjx_nero.mdp.actions import Chain, Drives
+from mjx_nero.mdp.success import Hold
+from mjx_nero.sim import linkage, obstacles, scene, touch
+from mjx_nero.sim.fields import Fields, Randomization
+from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
+from mjx_nero.types import TARGET, Carry, Key, Sim, Start, UserError, View
+
+_MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
+# Folded into an episode's key: what draws apart changes no other draw.
+_FIELDS, _MEMORY, _SENSORS, _OBSTACLES = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC
+
+
+def _precise(method: Callable) -> Callable:
+    """Computes with full float32 products, whatever the program has set: TF32 in the physics costs success."""
+
+    @functools.wraps(method)
+    def precise(*args, **kwargs):
+        with jax.default_matmul_precision("highest"):
+            return method(*args, **kwargs)
+
+    return precise
+
+
+class ManipulationEnv(Env):
+    """A robot, a table, objects and a commanded point, with the MDP of an ``EnvCfg``.
+
+    ``reset`` and ``step`` work on one environment and are pure: ``jax.vmap`` them for thousands, ``jax.jit`` them for speed.
+    ``state.pipeline_state`` is the physics state (``types.Sim``), ``state.obs`` a dict of groups, ``state.info['carry']`` the
+    rest of the episode's memory. ``info['truncation']`` is 1 where ``done`` is a time-out.
+
+    Args:
+        cfg: the task.
+        impl: ``auto``, ``warp``, ``jax`` or ``native``.
+        num_envs: how many are meant to be stepped together.
+
+    Attributes:
+        home_action: the action that keeps the robot at home [na].
+
+    Raises:
+        UserError: ``impl`` is unknown or not possible on this machine, or the task is not possible.
+    """
+
+    def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
+        cfg = identified.applied(cfg)
+        self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), num_envs
+        self.dt = cfg.sim.dt * cfg.sim.decimation
+        self.episode_length = round(cfg.episode_length_s / self.dt)
+        if not self.episode_length:
+            raise UserError(f"episode_length_s must be a control step ({self.dt:g} s) or more, got {cfg.episode_length_s:g}")
+        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
+        self.physics_model = model
+        self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
+        self._viewer = Viewer(
+            model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.motion, self._obstacles, cfg.targets
+        )
+        self._coupled = linkage.couplings(model)
+        self._qpos0 = np.array(model.qpos0, np.float32)
+        self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
+        self._actions = Chain(cfg.actions, self._drives())
+        self.home_action = self._actions.home
+        self._randomization = Randomization(model, cfg.randomization)
+        self._hold = Hold(round(cfg.success.hold_s / self.dt))
+        self._resample_steps = round(cfg.command.resample_s / self.dt)
+
+    def _drives(self) -> dict[str, Drives]:
+        groups, at = {}, 0
+        for name, cfg in (("arm", self.cfg.robot.arm), ("gripper", self.cfg.robot.gripper)):
+            own, at = slice(at, at + len(cfg.joints)), at + len(cfg.joints)
+            open, close = (getattr(cfg, end, cfg.home) for end in ("open", "close"))
+            home, speed, open, close = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close))
+            low, high = self._range[:, own]
+            groups[name] = Drives(home, low, high, speed * self.dt, open, close)
+        return groups
+
+    @functools.cached_property
+    def physics(self) -> Physics:
+        """The backend; made when first stepped."""
+        with jax.ensure_compile_time_eval():  # the first step may well be under a trace
+            drawn = self._randomization.names + (obstacles.FIELDS if self.cfg.obstacles else ())
+            return make_physics(self.physics_model, self.cfg.sim, self.impl, tuple(dict.fromkeys(drawn)))
+
+    @functools.cached_property
+    def mj_model(self) -> mujoco.MjModel:
+        """The whole scene with visual shapes, lights and cameras, compiled for MuJoCo (to render or to inspect)."""
+        return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
+
+    @property
+    def action_size(self) -> int:
+        """How many numbers the action terms read."""
+        return len(self.home_action)
+
+    @functools.cached_property
+    def observation_size(self) -> dict[str, Any]:
+        """Shape of each observation group; of a group whose terms stay apart, of each by name."""
+        obs = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs
+        return jax.tree.map(lambda value: value.shape, {name: obs[name] for name in self.cfg.observations})
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics backend, as Brax asks for it."""
+        return {"native": "mujoco", "jax": "mjx-jax", "warp": "mjx-warp"}.get(self.impl, self.impl)
+
+    @_precise
+    def reset(self, rng: Key) -> State:
+        """A fresh episode: joints at home, objects and command sampled anew.
+
+        Args:
+            rng: random key of this environment.
+        """
+        k_sample, k_obs = jax.random.split(rng)
+        sim, carry = self.sample(k_sample)
+        obs, carry = self.observe(sim, carry, k_obs)
+        names = [f"reward/{name}" for name in self.cfg.rewards]
+        names += ["success", "distance", "final_distance", "dropped", "nan", "overflow", *self.cfg.metrics]
+        zero = jnp.zeros(())
+        info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
+        return State(sim, obs, zero, zero, dict.fromkeys(names, zero), info)
+
+    @_precise
+    def sample(self, rng: Key) -> tuple[Sim, Carry]:
+        """The start of an episode, before it is observed."""
+        k_fields, k_memory = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY))
+        rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
+        poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
+        start = Start(
+            joint_pos=jnp.asarray(self.cfg.robot.home),
+            object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
+            object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
+        )
+        for key, event in zip(k_events, self.cfg.events.values(), strict=True):
+            start = event(key, start)
+        fields = self._randomization(k_fields)
+        qpos, nv = self._qpos(start, fields), self.physics_model.nv
+        command, command_quat = self._sample_command(k_command)
+        sim = Sim(
+            qpos=qpos,
+            qvel=jnp.zeros(nv),
+            ctrl=qpos[self._viewer.qpos_ids],
+            warmstart=jnp.zeros(nv),
+            time=jnp.zeros(()),
+            fields=fields,
+            touch=jnp.zeros(()) if touch.reader(self.physics_model) else None,
+        )
+        carry = Carry(
+            rng=rng,
+            step=jnp.zeros((), jnp.int32),
+            action=jnp.zeros(self.action_size),
+            command=command,
+            command_quat=command_quat,
+            memory={TARGET: start.target} if self.cfg.targets else {},
+        )
+        if self.cfg.obstacles:  # between what is already there: the start and the goal
+            boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
+            sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
+        return sim, dataclasses.replace(carry, memory=self._memory(k_memory, sim, carry))
+
+    def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
+        """Joints within their ranges, linkages closed, objects in their places; of another size, as far above the table."""
+        joints = jnp.clip(start.joint_pos, *self._range)
+        qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints)
+        for coupling in self._coupled:
+            qpos = qpos.at[coupling.follower].set(coupling.position(qpos))
+        for name, (at, _) in self._viewer.objects.items():
+            qpos = qpos.at[at : at + 7].set(jnp.concatenate([start.object_pos_w[name], start.object_quat_w[name]]))
+            if "geom_size" in fields:
+                geom = self.physics_model.geom(name).id
+                factor = fields["geom_size"][geom, 0] / self.physics_model.geom_size[geom, 0]
+                qpos = qpos.at[at + 2].add((factor - 1) * self.cfg.scene.objects[name].rest_height)
+        return qpos
+
+    def _memory(self, key: Key, sim: Sim, carry: Carry) -> dict[str, Any]:
+        k_actions, k_terms = jax.random.split(key)
+        view = self._viewer(sim, carry, carry.action)
+        apart = jax.random.fold_in(key, _SENSORS)
+        return {
+            **carry.memory,
+            **self._actions.init(k_actions, view.joint_pos),
+            **terms.init({"sensors": self.cfg.sensors, "pushes": self.cfg.pushes}, apart, view),
+            **terms.init(self.cfg.view_terms(), k_terms, view),
+            "success.hold": self._hold.init(k_terms, view),
+        }
+
+    @_precise
+    def view(self, state: State) -> View:
+        """What the terms and the controllers read of a state."""
+        carry = state.info["carry"]
+        return self._viewer(state.pipeline_state, carry, carry.action)
+
+    @_precise
+    def named_observations(self, state: State) -> dict[str, dict[str, Array]]:
+        """Each term of each observation group by its name, as it is now, without noise or delay; of a batch, too."""
+        if jnp.ndim(state.done):
+            return jax.vmap(self.named_observations)(state)
+        view, recall = self.view(state), terms.Recall(state.info["carry"].memory)
+        return {name: terms.by_name(group, view, recall, name) for name, group in self.cfg.observations.items()}
+
+    def goal(self, state: State) -> Float[Array, " n"]:
+        """What to draw of a state beside the joints' positions: see ``scenery``."""
+        return self.scenery(state.pipeline_state, state.info["carry"])
+
+    def scenery(self, sim: Sim, carry: Carry) -> Float[Array, " n"]:
+        """Where the goal is now, position [m] and orientation (wxyz) in the world frame; then of each obstacle position,
+        orientation and edges [m]."""
+        boxes = [x for box in self._obstacles.views(sim.fields).values() for x in (box.pos_w, box.quat_w, box.size)]
+        return jnp.concatenate([self._viewer.goal(carry)[0], carry.command_quat, *boxes])
+
+    def looks(self, state: State) -> dict[str, Float[Array, "7"]]:
+        """What a picture shows otherwise than ``mj_model``, by object: MuJoCo's size [m] and the colour, red to alpha.
+
+        Drawn fields, and of ``cfg.targets`` the commanded one in the goal's green.
+        """
+        fields, model = state.pipeline_state.fields, self.physics_model
+        if not self.cfg.targets and not {"geom_size", "geom_rgba"} & set(fields):
+            return {}
+        out = {}
+        for name in self.cfg.scene.objects:
+            geom = model.geom(name).id
+            size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
+            if name in self.cfg.targets:
+                commanded = state.info["carry"].memory[TARGET] == self.cfg.targets.index(name)
+                rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)
+            out[name] = jnp.concatenate([size, rgba])
+        return out
+
+    @_precise
+    def observe(self, sim: Sim, carry: Carry, key: Key) -> tuple[dict[str, Any], Carry]:
+        """The observation groups, and what remains in memory of them; ``key`` draws their noise."""
+        cfg, recall = self.cfg, terms.Recall(carry.memory)
+        view = sensed = self._viewer(sim, carry, carry.action)
+        for name, term in cfg.sensors.items():
+            sensed = recall.through(f"sensors.{name}", term.made, sensed)
+        seen = dict.fromkeys(cfg.sensed, sensed) if cfg.sensors else {}
+        obs = terms.observe(cfg.observations, view, key, cfg.corruption, recall, cfg.apart, seen)
+        return obs, dataclasses.replace(carry, memory=recall.memory)
+
+    @_precise
+    def step(self, state: State, action: Float[Array, " na"]) -> State:
+        """One control step.
+
+        Args:
+            state: from ``reset`` or ``step``.
+            action: [action_size], unbounded.
+
+        Raises:
+            UserError: the action has another size.
+        """
+        state, ctrl = self.act(state, action)
+        sim, overflow = self.physics.step(state.pipeline_state, ctrl)
+        return self.finish(state, action, sim, overflow)
+
+    @_precise
+    def step_and_reset(self, state: State, action: Float[Array, " na"]) -> State:
+        """``step``, and where that ends the episode the start of a new one, with fresh draws.
+
+        Reward, done and metrics are the ended episode's; physics, observation and carry the new one's. To cache the first
+        state instead would replay one object and goal position per environment for ever.
+        """
+        state, ctrl = self.act(state, action)
+        sim, overflow = self.physics.step(state.pipeline_state, ctrl)
+        state = self.advance(state, action, sim, overflow)
+        rng, k_sample, k_obs = jax.random.split(state.info["carry"].rng, 3)
+        old = (state.pipeline_state, state.info["carry"].replace(rng=rng))
+        sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), self.sample(k_sample), old)
+        obs, carry = self.observe(sim, carry, k_obs)
+        return state.replace(pipeline_state=sim, obs=obs, info={**state.info, "carry": carry})
+
+    def act(self, state: State, action: Float[Array, " na"]) -> tuple[State, Float[Array, " nu"]]:
+        """The drives' position targets for ``action`` [rad or m], and the state with what the action terms then remember.
+
+        Raises:
+            UserError: the action has another size.
+        """
+        if jnp.shape(action) != (self.action_size,):
+            shape = f"an action is {self.action_size} numbers, got an array of shape {jnp.shape(action)}"
+            raise UserError(f"{shape}: jax.vmap the step for many environments")
+        sim, carry = state.pipeline_state, state.info["carry"]
+        joint_pos = sim.qpos[self._viewer.qpos_ids]
+        memory, ctrl = self._actions.step(carry.memory, self._clip(action), joint_pos, sim.ctrl)
+        sim, memory = self._push(sim, carry, memory)
+        return state.replace(pipeline_state=sim, info={**state.info, "carry": carry.replace(memory=memory)}), ctrl
+
+    def _push(self, sim: Sim, carry: Carry, memory: dict[str, Any]) -> tuple[Sim, dict[str, Any]]:
+        """Objects with what the pushes add to their velocities."""
+        if not self.cfg.pushes:
+            return sim, memory
+        recall, view, qvel = terms.Recall(memory), self._viewer(sim, carry, carry.action), sim.qvel
+        for name, term in self.cfg.pushes.items():
+            dof = self._viewer.objects[term.params["object"]][1]
+            qvel = qvel.at[dof : dof + 3].add(recall(f"pushes.{name}", term, view))
+        return dataclasses.replace(sim, qvel=qvel), recall.memory
+
+    def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
+        """The drives' position targets for ``action`` alone. Raises as ``act``."""
+        return self.act(state, action)[1]
+
+    @_precise
+    def finish(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
+        """The second half of ``step``: what follows from the physics state ``sim``."""
+        state = self.advance(state, action, sim, overflow)
+        rng, k_obs = jax.random.split(state.info["carry"].rng)
+        obs, carry = self.observe(state.pipeline_state, state.info["carry"], k_obs)
+        return state.replace(obs=obs, info={**state.info, "carry": carry.replace(rng=rng)})
+
+    @_precise
+    def advance(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
+        """Rewards, terminations, metrics and carry for the physics state ``sim``; the observation is left as it was."""
+        cfg, carry = self.cfg, state.info["carry"]
+        sim, action, bad = self._guard(state, self._clip(action), sim)
+        step, count, recall = carry.step + 1, state.info["count"] + 1, terms.Recall(carry.memory)
+        view = self._viewer(sim, carry.replace(step=step), action)
+
+        rewards = terms.rewards(cfg.rewards, cfg.curriculum, view, count, self.dt, recall)
+        bad |= ~jnp.isfinite(sum(rewards.values()))
+        rewards = {name: jnp.where(bad, 0.0, value) for name, value in rewards.items()}
+        terminated, truncated = terms.terminations(cfg.terminations, view, recall)
+        terminated, truncated = terminated | bad, truncated & ~bad
+        done = (terminated | truncated).astype(jnp.float32)
+        met = recall("success.condition", cfg.success.condition, view)
+        ends = {"success": truncated & recall.through("success.hold", self._hold, met), "dropped": terminated & ~bad}
+        metrics = {f"reward/{name}": value for name, value in rewards.items()}
+        metrics |= self._metrics(view, recall, ends, done, bad) | {"nan": bad.astype(jnp.float32), "overflow": overflow}
+
+        carry = self._resample(carry.replace(step=step, action=jnp.where(bad, carry.action, action), memory=recall.memory))
+        info = {"carry": carry, "count": count, "truncation": truncated.astype(jnp.float32), "steps": step.astype(jnp.float32)}
+        return state.replace(
+            pipeline_state=sim,
+            reward=jnp.asarray(sum(rewards.values()), jnp.float32),
+            done=done,
+            metrics={**state.metrics, **metrics},
+            info={**state.info, **info},
+        )
+
+    def _guard(self, state: State, action: Float[Array, " na"], sim: Sim) -> tuple[Sim, Float[Array, " na"], Bool[Array, ""]]:
+        """A diverged environment stays at its last good state and ends; nothing of the bad one gets any further."""
+        bad = ~(jnp.all(jnp.abs(sim.qpos) < jnp.inf) & jnp.all(jnp.abs(sim.qvel) < _MAX_SPEED) & jnp.all(jnp.isfinite(action)))
+        sim = jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.pipeline_state, sim)
+        return sim, jnp.where(bad, state.info["carry"].action, action), bad
+
+    def _metrics(self, view: View, recall: terms.Recall, ends: dict, done: Array, bad: Array) -> dict[str, Float[Array, ""]]:
+        """The task's metrics; ``ends`` are further results of an episode."""
+        distance = recall("success.distance", self.cfg.success.distance, view)
+        values = {"distance": distance, "final_distance": distance, **ends}
+        values |= {name: recall(f"metrics.{name}", term, view) for name, term in self.cfg.metrics.items()}
+        # Episode results appear at the last step and are 0 before it: a sum over the episode gives them.
+        at_end = {"final_distance", *ends, *(name for name, term in self.cfg.metrics.items() if term.at_end)}
+        return {name: jnp.where(bad, 0.0, value * done if name in at_end else value) for name, value in values.items()}
+
+    def _resample(self, carry: Carry) -> Carry:
+        """Samples the command anew where it is time."""
+        if self._resample_steps >= self.episode_length:
+            return carry
+        rng, k_command = jax.random.split(carry.rng)
+        pos, quat = (
+            jnp.where(carry.step % self._resample_steps == 0, new, old)
+            for new, old in zip(self._sample_command(k_command), (carry.command, carry.command_quat), strict=True)
+        )
+        return dataclasses.replace(carry, rng=rng, command=pos, command_quat=quat)
+
+    def _sample_command(self, key: Key) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+        goal = self.cfg.command(key)
+        return goal if isinstance(goal, tuple) else (goal, jnp.array([1.0, 0.0, 0.0, 0.0]))
+
+    def _clip(self, action: Float[Array, " na"]) -> Float[Array, " na"]:
+        return jnp.clip(action, -self.cfg.action_clip, self.cfg.action_clip) if self.cfg.action_clip else action

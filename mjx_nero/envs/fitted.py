@@ -1,0 +1,104 @@
+"""Tasks for any robot: where things lie, where they have to go and how large they are follow from what the robot can do."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_nero.bounds import Range
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import EnvCfg, Envs, Presets
+from mjx_nero.envs.tasks import (
+    clutter,
+    follow_target,
+    lift,
+    lift_obstacles,
+    pick_place,
+    place,
+    push,
+    reach,
+    reach_obstacles,
+    stack,
+)
+from mjx_nero.sim import grasp
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+
+
+def lift_setup(robot: RobotCfg) -> lift.Setup:
+    """The cube anywhere in ``pick``, the goal anywhere in ``hold``."""
+    there = regions.of(robot)
+    return lift.Setup(scene=regions.scene(robot, "sphere"), cube=there.cube, goal=there.hold, grasp_radius=regions.near(there))
+
+
+def pick_place_setup(robot: RobotCfg) -> pick_place.Setup:
+    """The cube anywhere in the right half of ``pick``, its place in the left one; an edge apart."""
+    there, edge = regions.of(robot), grasp.cube_for(robot).size[0]
+
+    def split(side: Range) -> tuple[Range, Range]:
+        low, high = side
+        middle, apart = (low + high) / 2, min(edge, (high - low) / 2) / 2
+        return regions.span(low, middle - apart), regions.span(middle + apart, high)
+
+    return pick_place.Setup(
+        scene=regions.scene(robot, "cube"),
+        cube=(there.cube[0], split(there.cube[1])[0]),
+        goal=(there.place[0], split(there.place[1])[1]),
+        travel_height=there.travel,
+        episode_length_s=20.0,
+        grasp_radius=regions.near(there),
+    )
+
+
+def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
+    """The target on circles within ``pick``; of a robot that cannot grasp, within ``workspace``."""
+    box = np.array(robot.pick or regions.box(robot, "workspace", "where it can work"))
+    half = np.ptp(box, axis=1) / 2
+    (x, y, z), radius = (round(float(v), 4) for v in box.mean(1)), round(float(half[1:].min() / 2), 4)
+    return follow_target.Setup(
+        frame=robot.ee_site,
+        center=(x, y, z),
+        spread=(round(float(half[0] / 2), 4), round(float(half[1] / 2), 4), 0.0),
+        radius=radius,
+        scene=scenes.around(robot, SceneCfg(objects={}, goal="cube")),
+    )
+
+
+def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.Setup], EnvCfg]) -> EnvCfg:
+    return factory(robot, lift_setup(robot))
+
+
+def _pick_place(robot: RobotCfg) -> EnvCfg:
+    """By inverse kinematics: RMPflow needs files a robot."""
+    cfg, offset = pick_place.default(robot, pick_place_setup(robot)), regions.of(robot).offset
+    fields = {**cfg.controllers["pick_place"], "end_effector_offset": offset, "motion": "ik", **_turned(robot, "ik.")}
+    return dataclasses.replace(cfg, controllers={"pick_place": fields})
+
+
+def _follow_target(robot: RobotCfg, factory: Callable[[RobotCfg, follow_target.Setup], EnvCfg]) -> EnvCfg:
+    return dataclasses.replace(factory(robot, follow_target_setup(robot)), controllers={"ik": _turned(robot)})
+
+
+def _turned(robot: RobotCfg, prefix: str = "") -> dict[str, bool]:
+    """What inverse kinematics has to know of an arm of few joints."""
+    return {} if regions.turns(robot) else {f"{prefix}free_turn": True}
+
+
+def _presets(fit: Callable, **factories: Callable) -> Presets:
+    return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
+
+
+ENVS: Envs = {
+    "reach": (None, reach.presets()),
+    "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real)),
+    "follow_target": (None, _presets(_follow_target, default=follow_target.default, static=follow_target.static)),
+    "pick_place": (None, {"default": _pick_place}),
+    "reach_obstacles": (None, reach_obstacles.presets()),
+    "lift_obstacles": (None, lift_obstacles.presets()),
+    "clutter": (None, clutter.presets()),
+    "push": (None, push.presets()),
+    "place": (None, place.presets()),
+    "stack": (None, stack.presets()),
+}

@@ -1,0 +1,113 @@
+"""Drives that ``python -m mjx_nero identify`` found of a real arm, in a task: gains, ranges to draw from, and a delay."""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_nero import files, values
+from mjx_nero.bounds import Positive
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.mdp import actions, randomization
+from mjx_nero.mdp.terms import Term
+from mjx_nero.types import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Positives:
+    """A number above zero with its 95% interval."""
+
+    value: Positive
+    low: Positive
+    high: Positive
+
+
+@dataclasses.dataclass(frozen=True)
+class Numbers:
+    """A number with its 95% interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """What was found of a joint's drive (see ``tools.identification.plant.Drives``)."""
+
+    stiffness: Positives
+    damping: Positives
+    armature: Positives
+    friction: Positives
+    offset: Numbers
+
+
+@dataclasses.dataclass(frozen=True)
+class Identified:
+    """The content of such a file; joints by name."""
+
+    robot: str
+    delay: Numbers
+    joints: Mapping[str, Joint]
+
+
+def read(path: pathlib.Path) -> Identified:
+    """Reads a file of ``identify``; a stranger may have made it.
+
+    Raises:
+        UserError: there is none, or it holds something else.
+    """
+    found = values.read(Identified, files.read_yaml(path), "")
+    for name, number in {"delay": found.delay, **_numbers(found)}.items():
+        if not number.low <= number.value <= number.high or abs(number.high) > 1e6 or abs(number.low) > 1e6:
+            raise UserError(
+                f"{path}: {name} takes low <= value <= high up to 1e6, got {values.short(dataclasses.astuple(number))}"
+            )
+    return found
+
+
+def _numbers(found: Identified) -> dict[str, Any]:
+    return {
+        f"joints.{j}.{f.name}": getattr(joint, f.name) for j, joint in found.joints.items() for f in dataclasses.fields(joint)
+    }
+
+
+def applied(cfg: EnvCfg) -> EnvCfg:
+    """The task with the drives of the file that it names: centres as the robot's gains, 95% intervals as ranges to draw from
+    before all other randomization, and the delay in whole control steps. Encoder offsets are for the real arm to subtract.
+
+    Raises:
+        UserError: as ``read``; or it is another robot's.
+    """
+    if not cfg.identified:
+        return cfg
+    path = pathlib.Path(cfg.identified)
+    found, arm = read(path), cfg.robot.arm
+    if found.robot != cfg.robot.name or set(found.joints) != set(arm.joints):
+        raise UserError(
+            f"{path} is of {found.robot} with joints {', '.join(found.joints)}: this task's robot is {cfg.robot.name}"
+        )
+    joints = [found.joints[name] for name in arm.joints]
+    names = ("stiffness", "damping", "armature", "friction")
+    ranges = {n: tuple((getattr(j, n).low, getattr(j, n).high) for j in joints) for n in names}
+    gains: dict[str, Any] = {n: tuple(getattr(j, n).value for j in joints) for n in ("stiffness", "damping")}
+    return dataclasses.replace(
+        cfg,
+        robot=dataclasses.replace(cfg.robot, arm=dataclasses.replace(arm, **gains)),
+        actions=_late(cfg, found.delay),
+        randomization={"identified": Term(randomization.drives, params={"joints": arm.joints, **ranges}), **cfg.randomization},
+    )
+
+
+def _late(cfg: EnvCfg, delay: Numbers) -> dict[str, Term]:
+    """The actions with the delay's whole control steps, within what a task draws anyway or wider."""
+    dt, terms = cfg.sim.dt * cfg.sim.decimation, dict(cfg.actions)
+    # To the nearest step, or both where the interval lies between two.
+    steps = max(0, math.floor(delay.low / dt + 0.25)), max(0, math.ceil(delay.high / dt - 0.25))
+    mine = next((name for name, term in terms.items() if term.func is actions.Delay), None)
+    if mine is None:
+        return {"delay": Term(actions.Delay, params={"steps": steps}), **terms} if steps[1] else terms
+    low, high = terms[mine].params["steps"]
+    wider = {**terms[mine].params, "steps": (min(low, steps[0]), max(high, steps[1]))}
+    return {**terms, mine: dataclasses.replace(terms[mine], params=wider)}

@@ -1,0 +1,110 @@
+"""Where a robot can pick things up, and where it can hold them: what tasks for any robot are made from."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from mjx_nero.bounds import Range
+from mjx_nero.sim import grasp
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.robot import Box, RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+from mjx_nero.types import UserError
+
+HELD = 0.03  # [m] from where the cube is in a good grasp it may be so far off and still count as held
+TURNS = 5  # joints of an arm that can turn its hand at will while that points down
+TRAVEL = 0.1  # [m] a carried cube is this high above the table, if the hand can still point down there
+
+
+def box(robot: RobotCfg, name: str, what: str) -> Box:
+    """One of the robot's boxes [m], robot root frame.
+
+    Raises:
+        UserError: it is unknown.
+    """
+    found: Box | None = getattr(robot, name)
+    if found is None:
+        where = "its robot.yaml" if robot.folder else "its config"
+        raise UserError(f"{robot.name} has no {name}, {what}: give it in {where} as ranges of x, y and z [m], or import it anew")
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Regions:
+    """Where a robot can grasp a cube, and where it can hold it.
+
+    Attributes:
+        cube: ``x`` and ``y`` of the cube on the table, in the world [m].
+        place: the same in the robot's frame.
+        hold: as in ``RobotCfg``.
+        travel: height of the grasp point over the table while it carries a cube across, in the robot's frame [m].
+        offset: of the grasp point from the cube's centre in a grasp, in the world [m].
+    """
+
+    cube: tuple[Range, Range]
+    place: tuple[Range, Range]
+    hold: Box
+    travel: float
+    offset: tuple[float, float, float]
+
+
+def of(robot: RobotCfg) -> Regions:
+    """What follows from its ``pick``, ``hold`` and ``grip``.
+
+    Raises:
+        UserError: it has no gripper, or one of these is unknown.
+    """
+    rest = grasp.cube_for(robot).rest_height
+    pick = box(robot, "pick", "where on the table it can grasp")
+    hold = box(robot, "hold", "where it can hold what it has grasped")
+    turned = np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, np.array(robot.grip), np.array(robot.down))
+    x, y = (span(low + by, high + by) for (low, high), by in zip(pick[:2], turned[:2], strict=True))
+    dx, dy, dz = robot.base_pos
+    return Regions(
+        cube=(span(x[0] + dx, x[1] + dx), span(y[0] + dy, y[1] + dy)),
+        place=(x, y),
+        hold=hold,
+        travel=round(min(pick[2][1], pick[2][0] + TRAVEL), 4),
+        offset=(*span(-turned[0], -turned[1]), round(pick[2][0] + dz - rest, 4)),
+    )
+
+
+def turns(robot: RobotCfg) -> bool:
+    """Whether the arm can turn its hand at will while that points down."""
+    return len(robot.arm.joints) >= TURNS
+
+
+def span(low: float, high: float) -> Range:
+    """A range in whole tenths of a millimetre, without negative zeros."""
+    return round(float(low), 4) + 0.0, round(float(high), 4) + 0.0
+
+
+def scene(robot: RobotCfg, goal: str) -> SceneCfg:
+    """The cube that the robot can lift on a table where it works; ``goal`` is the marker's shape."""
+    cube = grasp.cube_for(robot)
+    return scenes.around(robot, SceneCfg(objects={"cube": cube}, goal=goal, goal_edge=cube.size[0]))
+
+
+def near(there: Regions) -> float:
+    """How far the cube may be from the grasp point and still count as held [m]."""
+    return round(max(0.04, float(np.linalg.norm(there.offset)) + HELD), 4)
+
+
+def turn_to(robot: RobotCfg, x: float, y: float) -> float:
+    """By how much the first joint has to turn, from home, for the arm to point at a place of the robot's frame [rad]; 0 where it
+    does not turn the arm about the vertical."""
+    model = scenes.robot_model(robot)
+    data, first = mujoco.MjData(model), model.joint(robot.arm.joints[0])
+    data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = robot.home
+    mujoco.mj_kinematics(model, data)
+    axis, about = data.xaxis[first.id], data.xanchor[first.id]
+    if first.type[0] != mujoco.mjtJoint.mjJNT_HINGE or abs(axis[2]) < 0.99:
+        return 0.0
+    now = (data.site(robot.ee_site).xpos - about)[:2]
+    to = np.array([x, y]) + robot.base_pos[:2] - about[:2]
+    turn = np.arctan2(now[0] * to[1] - now[1] * to[0], now @ to) * np.sign(axis[2])
+    if first.limited[0]:
+        turn = np.clip(robot.home[0] + turn, *first.range) - robot.home[0]
+    return round(float(turn), 4)

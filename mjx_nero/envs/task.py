@@ -1,0 +1,149 @@
+"""What a task is: an ``EnvCfg`` and its parts, all data. ``env`` runs it."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from mjx_nero import bounds, config
+from mjx_nero.bounds import NonNegative, Positive
+from mjx_nero.mdp import actions, success
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.types import TARGET, UserError
+
+
+def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
+    """One action an arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes), if it has one.
+
+    Without it the gripper stays at home.
+    """
+    return {
+        "arm": Term(actions.JointPosition, params={"scale": scale}),
+        **({"gripper": Term(actions.BinaryGripper)} if gripper else {}),
+        "speed_limit": Term(actions.SpeedLimit),
+    }
+
+
+def drive_targets() -> dict[str, Term]:
+    """The drives' position targets themselves [rad or m], one a drive; their speed is left to whoever gives them: controllers."""
+    return {"drives": Term(actions.DriveTargets)}
+
+
+@dataclasses.dataclass(frozen=True)
+class SuccessCfg:
+    """``condition`` has held for the end of the episode; ``distance`` [m] is what it is about."""
+
+    condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
+    distance: Term = Term(success.object_distance)
+    hold_s: NonNegative = 0.5  # for how long [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvCfg:
+    """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
+
+    Attributes:
+        actions: from the policy's output to the drives' targets, in this order.
+        action_clip: bounds every action to +-this before use; 0 leaves them alone.
+        apart: observation groups whose terms stay apart, a dict by name, instead of being concatenated.
+        motion: moves the goal: a path of ``mdp.commands``.
+        randomization: model fields that every episode draws anew (``mdp.randomization``).
+        sensors: between the world and the observation groups ``sensed``, in this order (``mdp.sensors``). Unlike the noise of
+            observations, they are always on.
+        sensed: the groups that see by the sensors; the others see what is.
+        obstacles: where the scene's obstacles stand, drawn for every episode once its start and goal are (``mdp.obstacles``).
+        targets: objects of which every episode commands one, which the terms of a view call ``target``; an event says which
+            (``Start.target``), else it is the first.
+        pushes: sudden changes of objects' velocities (``mdp.pushes``).
+        identified: a file of ``python -m mjx_nero identify``, whose drives and delay take the place of the robot's own.
+        controllers: those of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config by
+            dotted name.
+        training: fields of the learner's config that suit the task, likewise.
+
+    Raises:
+        UserError: a field is out of its bounds, or terms name what is not there.
+    """
+
+    robot: RobotCfg
+    command: CommandTerm
+    observations: Mapping[str, Mapping[str, ObservationTerm]]
+    rewards: Mapping[str, RewardTerm]
+    terminations: Mapping[str, DoneTerm]
+    events: Mapping[str, Term]
+    curriculum: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    scene: SceneCfg = SceneCfg()
+    sim: SimCfg = SimCfg()
+    actions: Mapping[str, Term] = dataclasses.field(default_factory=joint_actions)
+    action_clip: NonNegative = 0.0
+    success: SuccessCfg = SuccessCfg()
+    metrics: Mapping[str, MetricTerm] = dataclasses.field(default_factory=dict)
+    episode_length_s: Positive = 5.0  # [s]
+    corruption: bool = True  # observation noise: on to train, off to play
+    apart: tuple[str, ...] = ()
+    motion: Term | None = None
+    randomization: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    sensors: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    sensed: tuple[str, ...] = ("state",)
+    obstacles: Term | None = None
+    targets: tuple[str, ...] = ()
+    pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    identified: str = ""
+    controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        config.freeze(self)
+        bounds.check(self)
+        for what, names, valid in (
+            ("curriculum", self.curriculum, self.rewards),
+            ("apart", self.apart, self.observations),
+            ("targets", self.targets, self.scene.objects),
+        ):
+            if unknown := [name for name in names if name not in valid]:
+                raise UserError(f"{what} names {', '.join(unknown)}: not one of {', '.join(valid)}")
+        if self.targets and TARGET in self.scene.objects:
+            raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
+        seen = tuple(f"{group}." for group in ("sensors", *self.view_terms()))
+        for name, term in self.terms().items():
+            commanded = (TARGET,) if self.targets and name.startswith(seen) else ()
+            there = (*self.scene.objects, *commanded)
+            listed = ", ".join(there) or "none"
+            wanted = term.params.get("object")
+            if wanted is not None and wanted not in there:
+                raise UserError(f"{name}.params.object is {wanted!r}, and the scene's objects are: {listed}")
+            if unknown := [each for each in term.params.get("objects", ()) if each not in there]:
+                raise UserError(f"{name}.params.objects names {', '.join(unknown)}, and the scene's objects are: {listed}")
+
+    def view_terms(self) -> dict[str, Mapping[str, Term]]:
+        """The terms of a view by the dotted names of their groups."""
+        observed = {f"observations.{name}": group for name, group in self.observations.items()}
+        ends = {"condition": self.success.condition, "distance": self.success.distance}
+        return {
+            **observed,
+            "rewards": self.rewards,
+            "terminations": self.terminations,
+            "success": ends,
+            "metrics": self.metrics,
+        }
+
+    def terms(self) -> dict[str, Term]:
+        """All terms that may name an object, by their dotted names."""
+        groups = {
+            **self.view_terms(),
+            "events": self.events,
+            "randomization": self.randomization,
+            "sensors": self.sensors,
+            "pushes": self.pushes,
+        }
+        return {f"{group}.{name}": term for group, terms in groups.items() for name, term in terms.items()}
+
+
+def for_controllers(cfg: EnvCfg) -> EnvCfg:
+    """The task as controllers act in it: by drive targets, in place of the actions that policies learn."""
+    given = any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values())
+    return cfg if given else dataclasses.replace(cfg, actions=drive_targets())
+
+
+Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, the default first
+Envs = dict[str, tuple[RobotCfg | None, Presets]]  # by name, with the robot each is meant for

@@ -1,0 +1,148 @@
+"""What ``place`` and ``stack`` have in common: how near is there, what leads there, and who can do it. See ``mdp.towers``."""
+
+import dataclasses
+import math
+from typing import Any
+
+from mjx_nero.envs import regions
+from mjx_nero.envs.regions import Regions
+from mjx_nero.envs.task import SuccessCfg
+from mjx_nero.mdp import metrics, rewards, terminations, towers
+from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
+from mjx_nero.sim import contacts
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.types import UserError
+
+STILL = 0.005  # [m/s]
+FLAT = 0.005  # [m] how far above or below its place an object may be
+LIFTED = 0.01  # [m] above where it lies
+AWAY = 0.02  # [m] the pads are as far above an object that the hand has left
+CLOSING = 0.5  # [s] the fingers take to close, at least: at a metre a second they throw what they meet
+# Shares of the ten phases that a control step takes: 305 steps in all.
+QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tower:
+    """A tower that a robot builds.
+
+    Attributes:
+        objects: from the bottom up, as in ``mdp.towers``.
+        edge: how high an object is, and how far apart the fingers hold it [m].
+        aside: how far from its place an object may be, along the table [m].
+        angle: from the goal's orientation, likewise [rad].
+    """
+
+    robot: RobotCfg
+    scene: SceneCfg
+    objects: tuple[str, ...]
+    edge: float
+    aside: float
+    angle: float = math.pi
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Where objects belong."""
+        return {"tower": self.objects, "rise": self.edge}
+
+    @property
+    def near(self) -> dict[str, Any]:
+        """... and how near is there."""
+        return {**self.place, "within": (self.aside, FLAT, self.angle)}
+
+    @property
+    def there(self) -> Regions:
+        """Where the robot works."""
+        return regions.of(self.robot)
+
+    @property
+    def held(self) -> dict[str, float]:
+        """An object is held if it is this high, and this near to the grasp point [m]."""
+        return {"minimal_height": self.edge / 2 + LIFTED, "grasp_radius": regions.near(self.there)}
+
+    @property
+    def clearance(self) -> float:
+        """From an object to the grasp point of a hand that has left it [m]."""
+        return round(self.edge / 2 + self.robot.pad[0] / 2 + AWAY, 4)
+
+    @property
+    def done(self) -> dict[str, Any]:
+        """All stand, at rest, and the hand is away."""
+        return {**self.near, "max_speed": STILL, "clearance": self.clearance}
+
+    @property
+    def builder(self) -> RobotCfg:
+        """The robot as its own controller works it: its weight carried by the drives, and fingers as quick as real ones."""
+        fingers = self.robot.gripper
+        slow = (min(v, abs(a - b) / CLOSING) for v, a, b in zip(fingers.speed, fingers.open, fingers.close, strict=True))
+        return dataclasses.replace(
+            self.robot, gravity_compensation=True, gripper=dataclasses.replace(fingers, speed=tuple(round(v, 4) for v in slow))
+        )
+
+    def sim(self) -> SimCfg:
+        """Buffers by count."""
+        return contacts.sized(self.robot, self.scene, SimCfg())
+
+    def success(self) -> SuccessCfg:
+        """For half a second at the end."""
+        return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
+
+    def rewards(self) -> dict[str, RewardTerm]:
+        """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones."""
+        near, carried = self.near, {**self.near, **self.held}
+        way, leave = {**carried, "over": round(0.75 * self.edge, 4)}, {**near, "clearance": self.clearance}
+        fingers = {"open": self.robot.gripper.open, "close": self.robot.gripper.close}
+        turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
+        return {
+            "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **near}),
+            "holding_object": RewardTerm(towers.carried, weight=5.0, params=carried),
+            "approaching": RewardTerm(towers.approached, weight=10.0, params={"std": 0.3, **way}),
+            "approaching_near": RewardTerm(towers.approached, weight=10.0, params={"std": 0.1, **way}),
+            "approaching_fine": RewardTerm(towers.approached, weight=15.0, params={"std": 0.03, **way}),
+            **(turned if self.angle < math.pi else {}),
+            "standing": RewardTerm(towers.standing, weight=10.0, params=near),
+            "releasing": RewardTerm(towers.opened, weight=10.0, params={**leave, **fingers}),
+            "leaving": RewardTerm(towers.left, weight=10.0, params=leave),
+            "completed": RewardTerm(towers.completed, weight=15.0, params=self.done),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        }
+
+    def metrics(self) -> dict[str, MetricTerm]:
+        """Of the first object that is to be moved."""
+        first = {"object": self.objects[1], **self.held}
+        return {"grasped": MetricTerm(metrics.Grasped, params=first), "grasp_time": MetricTerm(metrics.GraspTime, params=first)}
+
+    def terminations(self) -> dict[str, DoneTerm]:
+        """The time is over, or an object has left the table."""
+        table = {"center": self.scene.table_center, "size": self.scene.table_size}
+        off = {
+            f"{name}_off_table": DoneTerm(terminations.object_off_table, params={**table, "object": name})
+            for name in self.scene.objects
+        }
+        return {"time_out": DoneTerm(terminations.time_out, time_out=True), **off}
+
+    def controllers(self) -> dict[str, dict[str, Any]]:
+        """Pick and place by inverse kinematics, object by object.
+
+        Raises:
+            UserError: the robot's hand does not point down as high as the tower is.
+        """
+        there, (low, high) = self.there, regions.box(self.robot, "pick", "where on the table it can grasp")[2]
+        top = low + (len(self.objects) - 1 - (towers.GOAL in self.objects)) * self.edge
+        if top + LIFTED > high:
+            needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, and pick ends at {high:.3g} m"
+            raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
+        leave = max(there.travel, top + max(self.edge, self.clearance + LIFTED))
+        fields = {
+            "tower": self.objects,
+            "rise": self.edge,
+            "events_dt": QUICK,
+            "end_effector_initial_height": round(min(high, leave), 4),
+            "end_effector_offset": there.offset,
+            "motion": "ik",
+            "turn": self.angle < math.pi,
+            **({} if regions.turns(self.robot) else {"ik.free_turn": True}),
+        }
+        return {"pick_place": fields}

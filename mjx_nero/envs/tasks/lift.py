@@ -1,0 +1,151 @@
+"""Lift: pick a cube off the table and hold it at a commanded point. A preset is one list, however long, to be read as one."""
+
+import dataclasses
+import functools
+
+from mjx_nero.bounds import Range
+from mjx_nero.envs.task import EnvCfg, Presets, joint_actions
+from mjx_nero.envs.tasks import sim2real as sim2reals
+from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What differs from robot to robot: the cube, where it lies and where it has to go [m], robot root frame.
+
+    Attributes:
+        cube: ``x`` and ``y`` of the cube at the start of an episode.
+        goal: ``x``, ``y`` and ``z`` of the commanded point.
+        grasp_radius: how near to the grasp point the object counts as held [m].
+    """
+
+    scene: SceneCfg
+    cube: tuple[Range, Range]
+    goal: tuple[Range, Range, Range]
+    grasp_radius: float = 0.04
+
+    @property
+    def lifted(self) -> dict[str, float]:
+        """The object's centre above this is off the table [m]: 1 cm above a cube at rest."""
+        return {"minimal_height": self.scene.objects["cube"].rest_height + 0.01}
+
+    @property
+    def held(self) -> dict[str, float]:
+        """... and held, if it is this near to the grasp point [m]."""
+        return {**self.lifted, "grasp_radius": self.grasp_radius}
+
+
+def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """The Isaac Lab recipe's MDP, its numbers word for word.
+
+    Kept to compare with. Its lifting reward is open to a shortcut: a cube knocked into the air scores like a held one.
+    The recipe switches observation corruption on but gives no term a noise range, so there is none to apply.
+    """
+    return EnvCfg(
+        robot=robot,
+        episode_length_s=5.0,
+        actions=joint_actions(scale=0.5),
+        scene=setup.scene,
+        metrics={
+            "grasped": MetricTerm(metrics.Grasped, params=setup.held),
+            "grasp_time": MetricTerm(metrics.GraspTime, params=setup.held),
+        },
+        command=CommandTerm(
+            commands.uniform_position,
+            params=dict(zip("xyz", setup.goal, strict=True)),
+            resample_s=5.0,
+        ),
+        observations={
+            "state": {
+                "joint_pos": ObservationTerm(observations.joint_pos_rel),
+                "joint_vel": ObservationTerm(observations.joint_vel_rel),
+                "object_position": ObservationTerm(observations.object_position),
+                "target_object_position": ObservationTerm(observations.command),
+                "actions": ObservationTerm(observations.last_action),
+            },
+        },
+        events={
+            "reset_object_position": Term(
+                events.object_position_uniform,
+                params={"x": setup.cube[0], "y": setup.cube[1], "z": (0.0, 0.0)},
+            ),
+        },
+        rewards={
+            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.05}),
+            "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=setup.lifted),
+            "object_goal_tracking": RewardTerm(rewards.object_goal_distance, weight=16.0, params={"std": 0.3, **setup.lifted}),
+            "object_goal_tracking_fine_grained": RewardTerm(
+                rewards.object_goal_distance, weight=5.0, params={"std": 0.05, **setup.lifted}
+            ),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum={
+            "action_rate": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
+            "joint_vel": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
+        },
+        terminations={
+            "time_out": DoneTerm(terminations.time_out, time_out=True),
+            "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
+            # The physics' table has no edge to fall from, so leaving the drawn one counts as the fall.
+            "object_off_table": DoneTerm(
+                terminations.object_off_table,
+                params={"center": setup.scene.table_center, "size": setup.scene.table_size},
+            ),
+        },
+    )
+
+
+def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """The preset that learns to grasp: height and tracking count only for a held cube, and relative positions are observed."""
+    recipe, held = isaac(robot, setup), setup.held
+    state = {
+        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
+        "target_error": ObservationTerm(observations.target_error),
+        "ee_position": ObservationTerm(observations.ee_position),
+        "ee_to_object": ObservationTerm(observations.ee_to_object, noise=0.002),
+        "object_to_goal": ObservationTerm(observations.object_to_goal, noise=0.002),
+        "target_object_position": ObservationTerm(observations.command),
+        "actions": ObservationTerm(observations.last_action),
+    }
+    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
+    return dataclasses.replace(
+        recipe,
+        observations={
+            "state": state,
+            "privileged_state": {
+                **exact,
+                "object_velocity": ObservationTerm(observations.object_velocity),
+                "object_orientation": ObservationTerm(observations.object_orientation),
+            },
+        },
+        rewards={
+            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
+            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
+            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
+            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum={},
+    )
+
+
+def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """The default with all that differs between a simulated arm and a real one: see ``sim2real``."""
+    return sim2reals.randomized(default(robot, setup))
+
+
+def presets(setup: Setup) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {
+        "default": functools.partial(default, setup=setup),
+        "isaac": functools.partial(isaac, setup=setup),
+        "sim2real": functools.partial(sim2real, setup=setup),
+    }

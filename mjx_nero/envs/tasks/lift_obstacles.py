@@ -1,0 +1,71 @@
+"""Lift past obstacles: a cube from the right of the table to a point above its left. Neither arm nor cube may touch what stands
+between."""
+
+import dataclasses
+import functools
+
+from mjx_nero.bounds import Range
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg
+from mjx_nero.envs.tasks import lift, reach_obstacles
+from mjx_nero.mdp import metrics, rewards, success
+from mjx_nero.mdp.terms import ONCE, CommandTerm, MetricTerm, RewardTerm, Term
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What differs from robot to robot. None: from the robot's ``pick``, ``hold`` and gripper.
+
+    Attributes:
+        cube: ``x`` and ``y`` of the cube at the start [m], in the world.
+        goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
+        room: what start and goal have to themselves on every side [m].
+        top: the highest that an obstacle may be above the robot's foot [m].
+        scene: the cube, cameras and table.
+    """
+
+    cube: tuple[Range, Range] | None = None
+    goal: tuple[Range, Range, Range] | None = None
+    room: float | None = None
+    top: float | None = None
+    scene: SceneCfg | None = None
+
+
+def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """Success: the cube within 2 cm of the goal for the last half second, without one touch in the whole episode."""
+    there = regions.of(robot)
+    (x, y), (goal_x, goal_y, z) = there.cube, there.hold
+    share = reach_obstacles.SHARE
+    cube = setup.cube or (x, regions.span(y[0], y[0] + share * (y[1] - y[0])))
+    goal = setup.goal or (goal_x, regions.span(goal_y[1] - share * (goal_y[1] - goal_y[0]), goal_y[1]), z)
+    scene = reach_obstacles.with_obstacles(setup.scene or regions.scene(robot, "sphere"))
+    arm = dataclasses.replace(robot, gravity_compensation=True)
+    plain = lift.default(arm, lift.Setup(scene=scene, cube=cube, goal=goal, grasp_radius=regions.near(there)))
+    middle = (sum(cube[0]) / 2 - robot.base_pos[0], sum(cube[1]) / 2 - robot.base_pos[1])
+    ways = reach_obstacles.Setup(start=middle, goal=goal, room=setup.room, top=setup.top or round(0.8 * z[0], 4), scene=scene)
+    ways = reach_obstacles.completed(robot, ways)
+    done = {"threshold": 0.02, "object": "cube"}
+    return dataclasses.replace(
+        plain,
+        sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, and a box that is leant on
+        episode_length_s=12.0,
+        controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
+        command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
+        obstacles=reach_obstacles.between(ways, "cube"),
+        success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),
+        metrics={**plain.metrics, "touched": MetricTerm(metrics.Touched)},
+        observations={name: {**group, **reach_obstacles.seen()} for name, group in plain.observations.items()},
+        events={**plain.events, **reach_obstacles.aside(robot, ways)},
+        rewards={
+            **plain.rewards,
+            "touching": RewardTerm(rewards.touching, weight=-10.0),
+            "nearness": RewardTerm(rewards.obstacle_nearness, weight=-1.0, params={"margin": 0.05}),
+        },
+    )
+
+
+def presets(setup: Setup | None = None) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {"default": functools.partial(default, setup=setup or Setup())}

@@ -1,0 +1,84 @@
+"""Pick and place: a cube from where it lies to where it belongs. The Isaac Sim tutorial's second task."""
+
+import dataclasses
+import functools
+
+from mjx_nero.bounds import Range
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
+from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What differs from robot to robot: where the cube starts, where it has to go, how high it travels [m], and how long that may
+    take [s]."""
+
+    scene: SceneCfg
+    cube: tuple[Range, Range]
+    goal: tuple[Range, Range]
+    travel_height: float
+    episode_length_s: float
+    grasp_radius: float = 0.04  # how near to the grasp point the cube counts as held [m]
+
+
+def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """Success: the cube within 1 cm of its place, at rest and let go of. One list, however long, as in ``lift``."""
+    rest = setup.scene.objects["cube"].rest_height
+    held = {"minimal_height": rest + 0.01, "grasp_radius": setup.grasp_radius}
+    place = rest - robot.base_pos[2]  # of the robot's frame, as all commands are
+    return EnvCfg(
+        robot=dataclasses.replace(robot, gravity_compensation=True),
+        scene=setup.scene,
+        episode_length_s=setup.episode_length_s,
+        actions=drive_targets(),
+        controllers={"pick_place": {"end_effector_initial_height": setup.travel_height}},
+        command=CommandTerm(
+            commands.uniform_position,
+            params={"x": setup.goal[0], "y": setup.goal[1], "z": (place, place)},
+            resample_s=ONCE,
+        ),
+        success=SuccessCfg(
+            condition=Term(success.object_placed, params={"threshold": 0.01, "max_speed": 0.005, "clearance": 0.05}),
+        ),
+        metrics={
+            "grasped": MetricTerm(metrics.Grasped, params=held),
+            "grasp_time": MetricTerm(metrics.GraspTime, params=held),
+        },
+        observations={
+            "state": {
+                "joint_positions": ObservationTerm(observations.joint_pos),
+                "end_effector_position": ObservationTerm(observations.ee_position),
+                "end_effector_orientation": ObservationTerm(observations.ee_orientation),
+                "cube_position": ObservationTerm(observations.object_position),
+                "cube_orientation": ObservationTerm(observations.object_orientation),
+                "cube_target_position": ObservationTerm(observations.goal_position),
+            },
+        },
+        events={
+            "reset_object_position": Term(
+                events.object_position_uniform, params={"x": setup.cube[0], "y": setup.cube[1], "z": (0.0, 0.0)}
+            ),
+        },
+        rewards={
+            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
+            "goal_tracking": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.3}),
+            "goal_tracking_fine": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.05}),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum={},
+        terminations={
+            "time_out": DoneTerm(terminations.time_out, time_out=True),
+            "object_off_table": DoneTerm(
+                terminations.object_off_table,
+                params={"center": setup.scene.table_center, "size": setup.scene.table_size},
+            ),
+        },
+    )
+
+
+def presets(setup: Setup) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {"default": functools.partial(default, setup=setup)}

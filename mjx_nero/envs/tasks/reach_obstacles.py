@@ -1,0 +1,127 @@
+"""Reach past obstacles: from the right of the workspace to a point on its left, without touching what stands between."""
+
+import dataclasses
+import functools
+from typing import Any
+
+from mjx_nero.bounds import Range
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.mdp import commands, events, metrics, observations, obstacles, rewards, success, terminations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import ObstacleCfg, SceneCfg
+
+NAMES = ("one", "two")  # boxes: what an obstacle is made of at most
+SHARE = 0.3  # of the region's width, at either side, that start and goal are drawn from
+HAND = 0.08  # [m] from a finger's pad to the far side of the hand, and some more
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What differs from robot to robot. None: from the robot's ``workspace`` and gripper.
+
+    Attributes:
+        start: ``x`` and ``y`` to which the arm is turned at the start [m], robot root frame.
+        goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
+        room: what start and goal have to themselves on every side [m].
+        top: the highest that an obstacle may be above the robot's foot [m].
+        scene: cameras and table.
+    """
+
+    start: tuple[float, float] | None = None
+    goal: tuple[Range, Range, Range] | None = None
+    room: float | None = None
+    top: float | None = None
+    scene: SceneCfg | None = None
+
+
+def completed(robot: RobotCfg, setup: Setup) -> Setup:
+    """The setup with all that it leaves open."""
+    x, y, z = regions.box(robot, "workspace", "where it can work")
+    by = SHARE * (y[1] - y[0])
+    return Setup(
+        start=setup.start or ((x[0] + x[1]) / 2, y[0] + by / 2),
+        goal=setup.goal or (x, regions.span(y[1] - by, y[1]), z),
+        room=setup.room or round(robot.opening / 2 + HAND, 4),
+        top=setup.top or round(z[0] + 0.6 * (z[1] - z[0]), 4),
+        scene=setup.scene or scenes.around(robot, SceneCfg(objects={})),
+    )
+
+
+def between(setup: Setup, object: str | None = None) -> Term:
+    """Draws what stands between start and goal; ``object`` is what goes there, None: the end effector."""
+    params = {"thickness": (0.02, 0.04), "width": (0.15, 0.3), "above": (0.0, 0.08), "top": setup.top, "room": setup.room}
+    return Term(obstacles.across, params={**params, "names": NAMES, "object": object})
+
+
+def with_obstacles(scene: SceneCfg) -> SceneCfg:
+    """The scene with the boxes, and a robot that can touch itself."""
+    return dataclasses.replace(scene, obstacles={name: ObstacleCfg() for name in NAMES}, self_collision=True)
+
+
+def seen() -> dict[str, ObservationTerm]:
+    """Where the obstacles are and how large."""
+    return {f"obstacle_{name}": ObservationTerm(observations.obstacle, params={"obstacle": name}) for name in NAMES}
+
+
+def aside(robot: RobotCfg, setup: Setup) -> dict[str, Term]:
+    """The arm starts turned to the start, by chance a little beside it."""
+    assert setup.start is not None
+    turn = regions.turn_to(robot, *setup.start)
+    return {
+        "reset_robot_joints": Term(events.joints_by_scale, params={"low": 0.95, "high": 1.05}),
+        "turn_aside": Term(events.joint_turned, params={"joint": 0, "by": (turn - 0.05, turn + 0.05)}),
+    }
+
+
+def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str, Any]]:
+    """The expert, of a robot that has RMPflow's files."""
+    return {name: fields} if (robot.xml.parent / "rmpflow").is_dir() else {}
+
+
+def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+    """Success: within 2 cm of the goal for the last half second, without one touch in the whole episode."""
+    setup = completed(robot, setup)
+    assert setup.goal is not None and setup.scene is not None
+    state = {
+        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
+        "target_error": ObservationTerm(observations.target_error),
+        "ee_position": ObservationTerm(observations.ee_position),
+        "ee_to_goal": ObservationTerm(observations.ee_to_goal),
+        "goal_position": ObservationTerm(observations.command),
+        **seen(),
+        "actions": ObservationTerm(observations.last_action),
+    }
+    return EnvCfg(
+        robot=dataclasses.replace(robot, gravity_compensation=True),
+        scene=with_obstacles(dataclasses.replace(setup.scene, objects={})),
+        episode_length_s=8.0,
+        actions=joint_actions(scale=0.5, gripper=False),
+        controllers=controllers(robot, "detour"),
+        command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.goal, strict=True)), resample_s=ONCE),
+        obstacles=between(setup),
+        success=SuccessCfg(
+            condition=Term(success.AtGoalUntouched, params={"threshold": 0.02}), distance=Term(success.ee_distance)
+        ),
+        metrics={"touched": MetricTerm(metrics.Touched)},
+        observations={"state": state},
+        events=aside(robot, setup),
+        rewards={
+            "position_tracking": RewardTerm(rewards.ee_goal_distance, weight=0.2, params={"std": 0.3}),
+            "position_tracking_fine": RewardTerm(rewards.ee_goal_distance, weight=0.4, params={"std": 0.1}),
+            "position_tracking_finest": RewardTerm(rewards.ee_goal_distance, weight=0.4, params={"std": 0.02}),
+            "touching": RewardTerm(rewards.touching, weight=-2.0),
+            "nearness": RewardTerm(rewards.obstacle_nearness, weight=-0.2, params={"margin": 0.05}),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-3),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
+    )
+
+
+def presets(setup: Setup | None = None) -> Presets:
+    """Preset -> robot -> config; the default first."""
+    return {"default": functools.partial(default, setup=setup or Setup())}

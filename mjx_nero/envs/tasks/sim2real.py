@@ -1,0 +1,85 @@
+"""What differs between a simulated arm and a real one, for any task: the preset ``sim2real``. Every range is a field of its own
+(``--env.randomization.object_mass.params.scale "(0.5, 4)"``, ``--env.actions.delay.params.steps "(0, 3)"``).
+
+The ranges are those that others train manipulation with (mjlab's lift_cube, MuJoCo Playground, Isaac Lab, HumanoidVerse), and of
+delays what a bus and a camera have at 50 control steps a second.
+"""
+
+import dataclasses
+
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.mdp import actions, pushes, randomization, sensors
+from mjx_nero.mdp.terms import ObservationTerm, Term
+from mjx_nero.sim import robot_file
+from mjx_nero.sim.robot import RobotCfg
+
+
+def randomized(cfg: EnvCfg) -> EnvCfg:
+    """A task with drives, loads, objects, delays and sensors that differ from episode to episode."""
+    late = {"delay": Term(actions.Delay, params={"steps": (0, 3), "hold": 0.9})}
+    first = {name: term for name, term in cfg.actions.items() if name != "speed_limit"}
+    noise = {"noise": Term(actions.Noise, params={"amount": 0.002})}
+    objects = list(cfg.scene.objects)
+    pushed = {name: Term(pushes.Push, params={"object": name, "speed": 0.1, "interval": (1.0, 3.0)}) for name in objects}
+    return dataclasses.replace(
+        cfg,
+        actions={**late, **first, **noise, **{n: t for n, t in cfg.actions.items() if n == "speed_limit"}},
+        observations={name: _late(group) if name in cfg.sensed else group for name, group in cfg.observations.items()},
+        randomization={
+            **cfg.randomization,
+            **_arm(cfg.robot, bool(objects)),
+            **{k: v for name in objects for k, v in _object(name).items()},
+        },
+        sensors={**cfg.sensors, "encoders": Term(sensors.Encoders), **_eyes(objects)},
+        pushes={**cfg.pushes, **pushed},
+    )
+
+
+def _late(group):
+    """What the arm's bus tells comes up to a step late."""
+    told = ("joint_pos", "joint_vel")
+    return {
+        name: dataclasses.replace(term, delay=(0, 1), hold=0.9) if name in told and isinstance(term, ObservationTerm) else term
+        for name, term in group.items()
+    }
+
+
+def _arm(robot: RobotCfg, grips: bool) -> dict[str, Term]:
+    """Terms of links and drives, and of the pads where there is something to grip."""
+    spec, joints = robot_file.model(robot), robot.arm.joints
+    links = tuple(dict.fromkeys(spec.joint(name).parent.name for name in joints))
+    pads = tuple(geom.name for geom in spec.geoms if "pad" in geom.name)
+    terms = {
+        "link_mass": Term(randomization.mass, params={"bodies": links, "scale": (0.9, 1.1)}),
+        "link_center": Term(randomization.center_of_mass, params={"bodies": links, "offset": 0.01}),
+        "drives": Term(
+            randomization.gains,
+            params={"actuators": joints, "stiffness": (0.75, 1.25), "damping": (0.75, 1.25), "effort": (0.8, 1.0)},
+        ),
+        "joints": Term(randomization.joints, params={"joints": joints, "armature": (0.75, 1.25), "friction": (0.0, 0.02)}),
+        "encoders": Term(randomization.encoder_bias, params={"actuators": joints, "bias": 0.005}),
+    }
+    if robot.gravity_compensation:
+        params = {"bodies": links, "scale": (0.9, 1.1)}
+        terms["gravity_compensation"] = Term(randomization.gravity_compensation, params=params)
+    if pads and grips:
+        ranges = {"slide": (0.6, 1.5), "spin": (1e-3, 2e-2), "roll": (1e-5, 5e-3)}
+        terms["pad_friction"] = Term(randomization.friction, params={"geoms": pads, **ranges})
+    return terms
+
+
+def _object(name: str) -> dict[str, Term]:
+    return {
+        f"{name}_mass": Term(randomization.mass, params={"bodies": (name,), "scale": (0.5, 4.0)}),
+        f"{name}_size": Term(randomization.size, params={"object": name, "scale": (0.85, 1.15)}),
+        f"{name}_friction": Term(randomization.friction, params={"geoms": (name,), "slide": (0.5, 1.2)}),
+    }
+
+
+def _eyes(objects: list[str]) -> dict[str, Term]:
+    """Terms of what cameras see."""
+    if not objects:
+        return {}
+    seen = {"offset": 0.005, "noise": 0.002, "delay": (0, 2), "hold": 0.9}
+    each = {name: Term(sensors.ObjectPosition, params={"object": name, **seen}) for name in objects}
+    return {"base": Term(sensors.BasePose, params={"offset": 0.003, "turn": 0.01}), **each}

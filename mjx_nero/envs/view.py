@@ -1,0 +1,106 @@
+"""From the physics state and the carry to what the terms read."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_nero.sim import kinematics
+from mjx_nero.sim.obstacles import Obstacles
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import TARGET, Carry, ObjectView, Sim, View
+
+Motion = Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, "3"]]
+
+
+class Viewer:
+    """Looks names up once; ``__call__`` is pure.
+
+    Args:
+        model: compiled scene.
+        robot: whose joints and end effector to read.
+        objects: names of the scene's.
+        max_steps: control steps of an episode.
+        dt: of a control step [s].
+        motion: ``(position, time) -> position`` of a moving goal; None: it stays.
+        obstacles: the scene's.
+        targets: of the objects, those that may be commanded.
+
+    Attributes:
+        objects: addresses in qpos and qvel by name.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        robot: RobotCfg,
+        objects: Iterable[str],
+        max_steps: int,
+        dt: float,
+        motion: Motion | None = None,
+        obstacles: Obstacles | None = None,
+        targets: Sequence[str] = (),
+    ):
+        self.qpos_ids = np.array([model.joint(j).qposadr[0] for j in robot.joints])
+        self.dof_ids = np.array([model.joint(j).dofadr[0] for j in robot.joints])
+        self.objects = {name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0])) for name in objects}
+        self._ee_pose = kinematics.site_pose_fn(model, robot.ee_site)
+        self._gain = np.array(model.actuator_gainprm, np.float32)
+        self._default = np.asarray(robot.home, np.float32)
+        self._root = np.asarray(robot.base_pos, np.float32)
+        self._max_steps, self._dt, self._motion = max_steps, dt, motion
+        self._obstacles, self._targets = obstacles or Obstacles(model, ()), tuple(targets)
+
+    def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
+        """The view after a step that ``action`` caused; ``carry.action`` is the action before it."""
+        ee_pos, ee_quat = self._ee_pose(sim.qpos)
+        goal, goal_linvel = self.goal(carry)
+        objects = {name: _object(sim.qpos[at:][:7], sim.qvel[dof:][:6]) for name, (at, dof) in self.objects.items()}
+        target = carry.memory[TARGET] if self._targets else None
+        if target is not None:
+            objects[TARGET] = jax.tree.map(lambda *each: jnp.stack(each)[target], *(objects[name] for name in self._targets))
+        return View(
+            joint_pos=sim.qpos[self.qpos_ids],
+            joint_vel=sim.qvel[self.dof_ids],
+            default_joint_pos=jnp.asarray(self._default),
+            ctrl=sim.ctrl,
+            ee_pos_w=ee_pos,
+            ee_quat_w=ee_quat,
+            objects=objects,
+            root_pos_w=jnp.asarray(self._root),
+            command=carry.command,
+            goal_pos_w=goal,
+            goal_quat_w=carry.command_quat,
+            goal_linvel_w=goal_linvel,
+            action=action,
+            last_action=carry.action,
+            step=carry.step,
+            time=carry.step * self._dt,
+            encoder_bias=self._encoder_bias(sim),
+            obstacles=self._obstacles.views(sim.fields),
+            touch=sim.touch,
+            target=target,
+            max_steps=self._max_steps,
+        )
+
+    def _encoder_bias(self, sim: Sim) -> Float[Array, " nj"] | None:
+        """As ``randomization.encoder_bias`` put it into the drives: their pull is stiffness (target - joint - bias) - ..."""
+        if "actuator_biasprm" not in sim.fields:
+            return None
+        gain = sim.fields.get("actuator_gainprm", self._gain)
+        return -sim.fields["actuator_biasprm"][:, 0] / gain[:, 0]
+
+    def goal(self, carry: Carry) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Position [m] and velocity [m/s] of the goal in the world frame, now."""
+        at = carry.command + self._root
+        if self._motion is None:
+            return at, jnp.zeros(3)
+        motion, time = self._motion, carry.step * self._dt
+        return jax.jvp(lambda t: motion(at, t), (time,), (jnp.ones_like(time),))
+
+
+def _object(pose: Float[Array, "7"], speed: Float[Array, "6"]) -> ObjectView:
+    return ObjectView(pos_w=pose[:3], quat_w=pose[3:], linvel_w=speed[:3], angvel_local=speed[3:])

@@ -1,0 +1,232 @@
+"""Files: written whole or not at all, and read with limits, for a stranger may have made them."""
+
+import contextlib
+import json
+import math
+import os
+import pathlib
+import stat
+from collections.abc import Iterator, Mapping
+from typing import Any, BinaryIO
+
+import yaml
+from lxml import etree
+
+from mjx_nero.errors import UserError
+
+PART = ".part"  # in the name of a file that is not whole yet
+MAX_TAGS = 400_000  # of an XML file
+MAX_YAML = 200_000  # bytes
+MAX_NODES = 20_000  # of a YAML file, aliases written out
+MAX_DEPTH = 12  # of lists and entries within one another
+
+
+@contextlib.contextmanager
+def open_file(path: pathlib.Path) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file to read from, and its size in bytes.
+
+    Raises:
+        UserError: there is none, or it cannot be read.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # of a pipe, opening would wait for a writer
+        try:
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode):
+                raise UserError(f"{path} is not a file")
+            with open(handle, "rb", closefd=False) as file:
+                yield file, status.st_size
+        finally:
+            os.close(handle)
+    except FileNotFoundError:
+        raise UserError(f"there is no file {path}") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    except ValueError as error:
+        if "\0" not in str(path):
+            raise
+        raise UserError(f"cannot read {path}: {error}") from None
+
+
+def read_bytes(path: pathlib.Path, limit: int) -> bytes:
+    """The content of a regular file.
+
+    Raises:
+        UserError: there is none, it cannot be read, or it is larger than ``limit`` bytes.
+    """
+    with open_file(path) as (file, size):
+        content = file.read(limit + 1) if size <= limit else b""
+    size = max(size, len(content))
+    if size > limit:
+        raise UserError(f"{path} has {size / 1e6:.3g} MB: more than {limit / 1e6:.3g} MB are not read")
+    return content
+
+
+def parse_xml(content: bytes, name: str) -> etree._Element:
+    """The root element. Neither entities nor other files are read. Prefixes that are not declared stay in the tags (``a:b``).
+
+    Raises:
+        UserError: malformed, or it has more elements and attributes than ``MAX_TAGS``, or it declares a document type, which no
+            model or mesh needs and entity bombs do.
+    """
+    tags = content.count(b"<") + content.count(b"=")  # libxml2 takes hundreds of bytes for each
+    if tags > MAX_TAGS:
+        raise UserError(f"{name} has some {tags:,} elements and attributes: more than {MAX_TAGS:,} are not read")
+    parser = _parser()
+    try:
+        root = etree.fromstring(content, parser, base_url=name)
+    except (etree.XMLSyntaxError, ValueError) as error:
+        log = parser.error_log  # the error's own may hold what other files had
+        if not log or any(entry.domain_name != "NAMESPACE" for entry in log):
+            raise UserError(f"{name} is not well-formed XML: {error}") from None
+        root = etree.fromstring(content, _parser(recover=True), base_url=name)  # prefixes that are not declared, no more
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise UserError(f"{name} declares a document type (<!DOCTYPE ...>): remove it, a robot description needs none")
+    return root
+
+
+def _parser(recover: bool = False) -> etree.XMLParser:
+    return etree.XMLParser(resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False, recover=recover)
+
+
+def read_yaml(path: pathlib.Path, loader: type["YamlLoader"] | None = None) -> Any:
+    """The content of a YAML file as mappings, lists, strings, numbers, booleans and None; keys are strings, as written.
+
+    Args:
+        loader: in place of ``YamlLoader``, one that knows more tags.
+
+    Raises:
+        UserError: as ``read_bytes``; or it is not YAML, a key stands twice, or it is larger or deeper than ``MAX_NODES`` and
+            ``MAX_DEPTH`` say.
+    """
+    content = read_bytes(path, MAX_YAML)
+    try:
+        return (loader or YamlLoader)(content).get_single_data()
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:  # constructors fail in their own ways
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        what = " ".join((getattr(error, "problem", None) or str(error)).split())[:160]
+        raise UserError(f"{path} is not YAML{where}: {what or type(error).__name__}") from None
+
+
+class YamlLoader(yaml.SafeLoader):
+    """PyYAML's, with limits that hold while the file is read, and for plain values only."""
+
+    def __init__(self, content: bytes):
+        super().__init__(content)
+        self._count = self._depth = 0
+        self._sizes: dict[int, int] = {}  # nodes in a node
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        mark, alias = self.peek_event().start_mark, self.check_event(yaml.AliasEvent)
+        before, self._depth = self._count, self._depth + 1
+        if self._depth > MAX_DEPTH:
+            raise yaml.MarkedYAMLError(problem=f"deeper than {MAX_DEPTH} levels", problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if alias and id(node) not in self._sizes:
+            raise yaml.MarkedYAMLError(problem="an alias within what it stands for", problem_mark=mark)
+        self._count += self._sizes[id(node)] if alias else 1
+        if self._count > MAX_NODES:
+            raise yaml.MarkedYAMLError(problem=f"more than {MAX_NODES} values", problem_mark=mark)
+        self._sizes[id(node)] = self._count - before
+        return node
+
+    def mapping(self, node: Any) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.value in out:
+                problem = f"key {key.value!r} stands twice" if isinstance(key, yaml.ScalarNode) else "a key that is no name"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+            out[key.value] = self.construct_object(value, deep=True)
+        return out
+
+    def integer(self, node: Any) -> int:
+        value = self.construct_yaml_int(node) if len(node.value) < 100 else 1 << 63  # sexagesimal ones take long
+        if abs(value) >= 1 << 63:
+            raise yaml.MarkedYAMLError(problem="a whole number of more than 64 bits", problem_mark=node.start_mark)
+        return value
+
+    def refuse(self, node: Any) -> Any:
+        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag[:60]!r} is not read", problem_mark=node.start_mark)
+
+
+YamlLoader.yaml_implicit_resolvers = {  # a date is a string here
+    first: [rule for rule in rules if not rule[0].endswith((":timestamp", ":merge", ":value"))]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+YamlLoader.yaml_constructors = {
+    f"tag:yaml.org,2002:{kind}": construct
+    for kind, construct in {
+        "null": YamlLoader.construct_yaml_null,
+        "bool": YamlLoader.construct_yaml_bool,
+        "int": YamlLoader.integer,
+        "float": YamlLoader.construct_yaml_float,
+        "str": YamlLoader.construct_yaml_str,
+        "seq": lambda loader, node: loader.construct_sequence(node, deep=True),
+        "map": YamlLoader.mapping,
+    }.items()
+} | {None: YamlLoader.refuse}
+
+
+def check_writable(path: pathlib.Path) -> None:
+    """Before long work: a file that is to be written at its end.
+
+    Raises:
+        UserError: it is a folder, or its folder does not exist or is not writable.
+    """
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give a file name")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")
+
+
+@contextlib.contextmanager
+def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Where to write a file that then appears whole or not at all, even if the power fails. Makes its folder.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    part = path.with_name(f".{path.stem}{PART}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        _sync(part)
+        part.replace(path)
+        _sync(path.parent)
+    except (OSError, ValueError) as error:  # ValueError: a kind of file that a library does not know
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_json(path: pathlib.Path, value: Any) -> None:
+    """Writes JSON that every reader takes: a number that is not finite becomes null, what JSON does not know its text.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    with whole(path) as part:
+        part.write_text(json.dumps(finite(value), indent=2, allow_nan=False, default=str) + "\n")
+
+
+def finite(value: Any) -> Any:
+    """``value`` with None in place of every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _sync(path: pathlib.Path) -> None:
+    """Waits until a file, or a folder's list of files, is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,24 @@
+"""Other software: environments for Gymnasium and torch, policies for ONNX runtimes. Each part needs its extra."""
+
+import importlib
+from typing import Any
+
+from mjx_nero.types import UserError
+
+
+def missing(error: ModuleNotFoundError, extra: str) -> UserError:
+    """What to tell the user whose installation lacks a module that an extra brings."""
+    name = (error.name or "").partition(".")[0]
+    return UserError(f"this needs {name}, of the extra {extra!r}: pip install 'mjx-nero[{extra}]'")
+
+
+def need(module: str, extra: str) -> Any:
+    """Imports a module that an extra brings.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise missing(error, extra) from None

@@ -1,0 +1,82 @@
+"""What a policy's output means, as data: for runtimes and frameworks that don't know this package."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero.bounds import unwrapped
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.mdp import actions as terms
+from mjx_nero.mdp.terms import Term
+from mjx_nero.types import UserError
+
+
+def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
+    """How the action becomes position targets of the drives: the task's action terms, in their order.
+
+    Those with ``joints`` read entries of the action. ``joint_position``: ``offset + scale * action`` [rad, m], an entry a joint.
+    ``binary``: ``close`` for a negative entry, else ``open``, one for all the joints. The others change what is there:
+    ``speed_limit`` (targets move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
+    ``low_pass`` (time constant [s]) of the action.
+
+    Raises:
+        UserError: a term that only this package knows.
+    """
+    return [part for name, term in env.cfg.actions.items() for part in _part(env, name, term)]
+
+
+def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
+    robot, kind = env.cfg.robot, unwrapped(term.func)
+    if kind is terms.JointPosition:
+        drives = robot.arm if term.params["group"] == "arm" else robot.gripper
+        of = {"joints": list(drives.joints), "scale": term.params["scale"], "offset": list(drives.home)}
+        return [{"name": name, "type": "joint_position", **of}]
+    if kind is terms.DriveTargets:
+        of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
+        return [{"name": name, "type": "joint_position", **of}]
+    if kind is terms.BinaryGripper:
+        of = {"joints": list(robot.gripper.joints), "open": list(robot.gripper.open), "close": list(robot.gripper.close)}
+        return [{"name": name, "type": "binary", **of}] if robot.gripper.joints else []
+    if kind is terms.SpeedLimit:
+        return [{"name": name, "type": "speed_limit"}]
+    if kind is terms.Delay:
+        return [{"name": name, "type": "delay", "steps": list(term.params["steps"])}]
+    if kind is terms.LowPass:
+        return [{"name": name, "type": "low_pass", "time": term.params["time"]}]
+    raise UserError(f"the action term {name} ({term.name}) is one that only this package knows")
+
+
+def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
+    """The actions that take each joint to its limits; beyond them nothing more happens. A binary action is in +-1."""
+    low: list[float] = []
+    high: list[float] = []
+    for part in (part for part in parts(env) if "joints" in part):
+        if part["type"] == "binary":
+            low, high = [*low, -1.0], [*high, 1.0]
+            continue
+        limits = np.array([env.physics_model.joint(name).range for name in part["joints"]]).T
+        ends = np.sort((limits - part["offset"]) / part["scale"], axis=0)
+        low, high = [*low, *ends[0]], [*high, *ends[1]]
+    return np.array(low, np.float32), np.array(high, np.float32)
+
+
+def for_targets(env: ManipulationEnv, targets: jax.Array) -> jax.Array:
+    """The action that gives position targets of the drives: so a controller can act where a policy would.
+
+    A gripper without an action of its own stays where it is; a binary one opens or closes, whichever is nearer.
+
+    Args:
+        targets: [..., joints], in the order of ``RobotCfg.joints`` [rad or m].
+    """
+    out = []
+    for part in (part for part in parts(env) if "joints" in part):
+        ids = np.array([env.cfg.robot.joints.index(name) for name in part["joints"]])
+        want = targets[..., ids]
+        if part["type"] == "binary":
+            to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))
+            out.append(jnp.where(to_close < to_open, -1.0, 1.0)[..., None])
+        else:
+            out.append((want - jnp.array(part["offset"])) / part["scale"])
+    return jnp.concatenate(out, axis=-1)

@@ -1,0 +1,217 @@
+"""Environments for Gymnasium 1: ``VectorEnv`` with arrays of JAX, torch or numpy, and ``Env``, one environment with numpy's.
+
+Importing this module registers them: ``gymnasium.make("mjx_nero/nero_lift-v0")``, or without an import of one's own
+``gymnasium.make("mjx_nero.interop.gymnasium:mjx_nero/nero_lift-v0")``.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mjx_nero
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.interop import actions, missing, need
+from mjx_nero.interop.batch import Batch
+from mjx_nero.sim.render import Renderer
+from mjx_nero.types import UserError
+
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    raise missing(error, "gym") from None
+
+ARRAYS = ("numpy", "jax", "torch")
+RESULTS = ("success", "final_distance", "grasped", "grasp_time", "dropped", "nan")  # metrics of an ended episode
+
+
+class VectorEnv(gymnasium.vector.VectorEnv):
+    """Many environments in one compiled program, by Gymnasium's vector API, with same-step autoreset.
+
+    Where an episode ends, ``step`` returns the reward and the flags of its last step and the first observation of the next one;
+    ``info["final_obs"]`` holds the last observation and ``info["final_info"]`` the results (``success``, ``final_distance`` [m],
+    ...), valid where the masks ``info["_final_obs"]`` and ``info["_final_info"]`` are true. They are there at every step, so that
+    the host need not wait for the device to ask.
+
+    The action space ends where the joints' limits do.
+
+    Args:
+        env: name of an environment, or one made before.
+        num_envs: how many.
+        arrays: ``numpy``; or ``jax`` or ``torch``, which stay on JAX's device and are not copied.
+        group: observation group to return; None: all of them, in a dict.
+        render_mode: None or ``rgb_array``.
+        num_rendered: how many environments ``render`` draws, the first ones.
+        kwargs: of ``mjx_nero.make``.
+
+    Raises:
+        UserError: as ``mjx_nero.make``, or an argument is none of the above.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        env: str | ManipulationEnv,
+        num_envs: int = 1,
+        arrays: str = "numpy",
+        group: str | None = "state",
+        render_mode: str | None = None,
+        num_rendered: int = 1,
+        **kwargs: Any,
+    ):
+        self.env = mjx_nero.make(env, num_envs=num_envs, **kwargs) if isinstance(env, str) else env
+        self.num_envs, self.render_mode, self._group, self._num_rendered = num_envs, render_mode, group, num_rendered
+        self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
+        self._out, self._device = _converter(arrays), jax.devices()[0]
+        self.single_observation_space, self.single_action_space = _spaces(self.env, group)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._batch = Batch(self.env, num_envs)
+        self._reset, self._step = jax.jit(self._reset_all), jax.jit(self._step_all)
+        self._renderer: Renderer | None = None
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Fresh episodes everywhere: observations and an empty info. A seed makes all that follows reproducible."""
+        super().reset(seed=seed)
+        self._state, self._key = self._reset(_key(self.np_random, seed))
+        return jax.tree.map(self._out, _group(self._state.obs, self._group)), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One control step: observations, rewards, terminated, truncated, info."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        self._state, self._key, out = self._step(self._state, self._key, _to_jax(actions, self._device))
+        return jax.tree.map(self._out, out)
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """Frames of the first ``num_rendered`` environments, uint8 [height, width, 3].
+
+        Raises:
+            UserError: the machine cannot draw offscreen.
+        """
+        self._renderer = self._renderer or Renderer(self.env.mj_model)
+        return tuple(_frame(self.env, self._renderer, self._state, i) for i in range(min(self._num_rendered, self.num_envs)))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the renderer."""
+        if self._renderer:
+            self._renderer.__exit__()
+            self._renderer = None
+
+    def _reset_all(self, key):
+        key, k_reset = jax.random.split(key)
+        return self._batch.reset(k_reset), key
+
+    def _step_all(self, state, key, action):
+        key, k_reset = jax.random.split(key)
+        state, last = self._batch.step(state, action, k_reset)
+        done, truncated = last.done > 0, last.info["truncation"] > 0
+        results = {name: last.metrics[name] for name in RESULTS if name in last.metrics}
+        info = {"final_obs": _group(last.obs, self._group), "_final_obs": done, "final_info": results, "_final_info": done}
+        return state, key, (_group(state.obs, self._group), last.reward, done & ~truncated, truncated, info)
+
+
+class Env(gymnasium.Env):
+    """One environment with numpy arrays: what ``gymnasium.make("mjx_nero/nero_lift-v0")`` makes.
+
+    The info of an episode's last step holds its results. Arguments and errors are those of ``VectorEnv``.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, env: str | ManipulationEnv, group: str | None = "state", render_mode: str | None = None, **kwargs: Any):
+        self.env = mjx_nero.make(env, **kwargs) if isinstance(env, str) else env
+        self.render_mode, self._group = render_mode, group
+        self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
+        self.observation_space, self.action_space = _spaces(self.env, group)
+        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
+        self._renderer: Renderer | None = None
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """A fresh episode: observation and an empty info."""
+        super().reset(seed=seed)
+        self._state = self._reset(_key(self.np_random, seed))
+        return jax.tree.map(np.asarray, _group(self._state.obs, self._group)), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One control step: observation, reward, terminated, truncated, info."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        done, truncated = bool(state.done), bool(state.info["truncation"])
+        info = {name: float(state.metrics[name]) for name in RESULTS if done and name in state.metrics}
+        obs = jax.tree.map(np.asarray, _group(state.obs, self._group))
+        return obs, float(state.reward), done and not truncated, truncated, info
+
+    def render(self) -> np.ndarray:
+        """A frame, uint8 [height, width, 3].
+
+        Raises:
+            UserError: the machine cannot draw offscreen.
+        """
+        self._renderer = self._renderer or Renderer(self.env.mj_model)
+        return _frame(self.env, self._renderer, jax.tree.map(lambda x: x[None], self._state), 0)
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        if self._renderer:
+            self._renderer.__exit__()
+            self._renderer = None
+
+
+def _spaces(env: ManipulationEnv, group: str | None) -> tuple[Any, Any]:
+    sizes, box = env.observation_size, gymnasium.spaces.Box
+    if group is not None and group not in sizes:
+        raise UserError(f"no observation group {group!r}: choose one of {', '.join(sizes)}, or None for all")
+    boxes: dict[str, Any] = {name: box(-np.inf, np.inf, size, np.float32) for name, size in sizes.items()}
+    observations = gymnasium.spaces.Dict(boxes) if group is None else boxes[group]
+    return observations, box(*actions.bounds(env), dtype=np.float32)
+
+
+def _group(obs: Any, group: str | None) -> Any:
+    return dict(obs) if group is None else obs[group]
+
+
+def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:
+    return jax.random.PRNGKey(int(rng.integers(2**31)) if seed is None else seed)
+
+
+def _converter(arrays: str) -> Callable[[jax.Array], Any]:
+    if arrays not in ARRAYS:
+        raise UserError(f"unknown arrays {arrays!r}: choose one of {', '.join(ARRAYS)}")
+    if arrays == "torch":
+        return need("torch", "torch").from_dlpack
+    return np.asarray if arrays == "numpy" else lambda array: array
+
+
+def _to_jax(action: Any, device: jax.Device) -> jax.Array:
+    if hasattr(action, "detach"):  # a torch tensor
+        action = jax.dlpack.from_dlpack(action.detach().contiguous())
+    return jax.device_put(jnp.asarray(action, jnp.float32), device)
+
+
+def _frame(env: ManipulationEnv, renderer: Renderer, state: Any, index: int) -> np.ndarray:
+    one = jax.tree.map(lambda x: x[index], state)
+    looks = jax.tree.map(np.asarray, env.looks(one))
+    return renderer.render(np.asarray(one.pipeline_state.qpos), np.asarray(env.goal(one)), looks)
+
+
+def register() -> None:
+    """Registers the environments that ``mjx_nero.list_envs`` names, with ``-v0`` behind: call it again after adding your own."""
+    for name in registry.list_envs():
+        if f"mjx_nero/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                id=f"mjx_nero/{name}-v0",
+                entry_point=f"{__name__}:Env",
+                vector_entry_point=f"{__name__}:VectorEnv",
+                kwargs={"env": name},
+            )
+
+
+register()

@@ -1,0 +1,168 @@
+"""A policy as ONNX: normalisation and network as a graph, and what a runtime has to know of the robot as metadata."""
+
+import inspect
+import json
+import re
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero.bounds import unwrapped
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.interop import actions, need
+from mjx_nero.learn.policy import Policy
+from mjx_nero.learn.run_folder import versions
+from mjx_nero.types import UserError
+
+OPSET = 17  # of 2021: what embedded runtimes know, too
+IR_VERSION = 8  # the one of that opset
+
+
+def model(policy: Policy, env: ManipulationEnv) -> Any:
+    """The policy as an ``onnx.ModelProto``: ``observations`` [n, state] -> ``actions`` [n, action_size], deterministic.
+
+    Args:
+        env: what it acts in; the metadata describe its robot and terms.
+
+    Raises:
+        UserError: the extra ``onnx`` is not installed, or the policy reads observations that stay apart.
+    """
+    onnx = need("onnx", "onnx")
+    if isinstance(policy.meta["observation_size"]["state"], dict):
+        raise UserError("only a policy that reads one vector can be exported: this one's observations stay apart")
+    helper, floats = onnx.helper, onnx.TensorProto.FLOAT
+    nodes, weights = _graph(policy, onnx)
+    (size,) = policy.meta["observation_size"]["state"]
+    graph = helper.make_graph(
+        nodes,
+        f"{policy.meta['env']} policy",
+        [helper.make_tensor_value_info("observations", floats, ["n", size])],
+        [helper.make_tensor_value_info("actions", floats, ["n", policy.meta["action_size"]])],
+        weights,
+    )
+    made = helper.make_model(
+        graph, producer_name="mjx_nero", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
+    )
+    helper.set_model_props(made, {name: json.dumps(value) for name, value in metadata(policy, env).items()})
+    onnx.checker.check_model(made)
+    return made
+
+
+def _graph(policy: Policy, onnx: Any) -> tuple[list[Any], list[Any]]:
+    """Nodes and weights: normalisation, then the layers."""
+    nodes: list[Any] = []
+    weights: list[Any] = []
+
+    def constant(name: str, value: np.ndarray) -> str:
+        weights.append(onnx.numpy_helper.from_array(np.asarray(value, np.float32), name))
+        return name
+
+    def apply(kind: str, *inputs: str) -> str:
+        nodes.append(onnx.helper.make_node(kind, list(inputs), [f"{kind.lower()}_{len(nodes)}"]))
+        return nodes[-1].output[0]
+
+    network, normalizer = policy.meta["network"], policy.params[0]
+    x = apply("Sub", "observations", constant("mean", normalizer.mean["state"]))
+    x = apply("Div", x, constant("std", normalizer.std["state"]))
+    if bound := network.get("max_observation"):
+        x = apply("Clip", x, constant("least", -bound), constant("most", bound))
+    *hidden, last = _layers(policy.params[1].policy["params"])
+    for i, (kernel, bias) in enumerate(hidden):
+        x = apply("Gemm", x, constant(f"kernel_{i}", kernel), constant(f"bias_{i}", bias))
+        # Swish is x * sigmoid(x), which ONNX has no single operator for before opset 24.
+        x = apply("Mul", x, apply("Sigmoid", x)) if network["activation"] == "swish" else apply(_OPS[network["activation"]], x)
+    n = policy.meta["action_size"]  # what the last layer gives beyond it is the deviation of tanh_normal
+    x = apply("Gemm", x, constant("kernel_out", last[0][:, :n]), constant("bias_out", last[1][:n]))
+    x = apply("Tanh" if network["distribution"] == "tanh_normal" else "Identity", x)
+    nodes[-1].output[0] = "actions"
+    return nodes, weights
+
+
+_OPS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
+
+
+def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(kernel, bias) of each layer, the input's first."""
+    hidden = params.get("MLP_0", params)  # with a deviation of its own the network is a module within a module
+    dense = [hidden[name] for name in sorted(hidden, key=lambda name: int(name.rpartition("_")[2]))]
+    for layer in dense + ([params["Dense_0"]] if "Dense_0" in params else []):
+        yield np.asarray(layer["kernel"]), np.asarray(layer["bias"])
+
+
+def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
+    """What a runtime needs beside the graph; docs/deploy_onnx.md says what each field means."""
+    robot, drives = env.cfg.robot, (env.cfg.robot.arm, env.cfg.robot.gripper)
+
+    def both(field: str) -> list[float]:
+        return [float(x) for drive in drives for x in getattr(drive, field)]
+
+    joints = [env.physics_model.joint(name) for name in robot.joints]
+    units = ["m" if joint.type[0] == 2 else "rad" for joint in joints]  # mjJNT_SLIDE
+    return {
+        "env": policy.meta["env"],
+        "preset": policy.meta["preset"],
+        "robot": robot.name,
+        "robot_fingerprint": policy.meta.get("fingerprint"),
+        "control_dt": env.dt,
+        "physics_dt": env.cfg.sim.dt,
+        "joints": {
+            "names": list(robot.joints),
+            "units": units,
+            "home": both("home"),
+            "lower": [float(joint.range[0]) for joint in joints],
+            "upper": [float(joint.range[1]) for joint in joints],
+            "speed": both("speed"),
+            "effort": both("effort"),
+            "stiffness": both("stiffness"),
+            "damping": both("damping"),
+        },
+        "base": {"position": list(robot.base_pos), "quaternion_wxyz": list(robot.base_quat)},
+        "observations": _observations(env),
+        "actions": actions.parts(env),
+        "action_clip": env.cfg.action_clip or None,
+        "versions": versions(),
+        "env_steps": policy.meta.get("env_steps"),
+    }
+
+
+def _observations(env: ManipulationEnv) -> list[dict[str, Any]]:
+    """The terms of the group ``state``, in the order of the input."""
+    sizes = jax.eval_shape(lambda key: env.named_observations(env.reset(key))["state"], jax.random.PRNGKey(0))
+    terms, out, start = env.cfg.observations["state"], [], 0
+    for name, term in terms.items():
+        says = (inspect.getdoc(unwrapped(term.func)) or "").partition("\n")[0]
+        size = int(np.prod(sizes[name].shape)) * term.history
+        unit = re.search(r"\[(.+?)\]", says)
+        late = {"history": term.history, "delay_steps": list(term.delay)}
+        out.append({"name": name, "start": start, "size": size, "units": unit and unit[1], "what": says, **late})
+        start += size
+    return out
+
+
+def check(made: Any, policy: Policy, observations: int = 10_000, seed: int = 0) -> tuple[float, float]:
+    """Runs the model with ONNX Runtime on one core, on observations drawn as the normaliser has seen them.
+
+    Returns:
+        the largest difference to JAX, and the 99th percentile of the core's time for one observation [s].
+
+    Raises:
+        UserError: the extra ``onnx`` is not installed.
+    """
+    runtime = need("onnxruntime", "onnx")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = runtime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    normalizer, rng = policy.params[0], np.random.default_rng(seed)
+    mean, std = np.asarray(normalizer.mean["state"]), np.asarray(normalizer.std["state"])
+    obs = (mean + std * rng.standard_normal((observations, len(mean)))).astype(np.float32)
+    ours = np.asarray(policy.act({"state": jnp.asarray(obs)}))
+    theirs, times = np.empty_like(ours), []
+    for i in range(observations):
+        started = time.thread_time()
+        (theirs[i],) = session.run(None, {"observations": obs[i : i + 1]})[0]
+        times.append(time.thread_time() - started)
+    return float(np.abs(ours - theirs).max()), float(np.percentile(times, 99))

@@ -1,0 +1,75 @@
+"""Environments for Stable-Baselines3: its own kind of vector environment over ``gymnasium.VectorEnv``."""
+
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.interop import missing
+from mjx_nero.interop.gymnasium import VectorEnv
+
+try:
+    from stable_baselines3.common import vec_env
+except ModuleNotFoundError as error:
+    raise missing(error, "torch") from None
+
+
+class VecEnv(vec_env.VecEnv):
+    """``PPO("MlpPolicy", VecEnv("nero_reach", 256))``. The info of an ended episode tells ``is_success``, which is logged.
+
+    Args:
+        env: name of an environment.
+        num_envs: how many.
+        kwargs: of ``VectorEnv``.
+    """
+
+    def __init__(self, env: str, num_envs: int, **kwargs: Any):
+        self.envs = VectorEnv(env, num_envs, **kwargs)
+        self._seed: int | None = None
+        super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Of the next ``reset``."""
+        self._seed = seed
+        return [seed] * self.num_envs
+
+    def reset(self) -> np.ndarray:
+        """First observations [n, ...]."""
+        obs, _ = self.envs.reset(seed=self._seed)
+        self._seed = None
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions [n, action_size] for ``step_wait``."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations, rewards, dones and infos of one control step."""
+        obs, rewards, terminated, truncated, info = self.envs.step(self._actions)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(info["_final_obs"]):
+            infos[i] = {
+                "terminal_observation": info["final_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i]),
+                "is_success": bool(info["final_info"]["success"][i]),
+            }
+        return obs, rewards, terminated | truncated, infos
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The same for each environment: they are one program."""
+        return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Of all environments."""
+        setattr(self.envs, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Calls it once, for all."""
+        return [getattr(self.envs, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """They are not."""
+        return [False] * len(list(self._get_indices(indices)))

@@ -1,0 +1,117 @@
+"""Arrays and a JSON description in one safetensors file: no pickle, so a file from a stranger runs no code."""
+
+import json
+import pathlib
+import zlib
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save as serialize
+
+from mjx_nero import files
+from mjx_nero.errors import UserError
+from mjx_nero.learn import header, machines
+
+Tree = TypeVar("Tree")
+
+
+class Damaged(UserError):
+    """A file that is not what ``save`` wrote."""
+
+
+def _names(tree: Any) -> list[str]:
+    return [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def fetch(tree: Tree) -> Tree:
+    """The tree's arrays copied to this process's memory, so that the device may go on with its own."""
+    return jax.tree.map(machines.fetch, tree)
+
+
+def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
+    """Writes the leaves of ``tree`` by name, and ``meta``; the file appears whole or not at all.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    arrays = dict(zip(_names(tree), [np.asarray(x, order="C") for x in jax.tree.leaves(tree)], strict=True))
+    text = json.dumps(files.finite(meta), allow_nan=False)
+    with files.whole(path) as part:
+        part.write_bytes(serialize(arrays, metadata={"meta": text, "crc32": _checksum(arrays)}))
+
+
+def verify(path: pathlib.Path) -> None:
+    """Reads a file's numbers.
+
+    Raises:
+        Damaged: it is missing, or they are not those that ``save`` wrote.
+    """
+    try:
+        load_meta(path)
+    except UserError as error:
+        raise Damaged(str(error)) from None
+    try:
+        with safe_open(path, framework="numpy") as file:
+            wanted = file.metadata().get("crc32")  # files of older versions have none
+            good = wanted is None or wanted == _checksum({name: file.get_tensor(name) for name in file.keys()})
+    except (SafetensorError, OSError, ValueError):
+        good = False
+    if not good:
+        raise Damaged(f"{path} is damaged: its numbers are not those that were written")
+
+
+def not_finite(tree: Any) -> str | None:
+    """The name of the first array with a number that is not finite; None if all are."""
+    for name, x in zip(_names(tree), jax.tree.leaves(tree), strict=True):
+        if not np.isfinite(np.asarray(x)).all():
+            return name
+    return None
+
+
+def _checksum(arrays: dict[str, np.ndarray]) -> str:
+    total = 0
+    for _, x in sorted(arrays.items()):
+        total = zlib.crc32(x.tobytes(), total)
+    return f"{total:08x}"
+
+
+def load_meta(path: pathlib.Path) -> dict[str, Any]:
+    """The description in the file.
+
+    Raises:
+        UserError: missing, or not a file that ``save`` wrote.
+    """
+    if not path.is_file():
+        raise UserError(f"no such file: {path}")
+    _, texts = header.read(path)
+    try:
+        meta = header.plain_json(texts["meta"])
+    except (LookupError, ValueError, RecursionError):
+        meta = None
+    if not isinstance(meta, dict):
+        raise header.damaged(path)
+    return meta
+
+
+def load(path: pathlib.Path, template: Tree) -> Tree:
+    """The arrays in the file as a tree like ``template`` (whose leaves need only shape and dtype).
+
+    Raises:
+        UserError: missing, damaged, or other names, shapes or types than the template's.
+    """
+    verify(path)
+    held, _ = header.read(path)
+    wanted = dict(zip(_names(template), jax.tree.leaves(template), strict=True))
+    for name, want in wanted.items():  # before any is read: the file may hold more than the memory
+        kind, shape = held.get(name, (str(want.dtype), want.shape))
+        if (kind, shape) != (str(want.dtype), want.shape):
+            raise UserError(f"{path} does not fit: {name} is {kind}{shape}, expected {want.dtype}{want.shape}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            leaves = [jnp.asarray(file.get_tensor(name)) for name in wanted]
+    except (SafetensorError, OSError):
+        raise UserError(f"{path} does not fit this environment and these networks, or it is damaged") from None
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -1,0 +1,117 @@
+"""A run's programs, compiled side by side: so many iterations of its learner, and the judge of its policy."""
+
+import concurrent.futures
+import contextlib
+import copy
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from mjx_nero.envs import wrappers
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import device_memory, learner, rollout
+from mjx_nero.learn.learner import Learner, Metrics
+from mjx_nero.learn.run_cfg import RunCfg
+
+
+@dataclasses.dataclass(frozen=True)
+class Compiled:
+    """What a run steps, ready to run.
+
+    Attributes:
+        advance: ``chunk`` iterations; takes the state for its own.
+        state: what it starts from.
+        evaluate: judges the policy of a state.
+        seconds: that all this took.
+    """
+
+    learner: Learner
+    chunk: int
+    advance: Callable[[Any], tuple[Any, Metrics]]
+    state: Any
+    evaluate: "Evaluator"
+    seconds: float
+
+    @property
+    def steps(self) -> int:
+        """Env steps of ``advance``."""
+        return self.chunk * self.learner.steps_per_iteration
+
+
+class Evaluator:
+    """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo's C library unless on Warp."""
+
+    def __init__(self, run: RunCfg, learner: Learner):
+        impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
+        env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
+        self._seed, self._policy = run.seed, learner.policy
+        self._runner = rollout.runner(env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
+
+    def of_seed(self, seed: int) -> "Evaluator":
+        """The same program, on another seed's episodes."""
+        other = copy.copy(self)
+        other._seed = seed
+        return other
+
+    def compiler(self, state: Any) -> Callable[[], None]:
+        """See ``rollout.Runner.compiler``."""
+        return self._runner.compiler(self._policy(state))
+
+    def __call__(self, state: Any) -> dict[str, Any]:
+        return self._runner(self._policy(state), self._seed).summary()
+
+
+def make_learner(run: RunCfg) -> Learner:
+    """The learner of a run and its environments.
+
+    Raises:
+        UserError: the number of environments or devices does not suit it.
+    """
+    env = ManipulationEnv(run.env, impl=run.impl, num_envs=run.num_envs)
+    return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
+
+
+def starter(learner: Learner) -> Callable[[int], Any]:
+    """Makes a new run's state of a seed, by one program."""
+    init = jax.jit(learner.init)
+    return lambda seed: learner.place(init(jax.random.PRNGKey(seed)))
+
+
+def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any]) -> Compiled:
+    """Compiles a run's programs, and makes its first state meanwhile.
+
+    Args:
+        chunk: iterations of a call.
+        start: makes the first state, placed.
+
+    Raises:
+        UserError: it does not fit into memory.
+    """
+    begun, env = time.perf_counter(), learner.env.unwrapped
+    with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers work without Python's lock
+        waiting = [side_by_side.submit(env.physics.prepare, run.num_envs // learner.num_devices, run.num_devices)]
+        starting = side_by_side.submit(start)
+        shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
+        program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
+        state = starting.result()
+        compiling = side_by_side.submit(program.compile, env.physics.compiler_options)
+        evaluate = Evaluator(run, learner)
+        waiting.append(side_by_side.submit(evaluate.compiler(state)))
+        advance = compiling.result()
+        device_memory.check_compiled(learner, advance)
+        for work in waiting:
+            work.result()
+    return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun)
+
+
+@contextlib.contextmanager
+def _threads():
+    """An executor that does not keep an error or Ctrl-C waiting for the others' ends."""
+    pool = concurrent.futures.ThreadPoolExecutor()
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,181 @@
+"""The head of a policy or checkpoint, which may be a stranger's: read with limits before a library sees the file."""
+
+import json
+import math
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from mjx_nero import files
+from mjx_nero.errors import UserError
+from mjx_nero.values import short
+
+MAX_HEAD = 2_000_000  # bytes
+MAX_FILE = 20_000_000_000  # bytes; a checkpoint holds its environments
+MAX_POLICY = 200_000_000  # bytes
+MAX_ARRAYS = 5_000
+MAX_LAYERS, MAX_WIDTH = 16, 8192  # of a network
+MAX_SIZE = 1_000_000  # numbers in an observation group
+DTYPES = {
+    "F64": "float64",
+    "F32": "float32",
+    "F16": "float16",
+    "I64": "int64",
+    "I32": "int32",
+    "I16": "int16",
+    "I8": "int8",
+    "U64": "uint64",
+    "U32": "uint32",
+    "U16": "uint16",
+    "U8": "uint8",
+    "BOOL": "bool",
+}
+_BYTES = {name: 1 if name == "BOOL" else int(name[1:]) // 8 for name in DTYPES}
+Arrays = dict[str, tuple[str, tuple[int, ...]]]  # name -> type as numpy calls it, shape
+
+
+def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
+    """The arrays of a safetensors file, and its own texts by name.
+
+    Raises:
+        UserError: missing, too large, damaged, or no such file.
+    """
+    with files.open_file(path) as (file, size):
+        length = int.from_bytes(file.read(8), "little")
+        if size > MAX_FILE:
+            raise UserError(f"{path} has {size / 1e9:.0f} GB: more than {MAX_FILE / 1e9:.0f} GB are not read")
+        head = file.read(length) if length <= min(MAX_HEAD, size - 8) else b""
+    try:
+        found = plain_json(head)
+        texts = found.pop("__metadata__")
+        arrays = {name: _array(entry) for name, entry in found.items()}
+        whole = sum(last - first for _, _, first, last in arrays.values()) == size - 8 - length
+        if not whole or len(arrays) > MAX_ARRAYS or not all(isinstance(text, str) for text in texts.values()):
+            raise ValueError
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise damaged(path) from None
+    return {name: (kind, shape) for name, (kind, shape, _, _) in arrays.items()}, texts
+
+
+def damaged(path: pathlib.Path) -> UserError:
+    """The error of a file that is not what was written."""
+    return UserError(f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew")
+
+
+def plain_json(text: str | bytes) -> Any:
+    """JSON by the letter: no key twice, no numbers that are not finite.
+
+    Raises:
+        ValueError, RecursionError: it is none.
+    """
+    return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse, parse_float=_finite)
+
+
+def check(meta: Mapping[str, Any], path: pathlib.Path) -> None:
+    """What files say of themselves: each field that the package uses is of its type and of a size that is usual.
+
+    Raises:
+        UserError: one is not, or one that every policy has is missing.
+    """
+    for name in ("env", "preset", "observation_size", "observations", "action_size"):
+        if name not in meta:
+            raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run (it has no {name!r})")
+    check_fields(meta, path)
+
+
+def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
+    """As ``check``, of those that are there: checkpoints of older versions have fewer.
+
+    Raises:
+        UserError: one is not of its type, or too large.
+    """
+    for name, good in _FIELDS.items():
+        if name in meta and not good(meta[name]):
+            shown = short(meta[name])
+            raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run (its {name} is {shown})")
+
+
+def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
+    """Type, shape, first byte and the one after the last."""
+    kind, shape, (first, last) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
+    whole = all(type(n) is int and 0 <= n < 1 << 40 for n in (*shape, first, last))
+    if not whole or len(shape) > 8 or math.prod(shape) * _BYTES[kind] != last - first:
+        raise ValueError
+    return DTYPES[kind], shape, first, last
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) != len(pairs):
+        raise ValueError("a key stands twice")
+    return out
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number")
+
+
+def _finite(text: str) -> float:
+    return float(text) if math.isfinite(float(text)) else _refuse(text)
+
+
+def _word(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= 200 and value.isprintable()
+
+
+def _whole(lowest: int, most: int) -> Callable[[Any], bool]:
+    return lambda value: type(value) is int and lowest <= value <= most
+
+
+def _list(good: Callable[[Any], bool], most: int) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and len(value) <= most and all(map(good, value))
+
+
+def _groups(good: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    """A mapping with the group that every policy observes."""
+    return lambda value: isinstance(value, dict) and "state" in value and all(_word(k) and good(v) for k, v in value.items())
+
+
+def _size(value: Any) -> bool:
+    return bool(value) and _list(_whole(1, MAX_SIZE), 4)(value) and math.prod(value) <= MAX_SIZE
+
+
+def _sizes(value: Any) -> bool:
+    """The shape of a group, or of each of its terms where they stay apart."""
+    return (
+        _size(value) or isinstance(value, dict) and 0 < len(value) <= 200 and all(_word(k) and _size(v) for k, v in value.items())
+    )
+
+
+def _number(most: float) -> Callable[[Any], bool]:
+    return lambda value: type(value) in (int, float) and 0 <= value <= most
+
+
+def _tally(value: Any) -> bool:
+    """What a run counts: numbers, of which some may be open, and its last evaluation."""
+    open = ("seconds_to_95", "steps_to_95", "rewound_at")
+    return isinstance(value, dict) and all(
+        isinstance(v, dict) if k == "evaluation" else type(v) in (int, float) or v is None and k in open for k, v in value.items()
+    )
+
+
+_LAYERS = _list(_whole(1, MAX_WIDTH), MAX_LAYERS)
+_NETWORK: dict[str, Callable[[Any], bool]] = {
+    "actor": _LAYERS,
+    "critic": _LAYERS,
+    "activation": _word,
+    "distribution": _word,
+    "init_std": lambda value: _number(100)(value) and value > 0,
+    "output_scale": _number(1e6),
+    "max_observation": _number(1e6),
+}
+_FIELDS: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("kind", "env", "preset", "robot", "learner", "fingerprint", "version"), _word),
+    "observation_size": _groups(_sizes),
+    "observations": _groups(_list(_word, 200)),
+    "action_size": _whole(1, 1000),
+    "env_steps": _whole(0, 1 << 60),
+    "num_envs": _whole(1, 1 << 24),
+    "tally": _tally,
+    "network": lambda value: isinstance(value, dict) and all(k in _NETWORK and _NETWORK[k](v) for k, v in value.items()),
+}

@@ -1,0 +1,80 @@
+"""One run on several machines: a process on each, which JAX joins to one mesh of devices.
+
+The first process alone writes, evaluates and decides; the others do as it does. With one process nothing here does anything.
+"""
+
+import glob
+import os
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+
+def join() -> None:
+    """Joins the processes that ``srun`` or ``mpirun`` started together; before JAX is used.
+
+    Where nothing tells JAX of the others (Kubernetes without its Python package, a shell), ``JAX_COORDINATOR_ADDRESS``,
+    ``JAX_NUM_PROCESSES`` and ``JAX_PROCESS_ID`` (or ``JOB_COMPLETION_INDEX``) do.
+    """
+    env = os.environ
+    how: dict[str, Any] = {}
+    if "JAX_COORDINATOR_ADDRESS" in env and "JAX_NUM_PROCESSES" in env:
+        rank = env.get("JAX_PROCESS_ID") or env.get("JOB_COMPLETION_INDEX") or "0"
+        how = {"num_processes": int(env["JAX_NUM_PROCESSES"]), "process_id": int(rank), "cluster_detection_method": "deactivate"}
+    elif max(int(env.get(name, 1)) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")) == 1:
+        return
+    elif "1" in (env.get("SLURM_STEP_TASKS_PER_NODE", "").partition("(")[0], env.get("OMPI_COMM_WORLD_LOCAL_SIZE")):
+        how = {"local_device_ids": _gpus()}  # a process a machine has all of it; JAX would give it the first GPU alone
+    jax.distributed.initialize(**how)
+
+
+def several() -> bool:
+    """True if there is more than one process."""
+    return jax.process_count() > 1
+
+
+def first() -> bool:
+    """True in the process that writes, evaluates and decides."""
+    return jax.process_index() == 0
+
+
+def default_devices() -> int:
+    """How many of a machine's devices a run takes if nobody says: one, or where machines are joined all."""
+    return jax.local_device_count() if several() else 1
+
+
+def devices(each: int) -> list[Any]:
+    """``each`` devices of every process."""
+    count: dict[int, int] = {}
+    found = []
+    for device in jax.devices():
+        count[device.process_index] = count.get(device.process_index, 0) + 1
+        if count[device.process_index] <= each:
+            found.append(device)
+    return found
+
+
+def gather(values: list[float]) -> np.ndarray:
+    """The values of all processes [processes, n], the first's first."""
+    mine = np.array(values, np.float64)
+    return np.asarray(multihost_utils.process_allgather(mine)).reshape(-1, len(values)) if several() else mine[None]
+
+
+def fetch(x: Any) -> np.ndarray:
+    """A copy of an array in this process's memory, put together of all processes' parts."""
+    if isinstance(x, jax.Array) and not x.is_fully_addressable and not x.is_fully_replicated:
+        x = multihost_utils.process_allgather(x, tiled=True)
+    return np.array(x, order="C")
+
+
+def wait() -> None:
+    """Until all processes are here."""
+    gather([0.0])
+
+
+def _gpus() -> list[int] | None:
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    count = len(named.split(",")) if named else len(glob.glob("/dev/nvidia[0-9]*"))
+    return list(range(count)) or None

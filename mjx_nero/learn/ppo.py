@@ -1,0 +1,347 @@
+"""PPO from Brax's building blocks: networks, advantages, running statistics and adaptive learning rate, in a loop of our own.
+
+Brax's own ``ppo.train`` keeps optimiser, environments and random keys to itself, so a run cannot be resumed exactly, reports
+no training episodes without a host callback at every step, and in release 0.14.2 calls a function that JAX 0.10 removed.
+This loop hands its whole state to the caller and is compiled ahead of time, so compilation is timed apart.
+
+The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in
+each of its minibatches, as their loop over time is slow on a GPU. At the first minibatch both agree (tests/learn/test_ppo.py).
+
+All of it is in this one file, longer than others, to be read from top to bottom.
+
+Nothing in it depends on a task's scale, or can run away: the critic learns returns in units of their own running deviation, the
+policy's advantages are normalised, its deviations have bounds, and so have normalised observations.
+
+On several devices each has an equal share of the environments, and of every minibatch; everything else is on all of them. Sums
+and means go over all devices, so their number changes only which environments share a minibatch, and the noise of the actions.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from typing import Any, TypeVar
+
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import Env, State
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import losses, networks, optimizer
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from mjx_nero import config
+from mjx_nero.errors import UserError
+from mjx_nero.learn import device_memory, machines
+from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn.policy import from_meta, init_params, make_act, make_networks, shapes
+from mjx_nero.learn.ppo_cfg import PRESETS as PRESETS
+from mjx_nero.learn.ppo_cfg import PpoCfg as PpoCfg
+from mjx_nero.types import Key
+
+Metrics = dict[str, Float[Array, ""]]
+Tree = TypeVar("Tree")
+
+_AXIS = "devices"
+_UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action_std", "learning_rate")
+
+
+@struct.dataclass
+class TrainState:
+    """All of a run: saved and loaded as it is, training goes on bit for bit."""
+
+    normalizer: running_statistics.RunningStatisticsState
+    params: losses.PPONetworkParams
+    opt_state: optax.OptState
+    env_state: State
+    key: Key
+    iteration: Int[Array, ""]
+    returns: running_statistics.RunningStatisticsState  # of all returns so far: the critic's unit
+
+
+_HERE: Any = PartitionSpec()
+_SPREAD: Any = PartitionSpec(_AXIS)
+_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE)
+
+
+@struct.dataclass
+class Batch:
+    """What an update learns from. Leaves are [time, env, ...], or any part of that."""
+
+    obs: dict[str, jax.Array]
+    raw_action: jax.Array  # before the distribution's squashing, if it has one
+    log_prob: jax.Array
+    distribution: Any  # parameters of the distribution that acted
+    value: jax.Array  # as the critic gives it, in units of ``TrainState.returns``
+    returns: jax.Array  # likewise
+    advantages: jax.Array
+
+
+class Learner:
+    """PPO on a batch of environments.
+
+    Args:
+        env: from ``wrappers.for_training``.
+        cfg: with ``num_envs`` filled in, the number on all devices together.
+        num_devices: how many of each machine's devices to spread them over.
+
+    Raises:
+        UserError: sizes or options that do not go together, or fewer devices than that.
+    """
+
+    def __init__(self, env: Env, cfg: PpoCfg, num_devices: int = 1):
+        cfg = dataclasses.replace(cfg, num_minibatches=cfg.num_minibatches or _minibatches(cfg))
+        here = jax.local_devices()
+        if num_devices > len(here):
+            raise UserError(f"num_devices is {num_devices}, but JAX finds {len(here)} here ({here[0].platform})")
+        devices = machines.devices(num_devices)
+        num_devices = len(devices)
+        parts = num_devices * cfg.num_minibatches
+        if not cfg.num_envs or cfg.num_envs % parts:
+            factors = f"ppo.num_minibatches ({cfg.num_minibatches})"
+            factors += f" x num_devices ({num_devices}) = {parts}" if num_devices > 1 else ""
+            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of {factors}")
+        if cfg.desired_kl and cfg.network.distribution != "normal":
+            raise UserError("an adaptive learning rate needs the normal distribution: pass --ppo.desired_kl 0")
+        if cfg.max_std and cfg.min_std > cfg.max_std:
+            raise UserError(f"ppo.min_std ({cfg.min_std:g}) is above ppo.max_std ({cfg.max_std:g})")
+        self.env, self.cfg, self.num_envs = env, cfg, cfg.num_envs
+        self.num_devices, self.divisor = num_devices, parts
+        self._axis = _AXIS if num_devices > 1 else None  # None: a program without any communication
+        self._mesh = Mesh(np.array(devices), (_AXIS,))
+        self.sizes = env.observation_size
+        self.networks = make_networks(self.sizes, env.action_size, cfg.network)
+        self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
+        adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
+        # On one vector: by parameter it would be a hundred small kernels for every minibatch.
+        self._optimizer = optax.flatten(optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam))
+        self._make_policy = networks.make_inference_fn(self.networks)
+
+    def init(self, key: Key) -> TrainState:
+        """Fresh networks and environments, the latter spread over their episodes so that they don't all end at once."""
+        k_net, k_env, k_phase, key = jax.random.split(key, 4)
+        normalizer, params = init_params(self.networks, self.sizes, k_net)
+        env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs))
+        carry = env_state.info["carry"]
+        phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
+        env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
+        opt_state = self._optimizer.init(params)
+        returns = running_statistics.init_state(specs.Array((), jnp.dtype("float32")), std_eps=jnp.float32(1e-6))
+        state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns)
+        # A weakly typed leaf comes back from ``run`` a strong one, and whatever takes the state would be compiled for both.
+        return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
+
+    def place(self, state: TrainState) -> TrainState:
+        """The state, or its shapes, where ``run`` takes it: environments spread over the devices, the rest on each of them."""
+        if not self._axis:
+            return state
+
+        def put(part, spec):
+            sharding = NamedSharding(self._mesh, spec)
+            if isinstance(jax.tree.leaves(part)[0], jax.ShapeDtypeStruct):
+                return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
+            if machines.several():  # each puts its own part of what all of them have
+                return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, np.asarray(x).__getitem__), part)
+            return jax.device_put(part, sharding)
+
+        return TrainState(*(put(getattr(state, f.name), getattr(_SPECS, f.name)) for f in dataclasses.fields(TrainState)))
+
+    def policy(self, state: TrainState) -> tuple:
+        """Normalizer and network parameters as the first device has them, for programs that run there alone."""
+        params = state.normalizer, state.params
+        return jax.tree.map(lambda x: x.addressable_data(0), params) if self._axis else params
+
+    def with_policy(self, state: TrainState, params: tuple) -> TrainState:
+        """A fresh state that starts from a policy."""
+        normalizer, networks = params
+        return dataclasses.replace(state, normalizer=normalizer, params=networks)
+
+    def slower(self, state: TrainState) -> TrainState:
+        """A tenth of the learning rate, and other draws."""
+        *others, adam = state.opt_state
+        rate = adam.hyperparams["learning_rate"]
+        adam = adam._replace(
+            hyperparams={**adam.hyperparams, "learning_rate": jnp.maximum(0.1 * rate, self.cfg.min_learning_rate)}
+        )
+        return dataclasses.replace(state, opt_state=(*others, adam), key=jax.random.fold_in(state.key, 1))
+
+    def act(self, params: tuple, obs: Observation) -> jax.Array:
+        """The mode of the action's distribution."""
+        return make_act(self.networks, params)(obs)
+
+    def describe(self) -> dict[str, Any]:
+        """The networks, for the policy's file."""
+        return {"network": config.to_dict(self.cfg.network)}
+
+    def memory(self) -> tuple[float, float]:
+        """See ``learner.Learner.memory``. The factors were measured on compiled programs (tests/learn/test_device_memory.py).
+
+        A rollout keeps every step's observations and the like; its end takes two layers of the critic for all of them; an update
+        copies a minibatch, and keeps what all of its networks' neurons gave, for the gradient.
+        """
+        cfg, env = self.cfg, self.env.unwrapped
+        state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
+        own = device_memory.size(state.env_state)
+        # Observations; actions, their means and deviations; log-probability, value, return, advantage, reward and two ends.
+        obs = 4 * sum(map(math.prod, shapes(self.sizes)))
+        step = obs + 4 * (3 * env.action_size + 7)
+        neurons = 4 * (sum(cfg.network.actor) + sum(cfg.network.critic))
+        layers = 4 * max(a + b for a, b in itertools.pairwise((*cfg.network.critic, 1)))
+        rollout = max(env.physics.memory(self.num_devices).in_program, cfg.unroll_length * (obs + layers))
+        update = cfg.unroll_length * (step + 1.75 * neurons) / cfg.num_minibatches
+        return 2.0 * (device_memory.size(state) - own), own / cfg.num_envs + 1.1 * cfg.unroll_length * step + max(rollout, update)
+
+    def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
+        """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""
+        run = functools.partial(self._run, iterations=iterations)
+        if self._axis:  # unchecked: no check sees through the calls of physics that is not a JAX program
+            run = jax.shard_map(run, mesh=self._mesh, in_specs=(_SPECS,), out_specs=(_SPECS, _HERE), check_vma=False)
+        return run(state)
+
+    def _run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
+        with jax.default_matmul_precision("float32"):
+            state, metrics = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
+        return state, {name: jnp.mean(value) for name, value in metrics.items()}
+
+    def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        key, k_roll, k_update = jax.random.split(state.key, 3)
+        if self._axis:
+            k_roll = jax.random.fold_in(k_roll, jax.lax.axis_index(self._axis))
+        env_state, batch, sums = self.rollout(state, k_roll)
+        with self._networks_precision():
+            params, opt_state, metrics = self._update(state, batch, k_update)
+        # After the update: the loss compares with log-probabilities made under the statistics that acted.
+        normalizer = running_statistics.update(state.normalizer, batch.obs, pmap_axis_name=self._axis)
+        returns = state.returns
+        if self.cfg.normalize_returns:  # otherwise they stay what they start as, mean 0 and deviation 1
+            raw = running_statistics.denormalize(batch.returns, returns)
+            returns = running_statistics.update(returns, raw, pmap_axis_name=self._axis)
+        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns)
+        sums = jax.lax.psum(sums, self._axis) if self._axis else sums
+        return state, {**sums, **metrics}
+
+    def _networks_precision(self):
+        return jax.default_matmul_precision(self.cfg.matmul_precision)
+
+    def _mean(self, tree: Tree) -> Tree:
+        """The mean over the devices, in ``run``, of what each has for its equal share."""
+        return jax.lax.pmean(tree, self._axis) if self._axis else tree
+
+    def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
+        """Acts for ``unroll_length`` steps in every environment and computes returns and advantages.
+
+        Returns:
+            the environments, the batch (leaves [time, env, ...]), and sums of the environments' metrics over it.
+        """
+        cfg = self.cfg
+        policy = self._make_policy((state.normalizer, state.params.policy))
+
+        def figures(env_state: State):
+            return {**env_state.metrics, "reward": env_state.reward, "episodes": env_state.done}
+
+        def act(carry: tuple[State, Metrics], key: Key):
+            env_state, totals = carry
+            with self._networks_precision():
+                action, extras = policy(env_state.obs, key)
+            after = self.env.step(env_state, action)
+            totals = jax.tree.map(jnp.add, totals, figures(after))  # by environment: a sum over them at every step costs more
+            return (after, totals), (env_state.obs, extras, after.reward, after.done, after.info["truncation"])
+
+        keys = jax.random.split(key, cfg.unroll_length)
+        start = state.env_state, jax.tree.map(jnp.zeros_like, figures(state.env_state))
+        (env_state, totals), (obs, extras, reward, done, truncation) = jax.lax.scan(act, start, keys)
+        # All steps' values at once: a few large products in place of many small ones.
+        with self._networks_precision():
+            value, last = (
+                self.networks.value_network.apply(state.normalizer, state.params.value, o) for o in (obs, env_state.obs)
+            )
+        raw_value, raw_last = (running_statistics.denormalize(x, state.returns) for x in (value, last))
+        returns, advantages = losses.compute_gae(
+            truncation=truncation,
+            termination=done * (1 - truncation),
+            rewards=reward * cfg.reward_scaling,
+            values=raw_value,
+            bootstrap_value=raw_last,
+            lambda_=cfg.gae_lambda,
+            discount=cfg.discounting,
+        )
+        returns = running_statistics.normalize(returns, state.returns)
+        batch = Batch(obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], value, returns, advantages)
+        return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in totals.items()}
+
+    def loss(
+        self, params: losses.PPONetworkParams, normalizer: running_statistics.RunningStatisticsState, batch: Batch, key: Key
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """Clipped surrogate, clipped value loss and entropy bonus. Schulman et al. 2017; the value's clipping as in RSL-RL."""
+        cfg, nets = self.cfg, self.networks
+        dist = nets.parametric_action_distribution
+        logits = nets.policy_network.apply(normalizer, params.policy, batch.obs)
+        value = nets.value_network.apply(normalizer, params.value, batch.obs)
+
+        centred = batch.advantages - self._mean(jnp.mean(batch.advantages))
+        advantages = centred / (jnp.sqrt(self._mean(jnp.mean(jnp.square(centred)))) + 1e-8)
+        ratio = jnp.exp(dist.log_prob(logits, batch.raw_action) - batch.log_prob)
+        clipped = jnp.clip(ratio, 1 - cfg.clipping, 1 + cfg.clipping)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
+
+        error = jnp.square(batch.returns - value)
+        if cfg.clip_value:
+            near = batch.value + jnp.clip(value - batch.value, -cfg.clip_value, cfg.clip_value)
+            error = jnp.maximum(error, jnp.square(batch.returns - near))
+        value_loss = 0.5 * cfg.value_loss * jnp.mean(error)
+
+        entropy = jnp.mean(dist.entropy(logits, key))
+        new, old = dist.create_dist(logits), dist.create_dist(batch.distribution)
+        kl = jnp.mean(new.kl_divergence(old)) if hasattr(new, "kl_divergence") else jnp.zeros(())
+        total = policy_loss + value_loss - cfg.entropy_cost * entropy
+        metrics = {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy, "kl": kl}
+        return total, {**metrics, "action_std": jnp.mean(new.scale)}
+
+    def _update(self, state: TrainState, batch: Batch, key: Key) -> tuple[losses.PPONetworkParams, optax.OptState, Metrics]:
+        cfg = self.cfg
+
+        def minibatch(carry, envs_and_key):
+            params, opt_state = carry
+            envs, key = envs_and_key
+            part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat: faster products on a CPU
+            grads, metrics = self._mean(jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key))
+            if cfg.desired_kl:
+                opt_state, _ = optimizer.adaptive_kl_learning_rate(
+                    opt_state, metrics["kl"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
+                )
+            metrics["learning_rate"] = opt_state[-1].hyperparams["learning_rate"]
+            updates, opt_state = self._optimizer.update(grads, opt_state)
+            params = optax.apply_updates(params, updates)
+            params = params.replace(policy=_bound_std(params.policy, cfg.min_std, cfg.max_std))
+            return (params, opt_state), jnp.stack([metrics[name] for name in _UPDATE_METRICS])
+
+        k_order, k_loss = jax.random.split(key)
+        mine, updates = cfg.num_envs // self.num_devices, cfg.num_epochs * cfg.num_minibatches
+        orders = jax.vmap(lambda k: jax.random.permutation(k, mine))(jax.random.split(k_order, cfg.num_epochs))
+        each = orders.reshape(updates, -1), jax.random.split(k_loss, updates)
+        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.opt_state), each)
+        return params, opt_state, dict(zip(_UPDATE_METRICS, jnp.mean(metrics, 0), strict=True))
+
+
+def _minibatches(cfg: PpoCfg) -> int:
+    """How many minibatches an epoch has by ``minibatch_size``."""
+    wanted = cfg.num_envs * cfg.unroll_length // cfg.minibatch_size
+    return max(8, 1 << wanted.bit_length() - 1 if wanted else 0)
+
+
+def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    """The policy's parameters with its learnt deviations within bounds (0: none); ``tanh_normal`` has no such parameters."""
+    layers, name = policy["params"], "std_logparam"
+    if name not in layers:
+        return policy
+    bounds = np.log(low) if low else -np.inf, np.log(high) if high else np.inf
+    return {**policy, "params": {**layers, name: jax.tree.map(lambda x: jnp.clip(x, *bounds), layers[name])}}
+
+
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta)

@@ -1,0 +1,112 @@
+"""Hyperparameters of PPO and its networks: plain data, read without Brax, which takes seconds to import."""
+
+import dataclasses
+from typing import Annotated
+
+from mjx_nero import config
+from mjx_nero.bounds import Bounds, Count, NonNegative, Positive, Share
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.errors import UserError
+from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
+from mjx_nero.values import hints, read, short
+
+PRECISIONS = ("default", "bfloat16", "tensorfloat32", "float32", "high", "highest")
+Rate = Annotated[float, Bounds(0.0, 1.0, above=True)]
+
+ACTIVATIONS = ("elu", "swish", "relu", "tanh")
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkCfg:
+    """Multilayer perceptrons of actor and critic, and the action's distribution.
+
+    Attributes:
+        actor, critic: neurons of the hidden layers.
+        activation: elu, swish, relu or tanh.
+        distribution: ``normal`` has one learnt log-std an action, ``tanh_normal`` squashes actions to +-1.
+        init_std: of a normal distribution, at first.
+        output_scale: of the first weights of the actor's last layer: small, so that it starts near home, whatever it sees.
+        max_observation: bound on normalised observations, of which actions are some, so that nothing feeds itself; 0: none.
+    """
+
+    actor: tuple[int, ...] = (256, 128, 64)
+    critic: tuple[int, ...] = (256, 128, 64)
+    activation: str = "elu"
+    distribution: str = "normal"
+    init_std: Positive = 1.0
+    output_scale: Positive = 0.01
+    max_observation: NonNegative = 10.0
+
+    def __post_init__(self):
+        if self.activation not in ACTIVATIONS:
+            raise UserError(f"unknown activation {self.activation!r}: choose one of {', '.join(ACTIVATIONS)}")
+        if self.distribution not in ("normal", "tanh_normal"):
+            raise UserError(f"unknown distribution {self.distribution!r}: choose normal or tanh_normal")
+        for name, layers in (("actor", self.actor), ("critic", self.critic)):
+            if len(layers) > MAX_LAYERS or not all(1 <= width <= MAX_WIDTH for width in layers):
+                most = f"{MAX_LAYERS} layers of 1 to {MAX_WIDTH} neurons"
+                raise UserError(f"network.{name} takes up to {most}, got {short(layers)}")
+        if not 0 < self.init_std <= 100:
+            raise UserError(f"network.init_std takes a number above 0, up to 100, got {self.init_std:g}")
+
+
+@dataclasses.dataclass(frozen=True)
+class PpoCfg:
+    """Hyperparameters. ``num_envs`` and ``num_timesteps`` 0: chosen for the machine."""
+
+    num_envs: Annotated[int, Bounds(0, 1 << 24)] = 0  # on all devices together; 0: chosen for the machine
+    num_timesteps: Annotated[int, Bounds(0, 10**15)] = 0  # env steps in all; 0: chosen for the machine
+    unroll_length: Annotated[int, Bounds(1, 10_000)] = 24  # control steps of every environment an iteration
+    num_epochs: Annotated[int, Bounds(1, 1_000)] = 2  # times that an iteration learns from its steps
+    num_minibatches: Annotated[int, Bounds(0, 1 << 20)] = 0  # updates an epoch; 0: a power of two, at least 8, by minibatch_size
+    minibatch_size: Count = 6144  # env steps; larger ones leave too few updates, smaller ones a GPU idle
+    learning_rate: Rate = 3e-4  # at first
+    desired_kl: NonNegative = 0.02  # adapts the learning rate; 0 keeps it fixed
+    min_learning_rate: Rate = 1e-5  # the least that it is adapted to
+    max_learning_rate: Rate = 1e-3  # the most; with thousands of environments it runs up to what it may
+    discounting: Share = 0.98  # of a reward, a control step later
+    gae_lambda: Share = 0.95  # of generalised advantage estimation: 1 trusts returns, 0 the critic
+    clipping: Positive = 0.2  # bound on the change of an action's probability, as a share
+    normalize_returns: bool = True  # the critic learns them in units of their running deviation
+    clip_value: NonNegative = 0.0  # bound on the change of a value estimate; 0: none
+    entropy_cost: NonNegative = 0.01  # weight of the entropy in the loss: keeps the policy exploring
+    min_std: NonNegative = 0.2  # least deviation of an action, so that exploration does not end before the goal is found; 0: none
+    max_std: NonNegative = 1.0  # most, as noise costs nothing where targets saturate; 0: none
+    value_loss: NonNegative = 1.0  # weight of the critic's loss
+    max_grad_norm: Positive = 1.0  # longer gradients are shortened to this
+    reward_scaling: Positive = 1.0  # what the learner multiplies rewards by
+    matmul_precision: str = "tensorfloat32"  # of the networks, on GPUs that have it; the environment's is always full
+    network: NetworkCfg = NetworkCfg()
+
+    def __post_init__(self):
+        for name, kind in hints(type(self)).items():
+            if name != "network":
+                read(kind, getattr(self, name), f"ppo.{name}")
+        if self.matmul_precision not in PRECISIONS:
+            raise UserError(f"ppo.matmul_precision takes one of {', '.join(PRECISIONS)}, got {short(self.matmul_precision)}")
+        if self.min_learning_rate > self.max_learning_rate:
+            raise UserError("ppo.min_learning_rate is above ppo.max_learning_rate: lower it")
+
+
+PRESETS = {  # by the environment's preset
+    "default": PpoCfg(),
+    # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
+    "isaac": PpoCfg(
+        num_epochs=5,
+        num_minibatches=4,
+        learning_rate=1e-4,
+        max_learning_rate=1e-2,
+        desired_kl=0.01,
+        entropy_cost=0.006,
+        clip_value=0.2,
+        normalize_returns=False,
+        min_std=0.0,
+        max_std=0.0,
+        network=NetworkCfg(output_scale=1.0, max_observation=0.0),
+    ),
+}
+
+
+def learner_cfg(cfg: EnvCfg, preset: str) -> PpoCfg:
+    """The hyperparameters that go with a preset, and those that the task asks for."""
+    return config.override(PRESETS.get(preset, PpoCfg()), cfg.training)

@@ -1,0 +1,202 @@
+"""Going on: the same run from its newest whole checkpoint, or another from a checkpoint or a policy."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import jax
+
+from mjx_nero import config
+from mjx_nero.errors import UserError
+from mjx_nero.learn import checkpoint, checkpoints, compiled, header
+from mjx_nero.learn.learner import Learner
+from mjx_nero.learn.run_cfg import RunCfg, resolve
+from mjx_nero.learn.run_folder import CONFIG
+
+# What may change when a run goes on: how long, on what, and what it leaves behind.
+_FREE = ("impl", "eval_every", "checkpoint_every", "checkpoint_minutes", "keep", "on_nan", "max_minutes", "num_devices")
+_OWN = (*_FREE, "seed", "eval_episodes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A file to go on from, and what it says of itself."""
+
+    path: pathlib.Path
+    meta: dict[str, Any]
+
+    @property
+    def is_checkpoint(self) -> bool:
+        """A whole run's state; else a policy, whose networks alone a new run starts from."""
+        return self.meta.get("kind") == "checkpoint"
+
+
+def find(restore: pathlib.Path, warn: Callable[[str], None]) -> Source:
+    """The newest checkpoint of a run folder that is whole, or the file itself.
+
+    Raises:
+        UserError: there is none.
+    """
+    if not restore.is_dir():
+        return Source(restore, checkpoint.load_meta(restore))
+    for path in checkpoints.saved(restore):
+        try:
+            checkpoint.verify(path)
+            return Source(path, checkpoint.load_meta(path))
+        except checkpoint.Damaged:
+            warn(f"warning: {path} is damaged and passed over for the checkpoint before")
+    raise UserError(f"{restore} holds no checkpoint to restore: give a run folder or a .safetensors file")
+
+
+def same_run(folder: pathlib.Path, asked: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]]) -> RunCfg:
+    """The run of a folder, to go on as it was; what the user asks for beside that may only say how long and on what.
+
+    Args:
+        asked: the run that the command line describes.
+        flags: names of the flags that it has.
+        dotted: its dotted flags, by prefix.
+
+    Raises:
+        UserError: a flag differs from the run's own; the config is damaged or of a version that this one cannot follow.
+    """
+    run = _rebuilt(folder)
+    if run is None:  # of a version that did not say enough
+        return dataclasses.replace(asked, restore=folder, out=folder)
+
+    def refuse(flag: str, own: Any, other: Any) -> None:
+        if own != other:
+            raise UserError(
+                f"--{flag} is {other}, and {folder} is a run with {own}: leave it out to go on with that run, or start another "
+                "with another --out"
+            )
+
+    for flag, name in (("env", "env_name"), ("preset", "preset"), ("learner", "learner"), ("seed", "seed")):
+        if flag in flags:
+            refuse(flag, getattr(run, name), getattr(asked, name))
+    if "robot" in flags:
+        refuse("robot", run.asked.robot, asked.asked.robot)
+    if "num_envs" in flags:
+        refuse("num-envs", run.num_envs, asked.num_envs)
+    for prefix, own in (("env", run.env), (run.learner, run.hyperparameters)):
+        changed = config.flatten(config.override(own, dotted.get(prefix, {})))
+        for name in dotted.get(prefix, {}):
+            if name != "num_timesteps":
+                refuse(f"{prefix}.{name}", config.flatten(own)[name], changed[name])
+    changes: dict[str, Any] = {name: getattr(asked, name) for name in (*_FREE, "track") if name in flags}
+    if "num_timesteps" in flags or "num_timesteps" in dotted.get(run.learner, {}):
+        changes["hyperparameters"] = dataclasses.replace(run.hyperparameters, num_timesteps=asked.num_timesteps)
+    return dataclasses.replace(run, **changes, restore=folder, out=folder)
+
+
+def overridden(folder: pathlib.Path, run: RunCfg) -> str:
+    """What a run that goes on does otherwise than before, for people; empty if nothing."""
+    before = _rebuilt(folder)
+    if before is None:
+        return ""
+    pairs = [(name, getattr(before, name), getattr(run, name)) for name in ("num_timesteps", *_FREE)]
+    return ", ".join(f"{name} {new} in place of {old}" for name, old, new in pairs if old != new)
+
+
+def _rebuilt(folder: pathlib.Path) -> RunCfg | None:
+    """The run that ``config.json`` describes; None if it is one of a version that did not keep what it was made from."""
+    path = folder / CONFIG
+    try:
+        stored = json.loads(path.read_text())
+        if "asked" not in stored:
+            return None
+        asked, own = stored["asked"], {name: stored[name] for name in _OWN}
+        run = resolve(stored["env_name"], stored["preset"], asked["robot"], asked["env"], {}, learner=stored["learner"], **own)
+        run = dataclasses.replace(run, asked=dataclasses.replace(run.asked, learner=asked["learner"]))
+        fields = {"env": _as_stored(run.env, stored["env"])}
+        fields["hyperparameters"] = _as_stored(run.hyperparameters, stored["hyperparameters"])
+        return dataclasses.replace(run, **fields)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    except UserError as error:
+        version = stored["versions"].get("mjx-nero", "unknown")
+        raise UserError(f"{path} is of a run of version {version}, which this version cannot go on with: {error}") from None
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise UserError(f"{path} is damaged: pass --restore with a checkpoint, all flags of the run and another --out") from None
+
+
+def _as_stored(cfg: Any, stored: Any) -> Any:
+    """The config with the numbers that a run was begun with, where this version has others."""
+    was = config.flatten(stored)
+    now = config.flatten(config.to_dict(cfg))
+    return config.override(cfg, {name: was[name] for name in config.flatten(cfg) if was.get(name) != now.get(name)})
+
+
+def check(source: Source, meta: dict[str, Any]) -> None:
+    """Does it fit a run?
+
+    Args:
+        meta: what the run's own checkpoints say (``policy.describe``).
+
+    Raises:
+        UserError: it does not; says why in words.
+    """
+    path, there = source.path, source.meta
+    header.check_fields(there, path)
+
+    def differs(name: str) -> bool:
+        return name in there and there[name] != meta[name]
+
+    if source.is_checkpoint:
+        if differs("env"):
+            raise UserError(f"{path} is a checkpoint of {there['env']}, not of {meta['env']}: pass --env {there['env']}")
+        if differs("robot") or differs("fingerprint"):
+            of = f"for {there['robot']}, not for {meta['robot']}" if differs("robot") else f"for another model of {meta['robot']}"
+            raise UserError(f"{path} is a checkpoint {of}: pass the --robot that it was trained with")
+        if differs("num_envs"):
+            n = there["num_envs"]
+            raise UserError(
+                f"{path} does not fit: it holds {n} environments, this run has {meta['num_envs']}: pass --num-envs {n}"
+            )
+    if there.get("learner", "ppo") != meta["learner"]:
+        raise UserError(f"{path} was made by the learner {there.get('learner', 'ppo')}: pass --learner to say so")
+    if differs("observations") or differs("observation_size") or differs("action_size"):
+        where = f"{there.get('env')} (preset {there.get('preset')})"
+        raise UserError(
+            f"{path} does not fit: it was trained in {where} on other observations or actions "
+            f"than those of {meta['env']} (preset {meta['preset']}): give one that was trained on the same"
+        )
+    # Files of version 0.4 know no bound on observations; the scale of the first weights matters to none that has weights.
+    own = {"max_observation": 0.0, **there["network"]} if "network" in there else {}
+    if other := {name: x for name, x in own.items() if name != "output_scale" and x != meta["network"].get(name, x)}:
+        flags = " ".join(f"--{meta['learner']}.network.{name} {_flag(x)}" for name, x in other.items())
+        raise UserError(f"{path} does not fit: its networks are others: pass {flags}")
+
+
+def _flag(value: Any) -> str:
+    """A field of JSON as one types it."""
+    return "'" + ",".join(map(str, value)) + "'" if isinstance(value, list) else str(value)
+
+
+def state(source: Source | None, learner: Learner, seed: int) -> Any:
+    """A fresh state, or that of a checkpoint; of a policy file, its networks alone.
+
+    Raises:
+        UserError: another version's, damaged, or its networks hold numbers that are not finite.
+    """
+    if source is None:
+        return compiled.starter(learner)(seed)
+    key = jax.random.PRNGKey(seed)
+    like = jax.eval_shape(learner.init, key)
+    if not source.is_checkpoint:
+        networks = _finite(checkpoint.load(source.path, learner.policy(like)), source)  # before compiling takes its time
+        return learner.place(learner.with_policy(jax.jit(learner.init)(key), networks))
+    try:
+        held = checkpoint.load(source.path, like)
+        _finite(learner.policy(held), source)
+        return learner.place(held)
+    except UserError as error:
+        made_by = source.meta.get("version")
+        raise UserError(f"{error} (it was made by version {made_by} of mjx_nero)" if made_by else str(error)) from None
+
+
+def _finite(networks: Any, source: Source) -> Any:
+    if name := checkpoint.not_finite(networks):
+        raise UserError(f"{source.path} holds numbers that are not finite, in {name}: give an earlier one, or copy it anew")
+    return networks

@@ -1,0 +1,120 @@
+"""Several seeds, one after another in one process: one compiled program, and for each seed a run of its own."""
+
+import dataclasses
+import json
+import math
+import pathlib
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+from scipy import stats
+
+from mjx_nero import files
+from mjx_nero.errors import UserError
+from mjx_nero.learn import compiled, device_memory, machines, run_folder, stopping, training
+from mjx_nero.learn.loop import Diverged, Tally
+from mjx_nero.learn.rollout import wilson
+from mjx_nero.learn.run_cfg import RunCfg, fit_machine
+
+SEEDS = "seeds.json"
+Row = dict[str, Any]
+
+
+def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple[list[Row], pathlib.Path, int]:
+    """Trains each seed as ``training.train`` does, in ``seed_<n>`` of the run's folder, which gets ``seeds.json``: a row a seed.
+
+    A seed that diverges is a row without success, and the next one follows; a signal ends them all.
+
+    Returns:
+        the rows of the folder's seeds, the folder, and an exit status.
+
+    Raises:
+        UserError: anything that the user can mend.
+        stopping.Signalled: a signal came before training began.
+    """
+    if machines.several():
+        raise UserError("--seeds trains on one machine: on several, start a run a seed with --seed")
+    say = training.speaker()
+    run, note = fit_machine(run)
+    learner = compiled.make_learner(run)
+    device_memory.check(learner)
+    meta = training.describe(run, learner)
+    with stopping.at_once(), run_folder.claim(run.out, run.env_name, goes_on=False) as folder:
+        homes = {seed: folder / f"seed_{seed}" for seed in seeds}
+        for home in homes.values():
+            if (home / run_folder.CONFIG).exists():
+                raise UserError(f"{home} already holds a run: pass other --seeds or another --out, or --restore {home} alone")
+        if note:
+            say(note)
+        start = compiled.starter(learner)
+        made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder)
+        found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
+        for i, (seed, home) in enumerate(homes.items()):
+            say(f"seed {seed}, {i + 1} of {len(seeds)}")
+            if i:
+                made = dataclasses.replace(made, state=start(seed), evaluate=made.evaluate.of_seed(seed), seconds=0.0)
+            with run_folder.claim(home, run.env_name, goes_on=False):
+                row, code = _run(dataclasses.replace(run, seed=seed, out=home), made, meta, home, command)
+            found[seed] = row
+            rows = [found[seed] for seed in sorted(found)]
+            files.write_json(folder / SEEDS, {**summary(rows), "rows": rows})
+            if code:
+                left = ",".join(map(str, seeds[i + 1 :]))
+                say(f"seeds {left} were not begun: --seeds {left} --out {folder} trains them" if left else "no seed is left")
+                return rows, folder, code
+    return rows, folder, 0
+
+
+def _run(run: RunCfg, made: compiled.Compiled, meta: dict[str, Any], home: pathlib.Path, command: str) -> tuple[Row, int]:
+    """A seed's row and exit status."""
+    tally = Tally()
+    try:
+        found = training.carry_out(run, made, tally, meta, home, command)
+    except Diverged as error:
+        training.speaker()(f"warning: {error}")
+        nothing = {"success_rate": 0.0, "success_rate_95": None}
+        found = {"evaluation": nothing, "seconds_to_95": None, "stopped": "diverged", "code": 0}
+    row = {
+        "seed": run.seed,
+        **{name: found["evaluation"][name] for name in ("success_rate", "success_rate_95")},
+        "seconds_to_95": found["seconds_to_95"],
+        "env_steps": tally.steps,
+        "train_s": round(tally.wall_s, 1),
+        "stopped": found["stopped"],
+    }
+    return row, found["code"]
+
+
+def _earlier(path: pathlib.Path) -> list[Row]:
+    """The rows of seeds that were trained in this folder before."""
+    try:
+        return json.loads(path.read_text())["rows"]
+    except FileNotFoundError:
+        return []
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is damaged: move it away, or pass another --out") from None
+
+
+def summary(rows: list[Row]) -> Row:
+    """About all seeds, each interval at 95%: how many reached 95% success (Wilson), mean success (Student's t), seconds till then
+    (median, and the mean's interval if all got there)."""
+    seconds = [row["seconds_to_95"] for row in rows if row["seconds_to_95"] is not None]
+    successes = [row["success_rate"] for row in rows]
+    return {
+        "seeds": len(rows),
+        "reached_95": len(seconds),
+        "reached_95_interval": wilson(float(len(seconds)), len(rows)),
+        "success_rate_mean": statistics.mean(successes),
+        "success_rate_interval": mean_interval(successes, most=1.0),
+        "seconds_to_95_median": statistics.median(seconds) if seconds else None,
+        "seconds_to_95_interval": mean_interval(seconds) if len(seconds) == len(rows) else None,
+    }
+
+
+def mean_interval(values: Sequence[float], most: float = math.inf) -> tuple[float, float] | None:
+    """Student's 95% interval of the mean of independent values from 0 to ``most``; None: there is but one."""
+    if len(values) < 2:
+        return None
+    half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / math.sqrt(len(values))
+    return max(0.0, statistics.mean(values) - half), min(most, statistics.mean(values) + half)

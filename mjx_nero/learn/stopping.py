@@ -1,0 +1,70 @@
+"""Signals: before training they end a program at once, during training they let it save first."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)  # Ctrl-C, and what job queues and terminals send
+
+
+class Signalled(KeyboardInterrupt):
+    """A signal that ends the program. ``code`` is its exit status, 128 and the signal's number."""
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.code = 128 + number
+
+
+class Stop:
+    """Whether a signal came, and which."""
+
+    number: int | None = None
+
+    @property
+    def code(self) -> int:
+        """Exit status of a program that the signal ended."""
+        return 128 + (self.number or 0)
+
+
+@contextlib.contextmanager
+def at_once() -> Iterator[None]:
+    """A signal raises ``Signalled`` wherever the program is, so that it cleans up as it ends."""
+
+    def handle(number: int, _: Any) -> None:
+        raise Signalled(number)
+
+    with _handled(handle):
+        yield
+
+
+@contextlib.contextmanager
+def after_this(say: Callable[[str], None]) -> Iterator[Stop]:
+    """The first signal sets a flag, so that what is in flight ends whole; the second raises ``Signalled``."""
+    stop = Stop()
+
+    def handle(number: int, _: Any) -> None:
+        if stop.number is not None:
+            raise Signalled(number)
+        stop.number = number
+        say("stopping after this update (Ctrl-C again: at once) ...")
+
+    with _handled(handle):
+        yield stop
+
+
+@contextlib.contextmanager
+def _handled(handle: Callable[[int, Any], None]) -> Iterator[None]:
+    before = {}
+    for number in SIGNALS:
+        if signal.getsignal(number) is signal.SIG_IGN:  # as under nohup
+            continue
+        try:
+            before[number] = signal.signal(number, handle)
+        except ValueError:  # not the main thread: whoever has that decides
+            break
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

@@ -1,0 +1,65 @@
+"""Services that are told how a run goes, beside its folder: ``--track``."""
+
+import importlib.util
+import os
+import pathlib
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+from mjx_nero import config
+from mjx_nero.errors import UserError
+from mjx_nero.learn.logs import Row, Tracker
+from mjx_nero.learn.run_cfg import RunCfg
+
+
+class Wandb:
+    """Weights & Biases: a run in the project ``mjx_nero`` with every row, over env steps.
+
+    ``WANDB_MODE=offline``, ``WANDB_PROJECT`` and its other settings come from the environment. A run that is gone on with goes on
+    there, too.
+    """
+
+    def __init__(self, run: RunCfg, folder: pathlib.Path):
+        import wandb
+
+        files = folder / "wandb"
+        files.mkdir(exist_ok=True)
+        own = files / "id"
+        if not own.exists():
+            own.write_text(uuid.uuid4().hex)
+        self._run: Any = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "mjx_nero"),
+            name=folder.name,
+            id=own.read_text(),
+            dir=folder,
+            config=config.to_dict(run),
+            resume="allow",
+            settings=wandb.Settings(console="off", silent=True),  # it leaves stdout and stderr alone
+        )
+
+    def write(self, row: Row) -> None:
+        """A row of metrics."""
+        self._run.log({name: value for name, value in row.items() if value is not None}, step=int(row["steps"]))
+
+    def close(self) -> None:
+        """Waits until all is sent."""
+        self._run.finish()
+
+
+TRACKERS: dict[str, Callable[[RunCfg, pathlib.Path], Tracker]] = {"wandb": Wandb}
+
+
+def check(name: str) -> None:
+    """Is what a tracker needs installed?
+
+    Raises:
+        UserError: it is not.
+    """
+    if name and importlib.util.find_spec(name) is None:
+        raise UserError(f"--track {name} needs the package {name}, of the extra 'track': pip install 'mjx-nero[track]'")
+
+
+def tracker(run: RunCfg, folder: pathlib.Path) -> Callable[[], Tracker] | None:
+    """What makes the tracker of a run; None: it has none."""
+    return (lambda: TRACKERS[run.track](run, folder)) if run.track else None

@@ -1,0 +1,202 @@
+"""Domain randomization: (key, model, *, params) -> {field: (rows, values)}, applied in order at every reset.
+
+Fields are MuJoCo's (``mjModel``), their values as those of the model or of the term before. Which rows a term draws must not
+depend on the key. Constants that follow from masses (inverse weights, masses of subtrees) follow by themselves.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_nero.bounds import NonNegative, NonNegativeRange, PositiveRange
+from mjx_nero.types import Key, UserError
+
+Drawn = dict[str, tuple[np.ndarray, Array]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """What a term reads of the compiled model.
+
+    Attributes:
+        fields: arrays by MuJoCo's names; rows are bodies, geoms, degrees of freedom or actuators.
+        index: row by name, of each kind: ``body``, ``geom``, ``dof`` (by its joint) and ``actuator``.
+    """
+
+    fields: Mapping[str, Array]
+    index: Mapping[str, Mapping[str, int]]
+
+    def rows(self, kind: str, names: Sequence[str]) -> np.ndarray:
+        """The rows of some names.
+
+        Raises:
+            UserError: the model has no such name.
+        """
+        known = self.index[kind]
+        if unknown := [name for name in names if name not in known]:
+            raise UserError(f"the model has no {kind} {', '.join(map(repr, unknown))}: choose from {', '.join(known)}")
+        return np.array([known[name] for name in names])
+
+
+def mass(key: Key, model: Model, *, bodies: tuple[str, ...], scale: PositiveRange) -> Drawn:
+    """Multiplies masses, and inertias with them, by a uniform factor a body."""
+    rows = model.rows("body", bodies)
+    factor = _uniform(key, len(rows), scale)
+    inertia = model.fields["body_inertia"][rows] * factor[:, None]
+    return {"body_mass": (rows, model.fields["body_mass"][rows] * factor), "body_inertia": (rows, inertia)}
+
+
+def friction(
+    key: Key,
+    model: Model,
+    *,
+    geoms: tuple[str, ...],
+    slide: PositiveRange,
+    spin: PositiveRange | None = None,
+    roll: PositiveRange | None = None,
+) -> Drawn:
+    """Friction coefficients, for each geom its own: sliding uniform, spinning and rolling [m] log-uniform; None: as they are.
+
+    Where two geoms meet, the one of higher priority counts, else the larger coefficient.
+    """
+    rows, values = model.rows("geom", geoms), model.fields["geom_friction"]
+    columns = [_uniform(jax.random.fold_in(key, 0), len(rows), slide)]
+    for column, bounds in ((1, spin), (2, roll)):
+        k_column = jax.random.fold_in(key, column)
+        columns.append(values[rows, column] if bounds is None else jnp.exp(_uniform(k_column, len(rows), np.log(bounds))))
+    return {"geom_friction": (rows, jnp.stack(columns, axis=1))}
+
+
+def gains(
+    key: Key,
+    model: Model,
+    *,
+    actuators: tuple[str, ...],
+    stiffness: PositiveRange = (1.0, 1.0),
+    damping: PositiveRange = (1.0, 1.0),
+    effort: PositiveRange = (1.0, 1.0),
+) -> Drawn:
+    """Multiplies stiffness, damping and effort of position drives by uniform factors, for each drive its own."""
+    rows, (k_stiffness, k_damping) = model.rows("actuator", actuators), jax.random.split(key)
+    kp = _uniform(k_stiffness, len(rows), stiffness)
+    factors = jnp.stack([jnp.ones_like(kp), kp, _uniform(k_damping, len(rows), damping)], axis=1)
+    gain, bias = model.fields["actuator_gainprm"][rows], model.fields["actuator_biasprm"][rows]
+    drawn = {
+        "actuator_gainprm": (rows, gain.at[:, 0].multiply(kp)),
+        "actuator_biasprm": (rows, bias.at[:, :3].multiply(factors)),
+    }
+    if effort != (1.0, 1.0):
+        factor = _uniform(jax.random.fold_in(key, 2), len(rows), effort)
+        drawn["actuator_forcerange"] = (rows, model.fields["actuator_forcerange"][rows] * factor[:, None])
+    return drawn
+
+
+def joints(
+    key: Key,
+    model: Model,
+    *,
+    joints: tuple[str, ...],
+    armature: PositiveRange = (1.0, 1.0),
+    damping: PositiveRange = (1.0, 1.0),
+    friction: NonNegativeRange = (0.0, 0.0),
+) -> Drawn:
+    """Multiplies armature and damping of hinges and slides by uniform factors, for each joint its own.
+
+    Args:
+        armature, damping: factors.
+        friction: dry friction (MuJoCo's ``frictionloss``) as a share of the effort of the joint's drive; (0, 0): as it is.
+    """
+    rows, (k_armature, k_damping) = model.rows("dof", joints), jax.random.split(key)
+    factors = (_uniform(k_armature, len(rows), armature), _uniform(k_damping, len(rows), damping))
+    names = ("dof_armature", "dof_damping")
+    drawn = {name: (rows, model.fields[name][rows] * factor) for name, factor in zip(names, factors, strict=True)}
+    if friction != (0.0, 0.0):
+        effort = model.fields["actuator_forcerange"][model.rows("actuator", joints), 1]
+        drawn["dof_frictionloss"] = (rows, effort * _uniform(jax.random.fold_in(key, 2), len(rows), friction))
+    return drawn
+
+
+def center_of_mass(key: Key, model: Model, *, bodies: tuple[str, ...], offset: NonNegative) -> Drawn:
+    """Moves centres of mass by up to ``offset`` along each axis of the body [m]."""
+    rows = model.rows("body", bodies)
+    moved = jax.random.uniform(key, (len(rows), 3), minval=-offset, maxval=offset)
+    return {"body_ipos": (rows, model.fields["body_ipos"][rows] + moved)}
+
+
+def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) -> Drawn:
+    """Multiplies an object's lengths by one uniform factor; its mass stays, its inertia follows."""
+    sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # a can has one
+    geoms, body = model.rows("geom", (object, *sides)), model.rows("body", (object,))
+    fields, (factor,) = model.fields, _uniform(key, 1, scale)
+    return {
+        "geom_size": (geoms, fields["geom_size"][geoms] * factor),
+        "geom_rbound": (geoms, fields["geom_rbound"][geoms] * factor),
+        "body_inertia": (body, fields["body_inertia"][body] * factor**2),
+    }
+
+
+def color(key: Key, model: Model, *, geoms: tuple[str, ...]) -> Drawn:
+    """A colour for each geom, any but green, which is the goal's; for pictures."""
+    rows = model.rows("geom", geoms)
+    hue = jax.random.uniform(key, (len(rows), 1), minval=0.55, maxval=1.12)  # of a turn: from blue by red to orange
+    # Each channel is at its full value within a sixth of a turn of its own hue, and at its least beyond a third.
+    far = jnp.abs(jnp.mod(hue - jnp.array([0.0, 1.0, 2.0]) / 3 + 0.5, 1.0) - 0.5)
+    rgb = 0.2 + 0.65 * jnp.clip(2.0 - 6.0 * far, 0.0, 1.0)
+    return {"geom_rgba": (rows, jnp.concatenate([rgb, jnp.ones_like(hue)], axis=1))}
+
+
+def gravity_compensation(key: Key, model: Model, *, bodies: tuple[str, ...], scale: NonNegativeRange) -> Drawn:
+    """Multiplies the shares of the bodies' weights that the drives carry by uniform factors, for each body its own."""
+    rows = model.rows("body", bodies)
+    return {"body_gravcomp": (rows, model.fields["body_gravcomp"][rows] * _uniform(key, len(rows), scale))}
+
+
+def encoder_bias(key: Key, model: Model, *, actuators: tuple[str, ...], bias: NonNegative) -> Drawn:
+    """Encoders read up to ``bias`` beside the joints' positions [rad or m]: the drives pull the readings, not the joints, to the
+    targets. ``View.encoder_bias`` is what was drawn, ``sensors.Encoders`` what observations make of it. Comes after ``gains``."""
+    rows = model.rows("actuator", actuators)
+    drawn = jax.random.uniform(key, (len(rows),), minval=-bias, maxval=bias)
+    stiffness, terms = model.fields["actuator_gainprm"][rows, 0], model.fields["actuator_biasprm"][rows]
+    return {"actuator_biasprm": (rows, terms.at[:, 0].set(-stiffness * drawn))}
+
+
+def drives(
+    key: Key,
+    model: Model,
+    *,
+    joints: tuple[str, ...],
+    stiffness: tuple[PositiveRange, ...],
+    damping: tuple[PositiveRange, ...],
+    armature: tuple[PositiveRange, ...],
+    friction: tuple[NonNegativeRange, ...],
+) -> Drawn:
+    """Parameters of position drives and their joints themselves, uniform, a range a joint: what ``identify`` writes.
+
+    Args:
+        stiffness: [N m/rad or N/m].
+        damping: [N m s/rad or N s/m], of drive and joint together.
+        armature: [kg m2 or kg].
+        friction: dry friction [N m or N].
+    """
+    actuators, dofs = model.rows("actuator", joints), model.rows("dof", joints)
+    draws = [
+        jax.random.uniform(jax.random.fold_in(key, i), (len(joints),), minval=np.array(part)[:, 0], maxval=np.array(part)[:, 1])
+        for i, part in enumerate((stiffness, damping, armature, friction))
+    ]
+    kp, kd = draws[:2]
+    gain, bias = model.fields["actuator_gainprm"][actuators], model.fields["actuator_biasprm"][actuators]
+    return {
+        "actuator_gainprm": (actuators, gain.at[:, 0].set(kp)),
+        "actuator_biasprm": (actuators, bias.at[:, 1].set(-kp).at[:, 2].set(-kd)),
+        "dof_damping": (dofs, jnp.zeros_like(kd)),
+        "dof_armature": (dofs, draws[2]),
+        "dof_frictionloss": (dofs, draws[3]),
+    }
+
+
+def _uniform(key: Key, n: int, bounds) -> Float[Array, " n"]:
+    return jax.random.uniform(key, (n,), minval=bounds[0], maxval=bounds[1])

@@ -1,0 +1,201 @@
+"""Towers: objects that belong at the goal, or onto one another; what the terms of ``place`` and ``stack`` have in common.
+
+``tower`` names them from the bottom up: ``("goal", "box")`` is a box at the goal, ``("blue", "red")`` the red one on the blue
+one, wherever that is. ``rise`` is from the centre of one object to that of the next one on it [m].
+
+An object *stands* while it is at its place, whoever holds it there, and those below it stand: ``within`` says how near that is,
+along the table, in height [m] and, at the goal, in angle [rad]. Rewards are sums over the objects that are to be moved, each from
+when those below it stand. What is paid for an object that is held is paid on while it stands, so nothing is lost by letting go of
+it there; for one that flies nothing is paid.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero import math
+from mjx_nero.bounds import NonNegative, Positive
+from mjx_nero.mdp.rewards import held
+from mjx_nero.types import View
+
+GOAL = "goal"  # at the bottom of a tower
+Within = tuple[Positive, Positive, Positive]
+Scalar = Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Level:
+    """An object that is to be moved: the way to its place [m], and whether those below it stand, and it, too."""
+
+    object: str
+    way: Float[Array, "3"]
+    due: Bool[Array, ""]
+    stands: Bool[Array, ""]
+
+
+def way(view: View, *, below: str, object: str, rise: float) -> Float[Array, "3"]:
+    """From the object to its place on the one ``below``, or at the goal [m]."""
+    place = view.goal_pos_w if below == GOAL else view.objects[below].pos_w + jnp.array([0.0, 0.0, rise])
+    return place - view.objects[object].pos_w
+
+
+def turn_to_goal(view: View, *, object: str) -> Float[Array, "3"]:
+    """The rotation vector that turns the object to the goal's orientation, in its own frame [rad]."""
+    return math.quat_log(math.quat_mul(math.quat_conj(view.objects[object].quat_w), view.goal_quat_w))
+
+
+def turn_to_object(view: View, *, object: str, down: tuple[float, float, float, float]) -> Float[Array, "3"]:
+    """The rotation vector that turns the hand, straight down where it is ``down``, to the object's orientation, in its own frame
+    [rad]."""
+    wanted = math.quat_mul(view.objects[object].quat_w, jnp.array(down))
+    return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), wanted))
+
+
+def _levels(view: View, tower: tuple[str, ...], rise: float, within: Within) -> Iterator[_Level]:
+    aside, height, angle = within
+    due = jnp.ones((), bool)
+    for below, object in zip(tower, tower[1:], strict=False):
+        to = way(view, below=below, object=object, rise=rise)
+        there = (jnp.linalg.norm(to[:2]) < aside) & (jnp.abs(to[2]) < height)
+        if below == GOAL:
+            there &= jnp.linalg.norm(turn_to_goal(view, object=object)) < angle
+        yield _Level(object, to, due, due & there)
+        due &= there
+
+
+# --- success
+
+
+def distance(view: View, *, tower: tuple[str, ...], rise: float) -> Scalar:
+    """Of the object that is farthest from its place [m]."""
+    pairs = zip(tower, tower[1:], strict=False)
+    return jnp.max(jnp.stack([jnp.linalg.norm(way(view, below=below, object=object, rise=rise)) for below, object in pairs]))
+
+
+def built(
+    view: View, *, tower: tuple[str, ...], rise: float, within: Within, max_speed: Positive, clearance: NonNegative
+) -> Bool[Array, ""]:
+    """All objects stand, are slower than ``max_speed`` [m/s], turn by less than ten of it [rad/s], and have been let go of: the
+    grasp point is at least ``clearance`` [m] from each."""
+    met = [level.stands for level in _levels(view, tower, rise, within)]
+    for name in tower:
+        if name == GOAL:
+            continue
+        seen = view.objects[name]
+        still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
+        met.append(still & (jnp.linalg.norm(view.ee_pos_w - seen.pos_w) > clearance))
+    return jnp.all(jnp.stack(met))
+
+
+# --- rewards
+
+
+def _sum(values: Iterable[Array]) -> Scalar:
+    return sum(values, start=jnp.zeros(()))
+
+
+def reached(view: View, *, tower: tuple[str, ...], rise: float, within: Within, std: Positive) -> Scalar:
+    """1 - tanh(distance from the grasp point to the object / std); 1 where it stands."""
+    near = {name: 1.0 - jnp.tanh(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / std) for name in tower[1:]}
+    levels = _levels(view, tower, rise, within)
+    return _sum(level.due * jnp.where(level.stands, 1.0, near[level.object]) for level in levels)
+
+
+def _carried(view: View, level: _Level, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
+    up = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=level.object)
+    return level.due & (up | level.stands)
+
+
+def carried(
+    view: View, *, tower: tuple[str, ...], rise: float, within: Within, minimal_height: float, grasp_radius: Positive
+) -> Scalar:
+    """1 while the object is held (see ``rewards.held``) or stands."""
+    levels = _levels(view, tower, rise, within)
+    return _sum(_carried(view, level, minimal_height, grasp_radius) for level in levels)
+
+
+def approached(
+    view: View,
+    *,
+    tower: tuple[str, ...],
+    rise: float,
+    within: Within,
+    minimal_height: float,
+    grasp_radius: Positive,
+    over: Positive,
+    std: Positive,
+) -> Scalar:
+    """1 - tanh(distance from the way to its place / std), while the object is held or stands.
+
+    The way comes down a cone of 45 degrees from ``over`` above the place [m]: straight to it would be through the side of what is
+    below. The distance is that along the table and that in height from the cone, together: 0 at the place alone.
+    """
+
+    def near(level: _Level) -> Scalar:
+        aside = jnp.linalg.norm(level.way[:2])
+        off = jnp.hypot(aside, level.way[2] + jnp.minimum(aside, over))
+        return _carried(view, level, minimal_height, grasp_radius) * (1.0 - jnp.tanh(off / std))
+
+    return _sum(near(level) for level in _levels(view, tower, rise, within))
+
+
+def aligned(
+    view: View,
+    *,
+    tower: tuple[str, ...],
+    rise: float,
+    within: Within,
+    minimal_height: float,
+    grasp_radius: Positive,
+    std: Positive,
+) -> Scalar:
+    """1 - tanh(angle of the lowest object from the goal's orientation / std), while it is held or stands."""
+    level = next(_levels(view, tower, rise, within))
+    angle = jnp.linalg.norm(turn_to_goal(view, object=level.object))
+    return _carried(view, level, minimal_height, grasp_radius) * (1.0 - jnp.tanh(angle / std))
+
+
+def standing(view: View, *, tower: tuple[str, ...], rise: float, within: Within) -> Scalar:
+    """1 while the object stands."""
+    return _sum(level.stands for level in _levels(view, tower, rise, within))
+
+
+def _away(view: View, name: str, clearance: float) -> Scalar:
+    return jnp.minimum(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / clearance, 1.0)
+
+
+def opened(
+    view: View,
+    *,
+    tower: tuple[str, ...],
+    rise: float,
+    within: Within,
+    open: tuple[float, ...],
+    close: tuple[float, ...],
+    clearance: Positive,
+) -> Scalar:
+    """How far the fingers are opened while the object stands, from 0 to 1; or how far they are from it (see ``left``), if that is
+    more: they may have work elsewhere.
+
+    Args:
+        open, close: positions of the gripper's joints, the last of all [rad or m].
+    """
+    fingers, opens, closes = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(close)
+    share = jnp.clip(jnp.mean((fingers - closes) / (opens - closes)), 0.0, 1.0)
+    levels = _levels(view, tower, rise, within)
+    return _sum(level.stands * jnp.maximum(share, _away(view, level.object, clearance)) for level in levels)
+
+
+def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
+    """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1."""
+    return _sum(level.stands * _away(view, level.object, clearance) for level in _levels(view, tower, rise, within))
+
+
+def completed(
+    view: View, *, tower: tuple[str, ...], rise: float, within: Within, max_speed: Positive, clearance: NonNegative
+) -> Scalar:
+    """1 while all is as it should be (see ``built``)."""
+    done = built(view, tower=tower, rise=rise, within=within, max_speed=max_speed, clearance=clearance)
+    return done.astype(jnp.float32)

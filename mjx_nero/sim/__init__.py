@@ -1,0 +1,1 @@
+"""Robots, scenes, kinematics, physics and pictures: what MuJoCo knows."""

@@ -1,0 +1,133 @@
+"""What can touch what, and the contacts and constraint rows that this needs at worst."""
+
+import dataclasses
+import itertools
+
+import mujoco
+import numpy as np
+
+from mjx_nero.sim import scene
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+
+# The most contacts that MuJoCo and MJX-Warp find between two shapes; a pair that is not listed goes by their general convex
+# routine, which gives 4.
+_MOST = {
+    "plane": {"sphere": 1, "ellipsoid": 1, "capsule": 2, "cylinder": 4, "box": 4},
+    "sphere": {"sphere": 1, "capsule": 1, "ellipsoid": 1, "cylinder": 1, "box": 1, "mesh": 1},
+    "capsule": {"capsule": 2, "box": 2},
+    "box": {"box": 8},
+    "hfield": dict.fromkeys(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), 50),
+}
+_CONVEX = 4
+# Steps of the solver's line search where things are gripped, MuJoCo's default. With fewer the solver may end, once in hundreds of
+# steps with two pads flat on a cube, with a force that throws it across the room.
+_LINE_SEARCH = 50
+_EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two geoms that can meet: the most contacts that their shapes make, and the constraint rows of all those."""
+
+    first: str
+    second: str
+    shapes: str
+    contacts: int
+    condim: int
+    rows: int
+
+
+def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
+    """The pairs of geoms that MuJoCo lets meet.
+
+    Explicit pairs, and those whose contact bits match: unless of one body, of a body and its parent, or of excluded bodies.
+    """
+    explicit = {(int(a), int(b)): int(d) for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)}
+    excluded = {(int(s) >> 16, int(s) & 0xFFFF) for s in model.exclude_signature}
+    weld, pairs = model.body_weldid, []
+    parents = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    for a, b in itertools.combinations(range(model.ngeom), 2):
+        if (a, b) in explicit or (b, a) in explicit:
+            continue
+        bodies = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+        wa, wb = (int(weld[body]) for body in bodies)
+        related = wa and wb and (weld[model.body_parentid[wa]] == wb or weld[model.body_parentid[wb]] == wa)
+        if wa == wb or (parents and related) or bodies in excluded or bodies[::-1] in excluded:
+            continue
+        if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
+            pairs.append((a, b, _condim(model, a, b)))
+    pairs += [(a, b, dim) for (a, b), dim in explicit.items()]
+    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    return tuple(_pair(model, a, b, dim, elliptic) for a, b, dim in pairs)
+
+
+def constraint_rows(model: mujoco.MjModel) -> dict[str, int]:
+    """Constraint rows at worst, by kind: all contacts made, every joint at a limit."""
+    kinds = [mujoco.mjtEq(kind).name.removeprefix("mjEQ_") for kind in model.eq_type]
+    return {
+        "contacts": sum(pair.rows for pair in contact_pairs(model)),
+        "joint limits": int(np.sum(model.jnt_limited != 0) + np.sum(model.tendon_limited != 0)),
+        "joint friction": int(np.sum(model.dof_frictionloss > 0) + np.sum(model.tendon_frictionloss > 0)),
+        "equalities": sum(_EQUALITY_ROWS.get(kind, 1) for kind in kinds),
+    }
+
+
+def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
+    """``sim`` for the worst case of a robot in a scene, MJX-Warp's buffers and the line search: what an imported robot gets, of
+    which nobody has counted how many contacts its work makes."""
+    model = scene.build(robot, objects, sim, visuals=False)
+    contacts = sum(pair.contacts for pair in contact_pairs(model))
+    rows = sum(constraint_rows(model).values())
+    return _of_size(sim, objects, contacts, rows)
+
+
+def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
+    """``sim`` with MJX-Warp's buffers for a scene of several objects, not all of which can touch all others at once.
+
+    Each lies on the table, each of the robot's geoms touches the table and one object, and every other object one more; always
+    those that make the most of it. What is lost beyond that is counted (see ``Physics``).
+    """
+    model = scene.build(robot, objects, sim, visuals=False)
+    of_object = {geom: _body(model, geom) for geom in range(model.ngeom) if _body(model, geom) in objects.objects}
+    names = {_geom(model, geom): body for geom, body in of_object.items()}
+    pairs, least = contact_pairs(model), constraint_rows(model)
+    at_table = [pair for pair in pairs if "table" in (pair.first, pair.second)]
+    between = [pair for pair in pairs if pair.first in names and pair.second in names]
+    rest = [pair for pair in pairs if pair not in at_table and pair not in between]
+    hand = {name for pair in rest for name in (pair.first, pair.second) if name not in names}
+
+    def most(count: str) -> int:
+        each = [max(getattr(pair, count) for pair in rest if geom in (pair.first, pair.second)) for geom in hand]
+        others = sorted((getattr(pair, count) for pair in between), reverse=True)[: len(objects.objects) // 2]
+        return sum(getattr(pair, count) for pair in at_table) + sum(each) + sum(others)
+
+    rows = most("rows") + sum(least.values()) - least["contacts"]
+    return _of_size(sim, objects, most("contacts"), rows)
+
+
+def _of_size(sim: SimCfg, scene: SceneCfg, contacts: int, rows: int) -> SimCfg:
+    search = max(sim.ls_iterations, _LINE_SEARCH if scene.objects else 0)
+    return dataclasses.replace(sim, contacts_per_env=max(contacts, 1), constraints_per_env=max(rows, 1), ls_iterations=search)
+
+
+def _body(model: mujoco.MjModel, geom: int) -> str:
+    return model.body(model.geom_bodyid[geom]).name
+
+
+def _condim(model: mujoco.MjModel, a: int, b: int) -> int:
+    """The higher priority's, else the larger."""
+    (pa, pb), (da, db) = model.geom_priority[[a, b]], model.geom_condim[[a, b]]
+    return int(max(da, db) if pa == pb else da if pa > pb else db)
+
+
+def _pair(model: mujoco.MjModel, a: int, b: int, condim: int, elliptic: bool) -> Pair:
+    a, b = sorted((a, b), key=lambda g: int(model.geom_type[g]))  # plane, height field, sphere, capsule, ..., as _MOST has them
+    kinds = [mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower() for g in (a, b)]
+    contacts = _MOST.get(kinds[0], {}).get(kinds[1], _CONVEX)
+    each = condim if elliptic else max(1, 2 * (condim - 1))
+    return Pair(_geom(model, a), _geom(model, b), ", ".join(kinds), contacts, condim, contacts * each)
+
+
+def _geom(model: mujoco.MjModel, geom: int) -> str:
+    return model.geom(geom).name or f"{model.body(model.geom_bodyid[geom]).name}'s geom {geom}"

@@ -1,0 +1,187 @@
+"""Model fields that differ from world to world: drawn by the terms of ``mdp.randomization``, and what follows from them."""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array
+
+from mjx_nero.mdp.randomization import Drawn, Model
+from mjx_nero.types import Key, UserError
+
+# What may be drawn: all backends read it afresh at every step.
+DRAWABLE = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_gravcomp",
+    "geom_size",
+    "geom_rbound",
+    "geom_friction",
+    "geom_rgba",
+    "dof_armature",
+    "dof_damping",
+    "dof_frictionloss",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+)
+Fields = dict[str, Array]
+
+
+class Randomization:
+    """Draws the fields of one world.
+
+    Args:
+        model: compiled scene.
+        terms: by name, each ``(key, model) -> {field: (rows, values)}``.
+
+    Attributes:
+        names: of the fields that differ from world to world.
+
+    Raises:
+        UserError: a term names what is not there, or draws a field that cannot differ.
+    """
+
+    def __init__(self, model: mujoco.MjModel, terms: Mapping[str, Callable[[Key, Model], Drawn]]):
+        self._terms = terms
+        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in DRAWABLE}
+        hinges = {model.joint(j).name: int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] >= 2}
+        self._index = {
+            "body": {model.body(i).name: i for i in range(1, model.nbody)},
+            "geom": {model.geom(i).name: i for i in range(model.ngeom)},
+            "dof": hinges,
+            "actuator": {model.actuator(i).name: i for i in range(model.nu)},
+        }
+        rows: dict[str, set[int]] = {}
+        for name, term in terms.items():
+            for field, (drawn, _) in term(jax.random.PRNGKey(0), self._model({})).items():
+                if field not in DRAWABLE:
+                    raise UserError(f"randomization.{name} draws {field}: only {', '.join(DRAWABLE)} may differ")
+                rows.setdefault(field, set()).update(map(int, drawn))
+        _make_room(model, rows)
+        bodies = rows.get("body_mass", set()) | rows.get("body_inertia", set()) | rows.get("body_ipos", set())
+        trees = {int(model.body_treeid[b]) for b in bodies} | {int(model.dof_treeid[d]) for d in rows.get("dof_armature", ())}
+        self._trees = [_Tree(model, tree) for tree in sorted(trees - {-1})]
+        self._derived = {name: np.array(getattr(model, name), np.float32) for name in _DERIVED} if trees else {}
+        self.names = tuple(rows) + tuple(self._derived)
+
+    def __call__(self, key: Key) -> Fields:
+        """The fields of one world; empty without terms."""
+        drawn: Fields = {}
+        for i, term in enumerate(self._terms.values()):
+            for field, (rows, values) in term(jax.random.fold_in(key, i), self._model(drawn)).items():
+                drawn[field] = drawn.get(field, jnp.asarray(self._nominal[field])).at[rows].set(values)
+        now: Fields = {**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}
+        derived = {name: jnp.asarray(value) for name, value in self._derived.items()}
+        for tree in self._trees:
+            for name, (rows, values) in tree(now, moved="body_ipos" in drawn).items():
+                derived[name] = derived[name].at[rows].set(values)
+        if derived:
+            derived["body_subtreemass"] = derived["body_subtreemass"].at[0].set(jnp.sum(now["body_mass"]))
+        return {**drawn, **derived}
+
+    def _model(self, drawn: Fields) -> Model:
+        return Model({**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}, self._index)
+
+
+def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:
+    """Prepares the model for what MuJoCo decides when it is compiled, and a drawn field could not change any more.
+
+    Raises:
+        UserError: that cannot be.
+    """
+    frictions, bodies, geoms = (sorted(rows.get(name, ())) for name in ("dof_frictionloss", "body_ipos", "geom_size"))
+    model.dof_frictionloss[frictions] = np.maximum(model.dof_frictionloss[frictions], 1e-9)  # without any there is no constraint
+    if "body_gravcomp" in rows and not model.ngravcomp:
+        raise UserError("randomization draws body_gravcomp: this robot has no gravity compensation (robot.gravity_compensation)")
+    for body in bodies:  # frames that are the same are not computed apart
+        geoms_too = model.geom_sameframe[model.geom_bodyid == body] == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA
+        if model.body_sameframe[body] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY or geoms_too.any():
+            name = model.body(body).name
+            raise UserError(
+                f"randomization draws body_ipos of {name!r}: its centre of mass is its origin or its shape's, and stays"
+            )
+    for geom in geoms:  # bounding boxes sort out what cannot touch: large enough for twice the size
+        model.geom_aabb[geom, 3:] *= 2
+        body = model.geom_bodyid[geom]
+        nodes = slice(model.body_bvhadr[body], model.body_bvhadr[body] + model.body_bvhnum[body])
+        model.bvh_aabb[nodes, 3:] *= 2
+
+
+# What follows from masses, inertias and armatures. MuJoCo computes it when a model is compiled (mj_setConst), at ``qpos0``.
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0")
+
+
+class _Tree:
+    """The constants of one kinematic tree, as functions of its masses, inertias and armatures.
+
+    With the Jacobians of the bodies' centres of mass, J = (Jv, Jr), at ``qpos0``, and M = sum Jv' m Jv + Jr' I Jr + armature:
+    a degree of freedom has the inverse weight (M^-1)_ii, a body the means over the axes of J M^-1 J'; those of a ball or a free
+    joint are means, too.
+    """
+
+    def __init__(self, model: mujoco.MjModel, tree: int):
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        self._bodies, self._dofs = np.flatnonzero(model.body_treeid == tree), np.flatnonzero(model.dof_treeid == tree)
+        shape = (len(self._bodies), 3, len(self._dofs))
+        self._linear, self._turning, self._spin = (np.zeros(shape, np.float32) for _ in range(3))
+        self._frames = data.xmat[self._bodies].reshape(-1, 3, 3).astype(np.float32)
+        self._centers = model.body_ipos[self._bodies].astype(np.float32)
+        for i, body in enumerate(self._bodies):
+            linear, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_jacBodyCom(model, data, linear, turning, body)
+            self._linear[i] = linear[:, self._dofs]
+            self._spin[i] = turning[:, self._dofs]
+            self._turning[i] = data.ximat[body].reshape(3, 3).T @ turning[:, self._dofs]  # about the principal axes
+        below = [[_carries(model, b, c) for c in self._bodies.tolist()] for b in self._bodies.tolist()]
+        self._below = np.array(below, np.float32)
+        # mean[i, j]: the share of j's inverse weight in i's
+        self._mean = np.eye(len(self._dofs), dtype=np.float32)
+        for joint in np.flatnonzero(np.isin(model.jnt_bodyid, self._bodies)):
+            at = model.jnt_dofadr[joint] - self._dofs[0]
+            for first in {mujoco.mjtJoint.mjJNT_FREE: (at, at + 3), mujoco.mjtJoint.mjJNT_BALL: (at,)}.get(
+                model.jnt_type[joint], ()
+            ):
+                self._mean[first : first + 3, first : first + 3] = 1 / 3
+        free = len(self._bodies) == 1 and model.jnt_type[model.body_jntadr[self._bodies[0]]] == mujoco.mjtJoint.mjJNT_FREE
+        self._alone = bool(free and not model.body_ipos[self._bodies[0]].any() and not model.dof_armature[self._dofs].any())
+
+    def __call__(self, fields: Mapping[str, Array], moved: bool = False) -> Drawn:
+        """
+        Args:
+            moved: the centres of mass are not where they were.
+        """
+        linear: Array = jnp.asarray(self._linear)
+        if moved:
+            way = jnp.einsum("bij,bj->bi", self._frames, fields["body_ipos"][self._bodies] - self._centers)
+            linear = linear + jnp.cross(self._spin, way[:, :, None], axis=1)
+        mass, inertia = fields["body_mass"][self._bodies], fields["body_inertia"][self._bodies]
+        armature = fields["dof_armature"][self._dofs]
+        matrix = jnp.einsum("b,bki,bkj->ij", mass, linear, linear) + jnp.diag(armature)
+        matrix += jnp.einsum("bk,bki,bkj->ij", inertia, self._turning, self._turning)
+        if self._alone:  # a free body: nothing to invert, which on a GPU would take longer than all the rest
+            body = jnp.stack([1 / mass, jnp.mean(1 / inertia, axis=1)], axis=1)
+            weight = jnp.repeat(body[0], 3)
+        else:
+            scale = jax.lax.rsqrt(jnp.diag(matrix))  # of very different sizes: metres and radians, cubes and arms
+            inverse = jnp.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
+            weight = jnp.asarray(self._mean) @ jnp.diag(inverse)
+            body = jnp.stack([jnp.einsum("bki,ij,bkj->b", part, inverse, part) / 3 for part in (linear, self._turning)], axis=1)
+        return {
+            "body_subtreemass": (self._bodies, jnp.asarray(self._below) @ mass),
+            "body_invweight0": (self._bodies, body),
+            "dof_invweight0": (self._dofs, weight),
+            "dof_M0": (self._dofs, jnp.diag(matrix)),
+        }
+
+
+def _carries(model: mujoco.MjModel, body: int, other: int) -> bool:
+    """Whether ``other`` is the body or hangs on it."""
+    while other > body:  # parents come before what they carry
+        other = int(model.body_parentid[other])
+    return other == body

@@ -1,0 +1,228 @@
+"""MuJoCo Warp, the engine of MJX-Warp, on an NVIDIA GPU.
+
+MJX's own wrapper hands all of MuJoCo's data, some hundred arrays, back and forth at every physics step. Here they stay where
+Warp made them: in go the few arrays of ``types.Sim``, then one CUDA graph runs all physics steps of a control step, and out
+come the same few. What else the engine keeps is recomputed from them, so the function is pure.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_nero.sim import touch
+from mjx_nero.sim.physics import Footprint, fusion, newton, possible
+from mjx_nero.sim.scene import SimCfg
+from mjx_nero.types import Sim
+
+# MuJoCo Warp's OverflowType bits that mean lost contacts or constraint rows; the others report unconverged solver iterations.
+_LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
+
+
+class WarpPhysics:
+    """See ``physics.Physics``. Buffers are made at the first step on a device with a batch size, and kept."""
+
+    def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
+        self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
+        # dof_M0 is of MuJoCo's C library alone.
+        self._fields = {name: np.shape(getattr(model, name)) for name in fields if name != "dof_M0"}
+        self._touch = touch.reader(model)
+        self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
+        self._batched = self._as_jax()
+        # Now, and not when somebody asks: the current device is the process's, not a thread's, and ``prepare`` may run in one.
+        self._bytes = self._bytes_per_env()
+
+    def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
+        """One control step; any leading axes are environments."""
+        # The drawn fields travel with the targets: without any these go alone.
+        lead = sim.qpos.shape[:-1]
+        drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
+        given = jnp.concatenate([jnp.broadcast_to(ctrl, (*lead, ctrl.shape[-1])), *drawn], axis=-1) if drawn else ctrl
+        qpos, qvel, warmstart, overflow, force = self._batched(sim.qpos, sim.qvel, given, sim.warmstart)
+        time = sim.time + self.decimation * self._cfg.dt
+        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
+        if self._touch:
+            after = dataclasses.replace(after, touch=force)
+        return after, ((overflow & _LOST) != 0).astype(jnp.float32)
+
+    def _as_jax(self) -> Callable:
+        import warp as wp
+
+        # Called by XLA on the stream that it computes on. No graph mode of Warp's: it would capture these copies for every set of
+        # addresses that XLA comes up with, where one graph of the steps between them does.
+        def control_step(qpos, qvel, given, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out, force_out):
+            data, drawn, run, strongest, _ = self._get(qpos.shape[0])
+            wp.copy(data.qpos, qpos)
+            wp.copy(data.qvel, qvel)
+            if drawn is None:
+                wp.copy(data.ctrl, given)
+            else:
+                wp.copy(data.ctrl, given[:, : data.ctrl.shape[1]])
+                wp.copy(drawn, given[:, data.ctrl.shape[1] :])
+            wp.copy(data.qacc_warmstart, warmstart)
+            run()
+            wp.copy(qpos_out, data.qpos)
+            wp.copy(qvel_out, data.qvel)
+            wp.copy(warmstart_out, data.qacc_warmstart)
+            wp.copy(overflow_out, data.overflow)
+            if strongest is not None:  # otherwise nobody reads it
+                wp.copy(force_out, strongest)
+
+        names = ("qpos", "qvel", "given", "warmstart", "qpos_out", "qvel_out", "warmstart_out")
+        control_step.__annotations__ = dict.fromkeys(names, wp.array(dtype=float, ndim=2)) | {
+            "overflow_out": wp.array(dtype=int),
+            "force_out": wp.array(dtype=float),
+        }
+        call = wp.jax_callable(control_step, num_outputs=5, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
+        nq, nv = self.model.nq, self.model.nv
+
+        @jax.custom_batching.custom_vmap
+        def batched(*inputs):
+            lead = inputs[0].shape[:-1]
+            inputs = tuple(x.reshape(-1, x.shape[-1]) for x in inputs)
+            n = inputs[0].shape[0]
+            sizes = {"qpos_out": (n, nq), "qvel_out": (n, nv), "warmstart_out": (n, nv), "overflow_out": (n,), "force_out": (n,)}
+            return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
+
+        @batched.def_vmap
+        def _(size, is_batched, *inputs):
+            pairs = zip(inputs, is_batched, strict=True)
+            inputs = tuple(x if there else jnp.broadcast_to(x, (size, *x.shape)) for x, there in pairs)
+            return batched(*inputs), (True,) * 5
+
+        return batched
+
+    @property
+    def compiler_options(self) -> dict[str, str | bool]:
+        """See ``physics.fusion``."""
+        return fusion()
+
+    def memory(self, num_devices: int = 1) -> Footprint:
+        """MuJoCo Warp's data."""
+        import warp as wp
+
+        free = [wp.get_cuda_device(i).free_memory for i in range(num_devices)] if wp.is_cuda_available() else [float("inf")]
+        return Footprint(outside=self._bytes, free=min(free))
+
+    def _bytes_per_env(self) -> int:
+        """Size of MuJoCo Warp's data of one environment."""
+        import warp as wp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        def size(value) -> int:
+            if isinstance(value, wp.array):
+                return value.capacity
+            return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
+
+        cfg = self._cfg
+        with wp.ScopedDevice("cpu"):
+            sizes = {"naconmax": cfg.contacts_per_env, "njmax": cfg.constraints_per_env}
+            fields = 4 * sum(math.prod(shape) for shape in self._fields.values())
+            return size(mujoco_warp.make_data(self.model, 1, **sizes)) + fields
+
+    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
+        """See ``physics.Physics``."""
+        import warp as wp
+
+        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
+            with wp.ScopedDevice(device):
+                self._get(num_envs)
+                wp.synchronize_device(device)
+
+    def _get(self, n: int) -> tuple[Any, Any, Callable[[], None], Any, Any]:
+        import warp as wp
+
+        key = (str(wp.get_device()), n)
+        if key not in self._made:
+            self._made[key] = self._make(n)
+        return self._made[key]
+
+    def _make(self, n: int) -> tuple[Any, Any, Callable[[], None], Any, Any]:
+        """MuJoCo Warp's data for ``n`` environments on the current device, their drawn fields as one array, what steps them,
+        the strongest contacts that count (None: none do), and what has to be kept."""
+        import warp as wp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        cfg = self._cfg
+        with possible("MuJoCo Warp"):
+            model = mujoco_warp.put_model(self.model)
+        drawn = self._world_fields(model, n)
+        model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
+        data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
+        solve, (strongest, sense) = newton.make(model, data), self._sense(model, data)
+
+        def run():
+            data.overflow.zero_()
+            if strongest is not None:
+                strongest.zero_()
+            for _ in range(self.decimation):
+                mujoco_warp.fwd_position(model, data, factorize=False)
+                mujoco_warp.fwd_velocity(model, data)
+                mujoco_warp.fwd_actuation(model, data)
+                mujoco_warp.fwd_acceleration(model, data, factorize=True)
+                solve()
+                sense()
+                mujoco_warp.implicit(model, data)
+
+        if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
+            return data, drawn, run, strongest, run
+        _load_kernels()
+        run()  # loads those made for this model, which cannot be done while a graph is captured
+        with wp.ScopedCapture() as capture:
+            run()
+        return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
+
+    def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
+        """The strongest contact that counts of each world [N], and what brings it up to date after the solver."""
+        import warp as wp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        if self._touch is None:
+            return None, lambda: None
+        strongest: Any = wp.zeros(data.nworld, dtype=float)
+        at: Any = wp.array(self._touch.addresses, dtype=int)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def keep(values: wp.array2d(dtype=float), at: wp.array(dtype=int), strongest: wp.array(dtype=float)):  # type: ignore
+            world = wp.tid()
+            for i in range(at.shape[0]):
+                force = wp.vec3(values[world, at[i]], values[world, at[i] + 1], values[world, at[i] + 2])
+                strongest[world] = wp.max(strongest[world], wp.length(force))
+
+        def sense():
+            mujoco_warp.sensor_acc(model, data, skip_rne_postconstraint=True)
+            wp.launch(keep, dim=data.nworld, inputs=[data.sensordata, at, strongest])
+
+        return strongest, sense
+
+    def _world_fields(self, model: Any, n: int) -> Any:
+        """Puts the drawn fields in the model's place, one row a world: views of one array [n, numbers], None without any."""
+        import warp as wp
+
+        sizes = [math.prod(shape) for shape in self._fields.values()]
+        if not sizes:
+            return None
+        drawn, at = wp.zeros((n, sum(sizes)), dtype=float), 0
+        for name, size in zip(self._fields, sizes, strict=True):
+            kind, rows = getattr(model, name).dtype, self._fields[name][0]
+            row = drawn.strides[0]
+            item = drawn.strides[1] * size // rows
+            view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=(n, rows), strides=(row, item))
+            setattr(model, name, view)
+            at += size
+        return drawn
+
+
+def _load_kernels() -> None:
+    """Compiles the parts of MuJoCo Warp that every model needs side by side; a first run would do it one after another."""
+    import warp as wp
+    from mujoco.mjx.third_party.mujoco_warp._src import constraint, derivative, forward, passive, smooth, support
+
+    parts = (constraint, derivative, forward, passive, smooth, support)
+    wp.force_load(wp.get_device(), [wp.get_module(part.__name__) for part in parts], max_workers=len(parts))

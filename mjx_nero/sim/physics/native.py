@@ -1,0 +1,134 @@
+"""MuJoCo's C library on CPU threads: by far the fastest physics without an accelerator, and the sim-to-sim check of a policy.
+
+JAX calls it back on the host, once a control step, with all environments of a batch. It computes in double precision.
+"""
+
+import contextlib
+import copy
+import dataclasses
+import math
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Float32
+from mujoco import rollout
+
+from mjx_nero.sim import touch
+from mjx_nero.sim.physics import Footprint, fusion
+from mjx_nero.sim.scene import SimCfg
+from mjx_nero.types import Sim
+
+# One batch at a time: it has all the cores to itself, and its work arrays.
+_lock = threading.Lock()
+
+
+class NativePhysics:
+    """See ``physics.Physics``. Work arrays are made at the first step with a batch size, and kept.
+
+    The C library does not tell the solver's last acceleration, so ``Sim.warmstart`` is the change of velocity over the last
+    physics step instead. It is a guess to start from, and a function of the state as the rest.
+    """
+
+    def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
+        self.model, self.decimation = model, cfg.decimation
+        self._period = cfg.decimation * cfg.dt
+        self._fields = {name: getattr(model, name).shape for name in fields}
+        self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu])
+        self._touch = touch.reader(model)
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._data = [mujoco.MjData(model) for _ in range(threads)]
+        self._rollout = rollout.Rollout(nthread=threads).rollout
+        self._made: dict[int, tuple[np.ndarray, ...]] = {}  # by number of environments
+
+    def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
+        """One control step; any leading axes are environments. Where MuJoCo gives up, the state is NaN."""
+        drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
+        packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
+        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + bool(self._touch)), jnp.float32)
+        after = jax.pure_callback(self._step, shape, packed, vmap_method="broadcast_all")
+        qpos, qvel, warmstart, force = jnp.split(after, self._sizes[:3], axis=-1)
+        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=sim.time + self._period)
+        if self._touch:
+            after = dataclasses.replace(after, touch=force[..., 0])
+        return after, jnp.zeros(packed.shape[:-1])
+
+    def _step(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
+        """(qpos, qvel, warmstart, ctrl, fields) -> the first three after the step, and the touch. No JAX in here: it would wait
+        for itself."""
+        n, (nq, nqv, nqvv, end) = math.prod(packed.shape[:-1]), self._sizes
+        given, fields = np.split(np.asarray(packed).reshape(n, -1), [end], axis=1)
+        after = np.empty((n, nqvv + bool(self._touch)), np.float32)
+        with _lock, _quiet():
+            if n not in self._made:
+                self._made[n] = self._make(n)
+            models, present, start, warmstart, ctrl, states, sensors = self._made[n]
+            self._set(models, present, fields)
+            start[:, 1:], warmstart[:], ctrl[:] = given[:, :nqv], given[:, nqv:nqvv], given[:, None, nqvv:]
+            self._rollout(
+                models,
+                self._data,
+                start,
+                ctrl,
+                nstep=self.decimation,
+                initial_warmstart=warmstart,
+                state=states,
+                sensordata=sensors,
+                skip_checks=True,
+            )
+            last, before = states[:, -1, 1:], states[:, -2, 1:] if self.decimation > 1 else start[:, 1:]
+            after[:, :nqv] = last
+            after[:, nqv:nqvv] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
+            if self._touch:
+                after[:, nqvv] = self._touch(sensors).max(axis=1)
+            # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time tells.
+            after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
+        return after.reshape(*packed.shape[:-1], -1)
+
+    def _set(self, models: Any, present: np.ndarray, fields: np.ndarray) -> None:
+        """Brings the models up to date where the fields have changed: at the starts of episodes."""
+        for i in np.flatnonzero((present != fields).any(axis=1)):
+            at = 0
+            for name, shape in self._fields.items():
+                size = math.prod(shape)
+                getattr(models[i], name)[:] = fields[i, at : at + size].reshape(shape)
+                at += size
+        present[:] = fields
+
+    @property
+    def compiler_options(self) -> dict[str, str | bool]:
+        """See ``physics.fusion``."""
+        return fusion()
+
+    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
+        """Nothing: the first step is as quick as any."""
+
+    def memory(self, num_devices: int = 1) -> Footprint:
+        """None of a device's."""
+        return Footprint()
+
+    def _make(self, n: int) -> tuple:
+        m, steps = self.model, self.decimation
+        state = 1 + m.nq + m.nv
+        start = np.ones((n, state))  # the clock starts at 1, so that one after a reset, from 0, differs
+        sensors = np.empty((n, steps, m.nsensordata))
+        # With drawn fields every environment has a model of its own, and those its fields that it has now; NaN: not yet set.
+        models = [copy.copy(m) for _ in range(n)] if self._fields else [m] * n
+        present = np.full((n, sum(map(math.prod, self._fields.values()))), np.nan, np.float32)
+        return models, present, start, np.empty((n, m.nv)), np.empty((n, steps, m.nu)), np.empty((n, steps, state)), sensors
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps MuJoCo from printing its warnings and writing them to a file; the environments count what came of them."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)

@@ -1,0 +1,67 @@
+"""MuJoCo's Newton solver for constraint forces, as one GPU kernel.
+
+MuJoCo Warp solves with a dozen kernels an iteration, each for all environments, until the slowest of them has converged: at
+thousands of environments that is most of a step that grasps. Here a block of 32 threads takes one environment from beginning to
+end, in shared memory. The problem is MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that
+minimise Gauss' cost and the constraints' cost, with elliptic or pyramidal friction cones), so the solution is, too.
+
+The source, ``newton.cu``, compiles for the CPU as well, with one thread for all 32: slow, for tests.
+"""
+
+import functools
+from collections.abc import Callable
+from importlib import resources
+from typing import Any
+
+import mujoco
+
+_SHARED_BYTES = 48 * 1024  # of a block, on every GPU that Warp supports
+
+
+@functools.cache
+def _solver() -> str:
+    return resources.files(__package__).joinpath("newton.cu").read_text()
+
+
+def make(model, data) -> Callable[[], None]:
+    """What puts the solution into ``data.qacc`` and ``data.efc.Ma``, all that MuJoCo Warp's integrators read of it; and where the
+    model has sensors, those of the contacts' forces into ``data.efc.force``.
+
+    Args:
+        model, data: MuJoCo Warp's.
+
+    Returns:
+        a function without arguments; MuJoCo Warp's own solver where the model is too large for this one.
+    """
+    import warp as wp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    nv, njmax = model.nv, data.njmax
+    size = 2 * nv * nv + njmax * nv + 5 * nv + 8 * njmax
+    if model.is_sparse or 4 * size > _SHARED_BYTES:
+        return lambda: mujoco_warp.solve(model, data)
+    numbers = {"NV": nv, "NJ": njmax, "SIZE": size, "ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)}
+    numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
+    source = "".join(f"constexpr int {name} = {value};\n" for name, value in numbers.items()) + _solver()
+    arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_smooth", "qacc_warmstart")}
+    arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
+    arrays |= {f"contact_{name}": getattr(data.contact, name) for name in ("friction", "dim", "efc_address")}
+    arrays |= {name: getattr(model, name) for name in ("M_rownnz", "M_rowadr", "M_colind")}
+    arrays |= {name: getattr(model.opt, name) for name in ("impratio_invsqrt", "tolerance", "ls_tolerance")}
+    arrays |= {"qacc": data.qacc, "solver_niter": data.solver_niter}
+    types: dict[str, Any] = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in arrays.items()}
+    Problem = wp.struct(type("Problem", (), {"__annotations__": {**types, "iterations": int, "ls_iterations": int}}))
+    problem = Problem()
+    for name, x in arrays.items():
+        setattr(problem, name, x)
+    problem.iterations, problem.ls_iterations = model.opt.iterations, model.opt.ls_iterations
+
+    @wp.func_native(source)
+    def solve(tid: int, problem: Problem): ...  # type: ignore[valid-type]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def newton(problem: Problem):  # type: ignore[valid-type]
+        solve(wp.tid(), problem)
+
+    threads = 32 if wp.get_device().is_cuda else 1
+    return lambda: wp.launch(newton, dim=data.nworld * threads, inputs=[problem], block_dim=threads)

@@ -1,0 +1,241 @@
+"""Pictures and videos with MuJoCo's own renderer."""
+
+import copy
+import dataclasses
+import math
+import pathlib
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import imageio.v2 as imageio
+import mujoco
+import numpy as np
+
+from mjx_nero import files
+from mjx_nero.errors import UserError
+from mjx_nero.sim.touch import OBSTACLE
+
+NO_GL = (
+    "no offscreen OpenGL here, so no pictures: install libegl1 (machines with a GPU) or libosmesa6 "
+    "(Debian and Ubuntu: apt-get install libosmesa6)"
+)
+_ENOUGH_S = 30.0  # for the drawing of a video
+# Width, height, samples a pixel and shadows' edge, the best first: OpenGL in software takes a tenth of a second and more a frame.
+_QUALITIES = ((1280, 720, 4, 4096), (960, 540, 0, 1024), (640, 360, 0, 1024))
+Looks = Mapping[str, np.ndarray]
+_APART = 1.5  # between robots that share a picture [m]
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoCfg:
+    """A video of episodes. What is None or 0 is chosen by how fast the machine draws: 1280 x 720 at 25 frames a second if it can.
+
+    Attributes:
+        size: width and height [pixels].
+        fps: frames a second.
+        envs: robots side by side in one picture; 1: episodes come one after another.
+        episodes: how many one after another, where ``envs`` is 1.
+    """
+
+    size: tuple[int, int] | None = None
+    fps: float = 0.0
+    envs: int = 1
+    in_turn: int = 3
+
+    @property
+    def episodes(self) -> int:
+        """How many have to be played."""
+        return self.envs if self.envs > 1 else self.in_turn
+
+
+class Renderer:
+    """Draws states of a model. A context manager.
+
+    Args:
+        width, height: pixels.
+        camera: one of the model's, or a free one.
+        samples: of a pixel's edge; None: as the model says.
+        shadows: pixels along a shadow map's side; None: as the model says.
+        envs: robots in one picture, at most.
+
+    Raises:
+        UserError: the machine cannot draw offscreen.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int = 640,
+        height: int = 480,
+        camera: str | mujoco.MjvCamera = "front",
+        samples: int | None = None,
+        shadows: int | None = None,
+        envs: int = 1,
+    ):
+        model = copy.copy(model)
+        screen, quality = model.vis.global_, model.vis.quality
+        screen.offwidth, screen.offheight = max(width, screen.offwidth), max(height, screen.offheight)
+        quality.offsamples = quality.offsamples if samples is None else samples
+        quality.shadowsize = quality.shadowsize if shadows is None else shadows
+        self._data, self._model, self._camera = mujoco.MjData(model), model, camera
+        self._option, self._hand = mujoco.MjvOption(), mujoco.MjvPerturb()
+        try:
+            self._renderer = mujoco.Renderer(model, height, width, max_geom=max(10_000, envs * (model.ngeom + 10)))
+        except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
+            raise UserError(NO_GL) from error
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._renderer.close()
+
+    def render(self, qpos: np.ndarray, goal: np.ndarray, looks: Looks = MappingProxyType({})) -> np.ndarray:
+        """One frame, uint8 [height, width, 3].
+
+        Args:
+            qpos: [nq].
+            goal: where the goal marker stands in the world [m] and how it is turned (wxyz), [7]; or [3], unturned. What follows
+                is of each obstacle position, orientation and edges (``ManipulationEnv.scenery``).
+            looks: [7] by object, size and colour (``ManipulationEnv.looks``); of the others, the model's.
+        """
+        self._forward(qpos, goal, looks)
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+    def render_all(self, qpos: np.ndarray, goals: np.ndarray, looks: Looks = MappingProxyType({})) -> np.ndarray:
+        """One frame of several robots, each at its own table, in rows; uint8 [height, width, 3].
+
+        Args:
+            qpos: [envs, nq]; goals: [envs, 3 or more]; looks: [envs, 7] by object.
+        """
+        columns = math.ceil(math.sqrt(len(qpos)))
+        rows = math.ceil(len(qpos) / columns)
+        scene = self._renderer.scene
+        for i, (at, goal) in enumerate(zip(qpos, goals, strict=True)):
+            self._forward(at, goal, {name: look[i] for name, look in looks.items()})
+            before = scene.ngeom if i else 0
+            if i == 0:
+                free = isinstance(self._camera, mujoco.MjvCamera)
+                self._renderer.update_scene(self._data, self._camera if free else self._overview(columns, rows))
+            else:
+                mujoco.mjv_addGeoms(self._model, self._data, self._option, self._hand, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+            x, y = i // columns - (rows - 1) / 2, i % columns - (columns - 1) / 2
+            for geom in scene.geoms[before : scene.ngeom]:
+                geom.pos[:2] += _APART * np.array([x, y])
+        for light in scene.lights[: scene.nlight]:  # far enough for all robots, too
+            light.pos[:] -= _APART * (max(columns, rows) - 1) * light.dir
+        return self._renderer.render()
+
+    def _forward(self, qpos: np.ndarray, goal: np.ndarray, looks: Looks) -> None:
+        for name, look in looks.items():
+            geom = self._model.geom(name)
+            geom.size[:], geom.rgba[:] = look[:3], look[3:]
+        self._data.qpos[:] = qpos
+        self._data.mocap_pos[0], self._data.mocap_quat[0] = goal[:3], goal[3:7] if len(goal) > 3 else (1, 0, 0, 0)
+        model = self._model
+        boxes = np.reshape(goal[7:], (-1, 10))
+        for geom, (x, y, z, *turn, a, b, c) in zip(np.flatnonzero(model.geom_contype & OBSTACLE), boxes, strict=False):
+            model.geom_pos[geom], model.geom_quat[geom], model.geom_size[geom] = (x, y, z), turn, (a / 2, b / 2, c / 2)
+        mujoco.mj_forward(self._model, self._data)
+
+    def _overview(self, columns: int, rows: int) -> mujoco.MjvCamera:
+        """From the front and above, far enough for all robots."""
+        camera = mujoco.MjvCamera()
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat = self._model.stat.center
+        camera.distance = 1.3 * self._model.stat.extent + 1.2 * _APART * (max(columns, rows) - 1)
+        camera.azimuth, camera.elevation = 138, -32
+        return camera
+
+
+def frames(model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, every: int = 1, **kwargs) -> list[np.ndarray]:
+    """Frames of recorded episodes, one after another.
+
+    Args:
+        qpos: [steps, episodes, nq]; goals: [steps, episodes, 3 or more], as in ``rollout.Episodes``.
+        every: render each ``every``-th step.
+        kwargs: of ``Renderer``.
+    """
+    with Renderer(model, **kwargs) as renderer:
+        steps, episodes = qpos.shape[:2]
+        return [renderer.render(qpos[t, k], goals[t, k]) for k in range(episodes) for t in range(0, steps, every)]
+
+
+def write_episodes(
+    path: pathlib.Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    goals: np.ndarray,
+    dt: float,
+    cfg: VideoCfg = VideoCfg(),
+    update: Callable[[int, int], None] = lambda done, total: None,
+    looks: Looks = MappingProxyType({}),
+) -> None:
+    """Writes recorded episodes as an MP4 in real time.
+
+    Args:
+        qpos: [steps, episodes, nq]; goals: [steps, episodes, 3 or more], as in ``rollout.Episodes``.
+        dt: between steps [s].
+        update: called with frames drawn and frames in all.
+        looks: [episodes, 7] by object.
+
+    Raises:
+        UserError: the machine cannot draw, or the path cannot be written.
+    """
+    together = cfg.envs > 1
+    shots = len(qpos) * (1 if together else qpos.shape[1])
+    width, height, samples, shadows, every = _quality(model, qpos, goals, dt, cfg, shots)
+
+    def pictures() -> Iterator[np.ndarray]:
+        total, done = math.ceil(len(qpos) / every) * shots // len(qpos), 0
+        with Renderer(model, width, height, samples=samples, shadows=shadows, envs=cfg.envs) as renderer:
+            for k in range(1 if together else qpos.shape[1]):
+                for t in range(0, len(qpos), every):
+                    if together:
+                        yield renderer.render_all(qpos[t], goals[t], looks)
+                    else:
+                        yield renderer.render(qpos[t, k], goals[t, k], {name: look[k] for name, look in looks.items()})
+                    done += 1
+                    update(done, total)
+
+    write_video(path, pictures(), fps=1 / (every * dt))
+
+
+def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> None:
+    """Writes an MP4; the file appears whole or not at all.
+
+    Raises:
+        UserError: the path cannot be written.
+    """
+    with files.whole(path) as part, warnings.catch_warnings():  # the encoder is a child process, and JAX warns of every fork
+        warnings.simplefilter("ignore", RuntimeWarning)
+        writer: Any = imageio.get_writer(part, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2)
+        with writer:
+            for image in images:
+                writer.append_data(image)
+
+
+def _quality(
+    model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, dt: float, cfg: VideoCfg, shots: int
+) -> tuple[int, int, int, int, int]:
+    """The best picture that the machine draws in time: width, height, samples, shadows, and each how many steps to draw one."""
+    every = max(1, round(1 / ((cfg.fps or 25) * dt)))
+    seconds = math.inf
+    for width, height, samples, shadows in _QUALITIES:
+        width, height = cfg.size or (width, height)
+        with Renderer(model, width, height, samples=samples, shadows=shadows, envs=cfg.envs) as renderer:
+            shot: Callable = renderer.render_all if cfg.envs > 1 else renderer.render
+            first = (qpos[0], goals[0]) if cfg.envs > 1 else (qpos[0, 0], goals[0, 0])
+            shot(*first)  # loads textures and shaders
+            begun = time.perf_counter()
+            shot(*first)
+            seconds = time.perf_counter() - begun
+        if seconds * shots / every <= _ENOUGH_S:
+            break
+    if not cfg.fps:
+        every = max(every, math.ceil(seconds * shots / _ENOUGH_S))
+    return width, height, samples, shadows, every

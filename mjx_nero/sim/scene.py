@@ -1,0 +1,333 @@
+"""Scene: a robot at a table with objects and a goal marker, as a compiled MuJoCo model."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from mjx_nero import config
+from mjx_nero.bounds import Count, NonNegative, Positive
+from mjx_nero.sim import robot_file, touch
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError
+
+# Shape -> MuJoCo's type, and what ``ObjectCfg.size`` says of it.
+_SHAPES = {
+    "box": (mujoco.mjtGeom.mjGEOM_BOX, "its three edges"),
+    "sphere": (mujoco.mjtGeom.mjGEOM_SPHERE, "its radius"),
+    "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, "its radius and the length between the centres of its ends"),
+    "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, "its radius and its length"),
+    "can": (mujoco.mjtGeom.mjGEOM_CYLINDER, "its radius and its length"),
+}
+# Contact bits: the table meets bit 1, objects bit 2; robot geoms have no type, so never meet one another. Objects meet by bit 4.
+_TABLE, _OBJECT, _OBJECTS = 1, 2, 4
+COMMANDED = (0.2, 0.8, 0.3, 1.0)  # colour of the goal, and of the object that belongs there where there are several
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectCfg:
+    """A free body.
+
+    Attributes:
+        shape: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``can``; the last three stand along z. A can is a cylinder to the
+            table, and to all else the capsule within it: what flat pads press on a cylinder's side is a single point that jumps
+            about, and MJX-JAX knows of none.
+        size: of a box its edges, of a sphere its radius, of a capsule (without its ends) or a cylinder radius and length [m].
+        mass: [kg].
+        friction: sliding; spinning and rolling [m].
+        condim: how many of these a contact has: 3 sliding, 4 spinning, too, 6 rolling, too; of two geoms that meet, the more.
+        pos: where it is before the reset events: x, y, and how far above the table it hovers [m].
+        quat: how it is turned there, wxyz.
+        rgba: colour.
+    """
+
+    shape: str = "box"
+    size: tuple[Positive, ...] = (0.03, 0.03, 0.03)
+    mass: Positive = 0.03
+    friction: tuple[NonNegative, NonNegative, NonNegative] = (1.0, 0.005, 0.0001)
+    condim: int = 3
+    pos: tuple[float, float, float] = (0.35, 0.0, 0.0)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    rgba: tuple[float, float, float, float] = (0.85, 0.3, 0.2, 1.0)
+
+    @property
+    def rest_height(self) -> float:
+        """Of its centre, where it touches the table [m]."""
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, np.asarray(self.quat) / np.linalg.norm(self.quat))
+        up, (first, *rest) = turn[6:], self.size
+        if self.shape == "box":
+            return float(np.abs(up) @ np.asarray(self.size) / 2)
+        if self.shape in ("cylinder", "can"):
+            return float(abs(up[2]) * rest[0] / 2 + np.sqrt(1 - min(1.0, up[2] ** 2)) * first)
+        return float(first + (abs(up[2]) * rest[0] / 2 if rest else 0.0))
+
+
+def cube(edge: float, mass: float) -> ObjectCfg:
+    """A cube [m, kg]."""
+    return ObjectCfg(size=(edge,) * 3, mass=mass)
+
+
+@dataclasses.dataclass(frozen=True)
+class ObstacleCfg:
+    """A box that stands still and stops robot and objects. Where nobody draws its place (``EnvCfg.obstacles``), it is below the
+    table, out of the way.
+
+    Attributes:
+        size: its edges [m].
+        pos: of its centre in the world [m].
+        quat: how it is turned, wxyz.
+        rgba: colour.
+    """
+
+    size: tuple[Positive, Positive, Positive] = (0.05, 0.05, 0.05)
+    pos: tuple[float, float, float] = (0.0, 0.0, -0.5)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    rgba: tuple[float, float, float, float] = (0.32, 0.38, 0.5, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneCfg:
+    """Table, objects and goal marker. Lengths in m.
+
+    The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
+    termination that counts an object beyond them as fallen.
+
+    Attributes:
+        table_center, table_size: of the drawn top, along x and y.
+        table: False makes it a picture alone: nothing meets it, and without contacts the physics is several times faster.
+        objects: free bodies by name.
+        obstacles: boxes that stand still, by name. The whole arm meets them, and what touches is measured (``sim.touch``).
+        self_collision: the robot's links meet one another, which is measured likewise.
+        goal: the marker's shape: ``sphere``, ``frame`` (a sphere with axes), ``cube``, an object's name, whose shape it then
+            has, or ``none``.
+        goal_edge: of a cube.
+        look_at, view_distance: where the cameras look, and from how far.
+    """
+
+    table_center: tuple[float, float] = (0.3, 0.0)
+    table_size: tuple[Positive, Positive] = (1.0, 1.2)
+    table: bool = True
+    objects: Mapping[str, ObjectCfg] = dataclasses.field(default_factory=lambda: {"cube": ObjectCfg()})
+    obstacles: Mapping[str, ObstacleCfg] = dataclasses.field(default_factory=dict)
+    self_collision: bool = False
+    goal: str = "sphere"
+    goal_edge: Positive = 0.03
+    look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
+    view_distance: Positive = 1.1
+
+    def __post_init__(self):
+        config.freeze(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class SimCfg:
+    """Physics options, and the buffers that MJX-Warp needs (overflows are counted, see ``Physics``)."""
+
+    dt: Positive = 0.01  # physics step [s]
+    decimation: Count = 2  # physics steps a control step
+    iterations: Count = 10  # of the constraint solver, at most
+    ls_iterations: Count = 20  # of its line search, at most
+    impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
+    elliptic: bool = True  # friction cones; else pyramids
+    contacts_per_env: Count = 24  # Warp: contact slots, times the number of environments
+    constraints_per_env: Count = 128  # Warp: constraint rows of one environment
+
+
+def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, fuse: bool = False) -> mujoco.MjModel:
+    """Compiles robot, table, objects (body, joint and geom by the object's name) and goal marker.
+
+    Args:
+        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
+            ctrl, less work a step.
+        fuse: makes links that nothing moves against their parents a part of them, unless one serves as the end effector: Warp
+            goes through the tree level by level.
+
+    Raises:
+        UserError: an object's shape, size or name is not possible.
+    """
+    whole = bool(scene.obstacles) or scene.self_collision
+    spec = _robot_spec(robot, whole)
+    spec.modelname = f"{robot.name}_scene"
+    option = spec.option
+    option.timestep = sim.dt
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.iterations, option.ls_iterations = sim.iterations, sim.ls_iterations
+    option.impratio = sim.impratio
+    # Box against box then goes by MJX-Warp's closed form instead of its general convex routine: faster, and quicker to compile.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if sim.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+    world = spec.worldbody
+    if scene.table:
+        world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=_TABLE, conaffinity=0, group=3)
+    for drive in (robot.arm, robot.gripper):
+        _add_drives(spec, drive)
+    for name, item in scene.objects.items():
+        _add_object(spec, name, item)
+    goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
+    if whole:
+        pairs = touch.self_pairs(robot) if scene.self_collision else ()
+        touch.add(spec, robot.base_link, scene.obstacles, tuple(scene.objects), pairs)
+    if visuals:
+        _add_visuals(spec, scene, goal, robot.floor)
+    else:
+        spec.discard_visual()
+    spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
+    return touch.unbounded(spec.compile())
+
+
+def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
+    """The scene with table and cameras where an imported robot works: the table under it, or in front of one on the floor."""
+    boxes = [np.array(box).T for box in (robot.workspace, robot.pick, robot.hold) if box]  # [2, 3]
+    if not boxes:
+        return scene
+    base = np.array(robot.base_pos)
+    work = np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]) + base
+    foot = base * [1, 1, 0]
+    low, high = np.minimum(work[0], foot), np.maximum(work[1], foot)
+    look_at, far = (low + high) / 2, 0.3 + 1.3 * float(np.linalg.norm(high - low))
+    if robot.floor < 0:
+        low, high = work[0], work[1] + 0.1 * np.sign(work.mean(0) - base)
+    else:
+        low, high = low - 0.15, high + 0.15
+    center, size = (low + high)[:2] / 2, (high - low)[:2]
+    return dataclasses.replace(
+        scene,
+        table_center=(float(center[0]), float(center[1])),
+        table_size=(float(size[0]), float(size[1])),
+        look_at=(float(look_at[0]), float(look_at[1]), float(look_at[2])),
+        view_distance=far,
+    )
+
+
+def robot_model(robot: RobotCfg) -> mujoco.MjModel:
+    """The robot alone where it is mounted: what kinematics need."""
+    return _robot_spec(robot).compile()
+
+
+def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
+    """``whole``: with the shapes that meet obstacles alone."""
+    spec = robot_file.model(robot)
+    for geom in [] if whole else spec.geoms:
+        if geom.conaffinity == touch.OBSTACLE:
+            spec.delete(geom)
+    base = spec.body(robot.base_link)
+    base.pos, base.quat = robot.base_pos, robot.base_quat
+    if robot.gravity_compensation:
+        for body in [base, *base.find_all(mujoco.mjtObj.mjOBJ_BODY)]:
+            body.gravcomp = 1.0
+    return spec
+
+
+def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectCfg) -> None:
+    if item.shape not in _SHAPES:
+        raise UserError(f"scene.objects.{name}.shape must be one of {', '.join(_SHAPES)}, got {item.shape!r}")
+    says = _SHAPES[item.shape][1]
+    count = {"box": 3, "sphere": 1}.get(item.shape, 2)
+    if len(item.size) != count:
+        raise UserError(f"scene.objects.{name}.size of a {item.shape} is {says}, got {item.size}")
+    if item.condim not in (1, 3, 4, 6):
+        raise UserError(f"scene.objects.{name}.condim must be 1, 3, 4 or 6, got {item.condim}")
+    if item.shape == "can" and item.size[1] <= 2 * item.size[0]:
+        raise UserError(f"scene.objects.{name}.size of a can is its radius and more than twice that as length, got {item.size}")
+    if name == "goal" or spec.body(name) or spec.joint(name) or spec.geom(name):
+        raise UserError(f"scene.objects.{name} needs another name: the robot or the scene has one that is called so")
+    shape, extent = _geom(item)
+    x, y, above = item.pos
+    body = spec.worldbody.add_body(name=name, pos=[x, y, item.rest_height + above], quat=item.quat)
+    body.add_freejoint(name=name)
+    body.add_geom(
+        name=name,
+        type=shape,
+        size=extent,
+        mass=item.mass,
+        friction=item.friction,
+        condim=item.condim,
+        contype=0 if item.shape == "can" else _OBJECT | _OBJECTS,
+        conaffinity=_TABLE if item.shape == "can" else _TABLE | _OBJECTS,
+        rgba=item.rgba,
+    )
+    if item.shape == "can":
+        radius, length = item.size
+        body.add_geom(
+            name=side(name),
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=[radius, length / 2 - radius, 0.0],
+            mass=0.0,
+            friction=item.friction,
+            condim=item.condim,
+            contype=_OBJECT | _OBJECTS,
+            conaffinity=_OBJECTS,
+            group=3,
+        )
+
+
+def side(name: str) -> str:
+    """Name of the geom that a can's side is."""
+    return f"{name}_side"
+
+
+def _geom(item: ObjectCfg) -> tuple[mujoco.mjtGeom, list[float]]:
+    """MuJoCo's type and size."""
+    half = [item.size[0], *(x / 2 for x in item.size[1:])] if item.shape != "box" else [x / 2 for x in item.size]
+    return _SHAPES[item.shape][0], half + [0.0] * (3 - len(half))
+
+
+def _add_drives(spec: mujoco.MjSpec, drive) -> None:
+    for name, kp, kd, effort in zip(drive.joints, drive.stiffness, drive.damping, drive.effort, strict=True):
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=kp, kv=kd)
+        actuator.forcelimited, actuator.forcerange = True, [-effort, effort]
+        actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
+
+
+def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, floor: float) -> None:
+    hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
+    box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.goal_edge / 2
+    shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
+    if item := scene.objects.get(scene.goal):
+        shape, extent = _geom(item)
+    if scene.goal != "none":
+        goal.add_geom(name="goal", type=shape, size=extent, rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
+    if scene.goal == "frame":
+        for axis, rgba in zip(np.eye(3), ([0.85, 0.2, 0.2, 1], [0.2, 0.7, 0.25, 1], [0.2, 0.35, 0.9, 1]), strict=True):
+            ends = [0, 0, 0, *(0.06 * axis)]
+            goal.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.003, 0, 0], fromto=ends, rgba=rgba, **hidden)
+    world = spec.worldbody
+    x, y = scene.table_center
+    size = [scene.table_size[0] / 2, scene.table_size[1] / 2, 0.02]
+    world.add_geom(name="table_top", type=box, size=size, pos=[x, y, -0.0205], rgba=[0.72, 0.6, 0.47, 1], **hidden)
+    if floor < 0:
+        world.add_geom(name="floor", type=box, size=[3, 3, 0.02], pos=[x, y, floor - 0.0205], rgba=[0.6, 0.62, 0.64, 1], **hidden)
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.62, 0.68, 0.74],
+        width=64,
+        height=64,
+    )
+    target, far = np.array(scene.look_at), scene.view_distance
+    for direction, color, shadow in (((-0.4, 0.6, -1.2), 0.7, True), ((0.0, -0.7, -1.0), 0.3, False)):
+        world.add_light(pos=target - 1.1 * far * np.array(direction), dir=direction, diffuse=[color] * 3, castshadow=shadow)
+    for name, direction in (("front", (0.71, -0.65, 0.28)), ("side", (0.07, -0.98, 0.17))):
+        pos = target + far * np.array(direction)
+        world.add_camera(name=name, pos=pos, quat=_look_at(pos, target), fovy=42)
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.visual.quality.shadowsize = 2048
+    spec.stat.center, spec.stat.extent = target, far
+
+
+def _look_at(pos, target) -> np.ndarray:
+    """Orientation (wxyz) of a camera at ``pos`` that looks at ``target`` with world z up."""
+    back = np.subtract(pos, target) / np.linalg.norm(np.subtract(pos, target))
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).flatten())
+    return quat

@@ -1,0 +1,253 @@
+"""The command line of the benchmark: what to measure, and what becomes of the rows."""
+
+import argparse
+import dataclasses
+import functools
+import gc
+import pathlib
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+from mjx_nero import cli, config, console, files
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.task import EnvCfg, for_controllers
+from mjx_nero.errors import UserError
+from mjx_nero.learn import compiled, device_memory, evaluation, run_cfg
+from mjx_nero.sim.physics import impls, resolve_impl
+from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
+from mjx_nero.tools.benchmark.program import Row
+
+WHATS = {
+    "physics": "random actions into the bare physics",
+    "step": "random actions in the auto-resetting training environment",
+    "ppo": "training, end to end",
+    "control": "the task's controller",
+    "reset": "batched resets",
+    "render": "frames of the offscreen renderer",
+    "learning": "seeds trained until they succeed",
+    "ik": "inverse kinematics",
+}
+_SIZES = "1024,4096,16384"
+_ENDS = ("_min", "_max")
+_ON_DEVICES = ("ppo", "learning")  # what --num-devices spreads
+_COUNTS = ("nan_count", "overflow_count")
+_MEMORY = ("compile_s", "memory_mb", "device_peak_mb", "warp_mb")
+_TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the table that shows it
+    ("physics", "step", "ppo", "control"): (
+        *("what", "controller", "impl", "num_envs", "env_steps_per_s", "physics_steps_per_s"),
+        *(*_MEMORY, "success_rate", *_COUNTS),
+    ),
+    ("reset",): ("what", "impl", "num_envs", "resets_per_s", *_MEMORY),
+    ("render",): ("what", "gl", "width", "height", "frames_per_s"),
+    ("learning",): (*("impl", "num_envs", "seed", "reached", "seconds", "evaluation_s", "env_steps", "success_rate", *_COUNTS),),
+    ("ik",): (*("solver", "batch", "ms_per_batch", "solves_per_s", "success", "error_mm", "error_mrad", "compile_s"),),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """One entry of the list of measurements. ``size`` orders those that differ in nothing else; 0: has none."""
+
+    what: str
+    impl: str
+    size: int
+    rows: Callable[[], Iterable[Row]]
+
+    def failed(self, note: str) -> Row:
+        row: Row = {"what": self.what, "impl": self.impl}
+        return row | ({"num_envs": self.size} if self.size else {}) | {"note": note}
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    args, _ = _parser().parse(argv)
+    whats = cli.choices(args.what, "what", tuple(WHATS))
+    _check_files(args.json, args.plot, whats)
+    cli.setup_jax()
+    jobs = _jobs(args, registry.env_cfg(args.env, args.preset, args.robot), whats)
+    head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
+    here = machine.machine()
+    report = {"machine": here, "versions": machine.versions(), "command": command(argv), "complete": False}
+    title = f"{', '.join(head.values())} on {machine.name(here)}"
+    rows: list[Row] = []
+    try:
+        for row in _measured(jobs):
+            spread = {"num_devices": args.num_devices} if row["what"] in _ON_DEVICES else {}
+            rows.append({**head, **row, **spread})
+            print(_line(row), file=sys.stderr)
+            _save(args.json, {**report, "rows": rows})  # each time: even a killed process leaves what it has measured
+        _save(args.json, {**report, "complete": True, "rows": rows})
+    except BaseException:
+        print(f"stopped after {len(rows)} rows{', which are kept' if rows else ''}", file=sys.stderr)
+        raise
+    finally:
+        _show(title, rows)
+        if args.plot and rows:
+            with files.whole(args.plot) as part:
+                plot.plot(rows, title, part)
+
+
+def command(argv: Sequence[str]) -> str:
+    """How the benchmark was called, without the folders of files."""
+    return shlex.join(["python", "-m", "mjx_nero", "benchmark", *map(_without_folders, argv)])
+
+
+def _parser() -> cli.Parser:
+    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
+    parser = cli.Parser(
+        prog=cli.called_as("benchmark"),
+        description="Measures what this machine does in a second, and how long it takes to learn.",
+        epilog=f"what can be measured:\n{lines}",
+    )
+    parser.add_environment(registry.list_envs())
+    parser.add_argument(
+        "--num-envs", type=_sizes, help=f"list (default: {_SIZES}; for learning the one number that train.py takes here)"
+    )
+    parser.add_argument("--learner", default="ppo", help="who trains for ppo and learning (default: %(default)s)")
+    parser.add_argument(
+        "--num-devices", type=cli.positive, default=1, help="GPUs for ppo and learning to spread over (default: %(default)s)"
+    )
+    parser.add_argument("--impl", default="auto", help=f"list of {', '.join(impls())} (default: %(default)s)")
+    parser.add_argument("--what", default="step", help="list, see below (default: %(default)s)")
+    parser.add_argument("--steps", type=cli.positive, default=100, help="control steps a measurement (default: %(default)s)")
+    parser.add_argument(
+        "--repeats", type=cli.positive, default=5, help="measurements, of which the median counts (default: %(default)s)"
+    )
+    parser.add_argument("--batch", type=_sizes, default="1,100,1000,2000,10000", help="list, poses of ik (default: %(default)s)")
+    parser.add_argument("--seeds", type=cli.positive, default=8, help="how many to train for learning (default: %(default)s)")
+    parser.add_argument("--target", type=cli.share, default=0.95, help="success that ends learning (default: %(default)s)")
+    parser.add_argument("--num-timesteps", type=cli.positive, help="env steps of a seed at most (default: what train.py takes)")
+    parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 a run)")
+    parser.add_argument("--json", type=cli.path(".json"), help="write the rows, the machine and all versions as JSON")
+    parser.add_argument("--plot", type=cli.path(".png"), help="picture (PNG) of rates and memory over the number of environments")
+    return parser
+
+
+def _jobs(args: argparse.Namespace, cfg: EnvCfg, whats: list[str]) -> list[_Job]:
+    """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here."""
+    jobs = []
+    for impl in dict.fromkeys(resolve_impl(impl) for impl in cli.choices(args.impl, "impl", impls())):
+        for what in whats:
+            if what == "learning":
+                for n in args.num_envs or [0]:
+                    run = _run(args, cfg, impl, n)
+                    rows = functools.partial(learning.measure_learning, run, args.seeds, args.target)
+                    compiled.make_learner(run)
+                    jobs.append(_Job(what, impl, run.num_envs, rows))
+            elif what not in ("ik", "render"):
+                task = for_controllers(cfg) if what == "control" else cfg
+                jobs += [_throughput(what, ManipulationEnv(task, impl, n), args) for n in args.num_envs or _sizes(_SIZES)]
+    if "render" in whats:
+        env = ManipulationEnv(cfg)
+        jobs.append(_Job("render", "", 0, lambda: [drawing.measure_render(env, min(20, args.steps), args.repeats)]))
+    if "ik" in whats:
+        jobs.append(_Job("ik", "", 0, lambda: inverse_kinematics.measure_ik(cfg.robot, args.batch, args.repeats)))
+    return jobs
+
+
+def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _Job:
+    make: Callable[[], throughput.Program]
+    about: Row = {}
+    if what == "ppo":
+        run = _run(args, env.cfg, env.impl, env.num_envs)
+        learner = compiled.make_learner(run)
+        iterations = max(1, args.steps * env.num_envs // learner.steps_per_iteration)
+        make = functools.partial(throughput.training, learner, iterations)
+        about = {"learner": args.learner} if args.learner != "ppo" else {}
+    elif what == "control":
+        name = next(iter(env.cfg.controllers), "")
+        make = functools.partial(throughput.controlled, env, evaluation.controller(name, env, args.env))
+        about = {"controller": name}
+    else:
+        measured = {"physics": throughput.physics, "step": throughput.step, "reset": throughput.reset}[what]
+        make = functools.partial(measured, env, args.steps)
+    return _Job(what, env.impl, env.num_envs, lambda: [throughput.measure(what, env, make, args.repeats) | about])
+
+
+def _run(args: argparse.Namespace, cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
+    sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
+    fields = {name: value for name, value in sizes.items() if value}
+    learner = config.override(run_cfg.learner_cfg(cfg, args.preset, args.learner), fields)
+    how = {"impl": impl, "eval_every": args.eval_every, "num_devices": args.num_devices, "learner": args.learner}
+    return run_cfg.fit_machine(run_cfg.RunCfg(args.env, args.preset, cfg, learner, **how))[0]
+
+
+def _measured(jobs: Iterable[_Job]) -> Iterator[Row]:
+    """The rows of all jobs. Where memory ends, a row says so, and larger sizes of the same are passed over."""
+    full: dict[tuple[str, str], int] = {}
+    for job in jobs:
+        limit = full.get((job.what, job.impl))
+        if limit is not None and job.size >= limit:
+            yield job.failed(f"not run: out of memory at {limit:,}")
+            continue
+        try:
+            yield from job.rows()
+            continue
+        except (MemoryError, RuntimeError) as error:
+            if not (isinstance(error, MemoryError) or device_memory.says_so(error)):
+                raise
+            message = (str(error) or type(error).__name__).splitlines()[0]
+        full[job.what, job.impl] = job.size
+        gc.collect()  # the traceback held the arrays
+        yield job.failed(f"out of memory: {message}")
+
+
+def _check_files(rows: pathlib.Path | None, picture: pathlib.Path | None, whats: list[str]) -> None:
+    if picture and not set(whats) & set(plot.PLOTTED):
+        raise UserError(f"--plot draws {', '.join(plot.PLOTTED)}: name one of them in --what")
+    for path in filter(None, (rows, picture)):
+        files.check_writable(path)
+
+
+def _sizes(values: str) -> list[int]:
+    return list(dict.fromkeys(cli.positive(n) for n in values.split(",")))
+
+
+def _without_folders(word: str) -> str:
+    return re.sub(r"[^=]*/(?=[^/=])", "", word).rstrip("/")
+
+
+def _line(row: Row) -> str:
+    """A row as it comes, in one line."""
+    return "  ".join(f"{name} {_cell(row, name)}" for name in row if row[name] is not None and not name.endswith(_ENDS))
+
+
+def _cell(row: Row, name: str) -> str:
+    """A value as text, with its range where the row has one; of a row about several seeds, median and worst."""
+    if f"{name}_median" in row:
+        return ", ".join(f"{which} {_text(row[f'{name}_{which}'])}" for which in ("median", "worst"))
+    if name == "reached" and "seeds" in row:
+        return f"{row['reached']} of {row['seeds']}"
+    if row.get(name) is None:
+        return ""
+    low, high = (row.get(name + end) for end in _ENDS)
+    text = _text(row[name])
+    return text if low is None else f"{text} ({_text(low)} to {_text(high)})"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "never"
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
+def _save(path: pathlib.Path | None, report: dict[str, Any]) -> None:
+    if path:
+        files.write_json(path, report)
+
+
+def _show(title: str, rows: list[Row]) -> None:
+    """A table a kind of row, with the columns that any of its rows fills."""
+    for whats, columns in _TABLES.items():
+        part = [row for row in rows if row["what"] in whats]
+        if not part:
+            continue
+        filled = [name for name in (*columns, "note") if any(_cell(row, name) for row in part)]
+        view = console.Table(title, filled, left=("note",))
+        for row in part:
+            view.add(*(_cell(row, name) for name in filled))
+        console.screen().print(view)

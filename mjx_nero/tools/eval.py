@@ -1,0 +1,144 @@
+"""Plays and measures a policy or a controller: python eval.py --env nero_lift. See --help."""
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from mjx_nero import cli, console, control, files
+from mjx_nero.envs import registry
+from mjx_nero.errors import UserError
+from mjx_nero.learn import evaluation
+from mjx_nero.sim import render
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    args, dotted = _parser().parse(argv, ("env", "control"), _cfgs)
+    if args.view:
+        from mjx_nero.tools import view
+
+        agent = args.controller or (args.agent if args.agent != "policy" else None)
+        policies = [args.policy] if args.policy else []
+        return view.serve(
+            env_name=args.env,
+            preset=args.preset,
+            robot=args.robot,
+            policies=policies,
+            agent=agent,
+            seed=args.seed,
+            overrides=dotted["env"],
+        )
+    for path in filter(None, (args.video, args.json)):
+        files.check_writable(path)
+    video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
+    cfg = evaluation.EvalCfg(
+        args.env,
+        preset=args.preset,
+        robot=args.robot,
+        agent=args.agent,
+        policy=args.policy,
+        any_robot=args.any_robot,
+        controller=args.controller,
+        episodes=args.episodes,
+        seed=args.seed,
+        backend=args.backend,
+        impl=args.impl,
+        record=video.episodes if args.video else 0,
+        env_fields=dotted["env"],
+        control_fields=dotted["control"],
+    )
+    cli.setup_jax()
+    played = evaluation.play(cfg)
+    report(played.result)
+    if args.json:
+        files.write_json(args.json, played.result)
+    if args.video:
+        draw(played, args.video, video)
+
+
+def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
+    """What ``--help`` lists the fields of."""
+    env = registry.env_cfg(args.env, args.preset, args.robot)
+    name = next(iter(env.controllers), "") if args.controller == evaluation.EXPERT else args.controller
+    return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(
+        prog=cli.called_as("eval"), description="Plays episodes with a policy or a controller and reports success."
+    )
+    parser.add_environment(registry.list_envs())
+    parser.add_argument("--agent", choices=evaluation.AGENTS, help="who acts (default: the policy, else the task's controller)")
+    parser.add_argument(
+        "--controller", help=f"instead of an agent: {', '.join(control.CONTROLLERS)}, or expert, the task's first"
+    )
+    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the one that ships for the environment)")
+    parser.add_argument(
+        "--any-robot", action="store_true", help="play a policy though it was trained for another model of the robot"
+    )
+    parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=64, help="played side by side (default: %(default)s)")
+    parser.add_seed(1)
+    parser.add_argument(
+        "--backend",
+        choices=evaluation.BACKENDS,
+        default="auto",
+        help="mjx, or mujoco: the C library (default: what --impl says)",
+    )
+    parser.add_impl()
+    parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three of the episodes")
+    parser.add_video()
+    parser.add_argument("--json", type=cli.path(".json"), help="write the result as JSON")
+    parser.add_argument("--view", action="store_true", help="play in a browser instead, until Ctrl-C (the extra view)")
+    return parser
+
+
+def report(result: dict[str, Any]) -> None:
+    """Prints a result for people."""
+    console.screen().print(table(result))
+    if result.get("warning"):
+        print(f"warning: {result['warning']}", file=sys.stderr)
+
+
+def draw(played: evaluation.Played, path: pathlib.Path, cfg: render.VideoCfg) -> None:
+    """Writes the video; says so where that cannot be."""
+    screen, episodes = console.screen(), played.episodes
+    try:
+        with console.drawing(console.screen(stderr=True), path.name) as update:
+            model, what = played.env.mj_model, (episodes.qpos, episodes.goals)
+            render.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.looks)
+        console.wrote(screen, "video", path)
+    except UserError as error:
+        console.line(screen, str(error))
+
+
+def table(result: dict[str, Any]) -> console.Table:
+    """The result for people."""
+    low, high = result["success_rate_95"]
+    who = result.get("controller") or result["agent"]
+    title = f"{result['env']} · {who} · {result['backend']} · {result['episodes']} episodes"
+    view = console.Table(title, ("", ""), left=("",))
+
+    def figure(name: str, unit: float = 1.0, digits: int = 2) -> str:
+        return "-" if result[name] is None else f"{unit * result[name]:.{digits}f}"
+
+    view.add("success rate", f"{result['success_rate']:.1%}  (95% interval {low:.1%} to {high:.1%})")
+    distances = f"{figure('final_distance_mean', 100)} cm mean, {figure('final_distance_median', 100)} cm median"
+    view.add("final distance", distances)
+    if "settled_error_max" in result:
+        view.add("second half", f"{figure('settled_error_mean', 100)} cm mean, {figure('settled_error_max', 100)} cm at most")
+    if "grasp_rate" in result:
+        grasp = result["time_to_grasp_mean"]
+        view.add("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
+        view.add("dropped", f"{result['dropped_rate']:.1%}")
+    if "touched_mean" in result:
+        view.add("touched", f"{result['touched_mean']:.1%}")
+    view.add("return", figure("return_mean"))
+    for name, value in result["return_by_term"].items():
+        view.add(f"  {name}", "-" if value is None else f"{value:.3f}")
+    view.add("NaN, overflows", f"{result['nan_count']}, {result['overflow_count']}")
+    if result["diverged"]:
+        view.add("diverged", f"{result['diverged']} episodes: failures, and in no mean")
+    view.add("time", f"{result['seconds']:.1f} s, compilation included")
+    return view

@@ -1,0 +1,78 @@
+"""The commands ``record`` and ``identify``."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from mjx_nero import cli, config, console, files
+from mjx_nero.envs import registry
+from mjx_nero.tools.identification import log as logs
+from mjx_nero.tools.identification.fit import identify
+from mjx_nero.tools.identification.plant import Plant
+from mjx_nero.tools.identification.report import save, save_plot, table
+from mjx_nero.tools.identification.simulate import RecordCfg, record
+
+_DT = 0.005
+
+
+def record_main(argv: Sequence[str]) -> None:
+    """The command line of ``record``."""
+    parser = cli.Parser(
+        prog=cli.called_as("record"),
+        description="Moves a simulated arm by sine sweeps within its limits, and writes what its drives were told and did.",
+    )
+    _add_robot(parser)
+    parser.add_argument(
+        "--out", type=cli.path(".csv"), required=True, help="the log: a table with commas (docs/identification.md)"
+    )
+    about = config.describe(RecordCfg())
+    for field in dataclasses.fields(RecordCfg):
+        kind = cli.seed if field.name == "seed" else cli.number(field.type)
+        parser.add_argument(
+            f"--{field.name}", type=kind, default=field.default, help=f"{about[field.name]} (default: %(default)s)"
+        )
+    args, _ = parser.parse(argv)
+    files.check_writable(args.out)
+    cfg = RecordCfg(**{field.name: getattr(args, field.name) for field in dataclasses.fields(RecordCfg)})
+    plant = Plant(registry.robot(args.robot), args.dt)
+    log, truth = record(plant, cfg)
+    notes = [f"simulated {plant.robot.name}; its parameters:", *(f"{name}: {value}" for name, value in _plain(truth).items())]
+    logs.write(args.out, log, plant.robot.arm.joints, notes)
+    console.wrote(console.screen(), "log", args.out)
+
+
+def identify_main(argv: Sequence[str]) -> None:
+    """The command line of ``identify``."""
+    parser = cli.Parser(
+        prog=cli.called_as("identify"),
+        description="Fits gains, armature, friction, delay and encoder offsets of an arm's drives to a log.",
+    )
+    parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/identification.md)")
+    _add_robot(parser)
+    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML for make(identified=...) and --env.identified")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of what remains unexplained")
+    args, _ = parser.parse(argv)
+    for path in filter(None, (args.out, args.plot)):
+        files.check_writable(path)
+    plant = Plant(registry.robot(args.robot), args.dt)
+    joints = plant.robot.arm.joints
+    log = logs.read(args.log, joints)
+    fit = identify(plant, log)
+    screen = console.screen()
+    screen.print(table(joints, fit, plant.nominal))
+    if args.plot:
+        save_plot(args.plot, joints, log, fit)
+        console.wrote(screen, "plot", args.plot)
+    if args.out:
+        save(args.out, plant.robot.name, args.log.name, joints, fit)
+        console.wrote(screen, "drives", args.out)
+
+
+def _add_robot(parser: cli.Parser) -> None:
+    parser.add_argument("--robot", required=True, help="name, or folder of an imported robot")
+    parser.add_argument("--dt", type=cli.positive_float, default=_DT, help="physics step, s (default: %(default)s)")
+
+
+def _plain(truth) -> dict[str, object]:
+    return {
+        name: value if isinstance(value, float) else [round(float(x), 7) for x in value] for name, value in vars(truth).items()
+    }

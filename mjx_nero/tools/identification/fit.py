@@ -1,0 +1,138 @@
+"""Parameters of drives from a log: nonlinear least squares (SciPy's) on MuJoCo's rollouts.
+
+The whole log is simulated open loop from its first reading on; what is minimised are the differences to the readings. First over
+the beginning, where a Jacobian is cheap, then over all that is not held out. Intervals come from the Jacobian at the solution and
+the residuals' variance, inflated by how long these stay correlated: what the model cannot explain is no independent noise.
+"""
+
+import dataclasses
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import scipy.special
+from jaxtyping import Float
+
+from mjx_nero.errors import UserError
+from mjx_nero.tools.identification.log import Log
+from mjx_nero.tools.identification.plant import Drives, Plant
+
+HELD_OUT = 0.25  # of the log, its end
+_BEGINNING = 15.0  # [s]
+_SETTLED = 4.0  # [s] from which on it shows no more in which position dry friction held the joints
+_SURE, _NOISE = 1.0, 1e-4  # the model's own parameters are right to such a share, as against such noise of a reading [rad or m]
+_FACTOR, _OFFSET, _LATEST = 30.0, 0.5, 0.3  # bounds: of the model's own parameters; [rad or m]; [s]
+_STEP = 3e-4  # of a finite difference, in units of ``_unit``
+_LEVEL = 0.975
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Identified drives.
+
+    Attributes:
+        drives, low, high: the values and their 95% intervals.
+        readings: [k, n] what the identified arm's encoders read.
+        nominal: [k, n] what the model's own would.
+        held: [k] where the log was held out.
+        rms, nominal_rms: [n] of the differences over what was held out [rad or m].
+    """
+
+    drives: Drives
+    low: Drives
+    high: Drives
+    readings: np.ndarray
+    nominal: np.ndarray
+    held: np.ndarray
+    rms: np.ndarray
+    nominal_rms: np.ndarray
+
+
+def identify(plant: Plant, log: Log) -> Fit:
+    """Fits drives to a log.
+
+    Raises:
+        UserError: the log does not say enough, or the simulation diverges.
+    """
+    cut = log.times[0] + (1 - HELD_OUT) * (log.times[-1] - log.times[0])
+    x = dataclasses.replace(plant.nominal, offset=np.mean(log.positions - _held(log), axis=0), delay=0.02).vector()
+    for end, enough in ((min(log.times[0] + _BEGINNING, cut), 0.03), (cut, 1e-5)):
+        part = (log.times >= log.times[0] + _SETTLED) & (log.times <= end)
+        found = _solve(plant, log, part, x, enough)
+        x = found.x
+    half = _half_widths(found.fun, found.jac, plant.n, int((part).sum()))
+    low, high = x - half, x + half
+    low[: 4 * plant.n] = np.maximum(low, _unit(plant) / _FACTOR)[: 4 * plant.n]
+    held, drives = log.times > cut, Drives.of(x)
+    readings, nominal = _read(plant, log, [x, plant.nominal.vector()])
+    rms, before = (np.sqrt(np.mean((path - log.positions)[held] ** 2, axis=0)) for path in (readings, nominal))
+    return Fit(drives, Drives.of(low), Drives.of(high), readings, nominal, held, rms, before)
+
+
+def _held(log: Log) -> np.ndarray:
+    """The targets last sent at the readings [k, n]."""
+    return log.targets[np.clip(np.searchsorted(log.sent, log.times, side="right") - 1, 0, None)]
+
+
+def _read(plant: Plant, log: Log, vectors: list[np.ndarray], part: np.ndarray | None = None) -> Float[np.ndarray, "b k n"]:
+    times = log.times if part is None else log.times[part]
+    return plant.readings([Drives.of(x) for x in vectors], log.sent, log.targets, log.positions[0], times)
+
+
+def _solve(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray, enough: float):
+    """Least squares over a part of the log; the model's own parameters count as readings, too, if rough ones.
+
+    Args:
+        enough: ends where a step makes the sum smaller by less than this share.
+    """
+    n, wanted, unit = plant.n, log.positions[part], _unit(plant)
+    guessed = np.eye(len(x))[: 4 * n] * _NOISE / _SURE
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([(_read(plant, log, [z * unit], part)[0] - wanted).ravel(), guessed @ (z - 1)])
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        here, *there = _read(plant, log, [z * unit, *((z + _STEP * row) * unit for row in np.eye(len(z)))], part)
+        return np.concatenate([np.stack([(path - here).ravel() for path in there], axis=1) / _STEP, guessed])
+
+    low, high = np.full(len(x), -_OFFSET / 0.01), np.full(len(x), _OFFSET / 0.01)
+    low[: 4 * n], high[: 4 * n], low[-1], high[-1] = 1 / _FACTOR, _FACTOR, 0.0, _LATEST / 0.01
+    settings: dict = {"x_scale": "jac", "xtol": 1e-5, "ftol": enough, "max_nfev": 40}
+    found = scipy.optimize.least_squares(residuals, np.clip(x / unit, low, high), jacobian, (low, high), **settings)
+    found.x, found.jac = found.x * unit, found.jac / unit
+    return found
+
+
+def _unit(plant: Plant) -> np.ndarray:
+    """Of the free numbers: the model's own parameters, 1e-2 rad and 10 ms."""
+    return np.concatenate([plant.nominal.vector()[: 4 * plant.n], np.full(plant.n + 1, 0.01)])
+
+
+def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int) -> np.ndarray:
+    """[p] half the widths of the 95% intervals; linear theory.
+
+    Raises:
+        UserError: some parameter does not show in the log.
+    """
+    seen = residuals[: rows * n]
+    free = len(seen) - jacobian.shape[1]
+    scale = np.linalg.norm(jacobian, axis=0)
+    try:
+        factor = scipy.linalg.cho_factor((jacobian / scale).T @ (jacobian / scale))
+    except (np.linalg.LinAlgError, ValueError):
+        raise UserError("the log does not show all parameters: every joint has to move, slowly and fast") from None
+    variance = np.diag(scipy.linalg.cho_solve(factor, np.eye(len(scale)))) / scale**2
+    noise = seen @ seen / free * _correlation(seen.reshape(-1, n))
+    return scipy.special.stdtrit(free, _LEVEL) * np.sqrt(noise * variance)
+
+
+def _correlation(residuals: Float[np.ndarray, "k n"], longest: int = 400) -> float:
+    """How many readings are as good as one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
+    total = np.sum(residuals**2)
+    out = 1.0
+    for lag in range(1, min(longest, len(residuals) // 2)):
+        rho = np.sum(residuals[lag:] * residuals[:-lag]) / max(total, 1e-30)
+        if rho < 0.05:
+            break
+        out += 2 * rho
+    return float(out)

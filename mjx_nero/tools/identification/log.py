@@ -1,0 +1,116 @@
+"""The log of an arm: what its drives were told, and what their encoders read. A table that any program can write:
+
+    time,target.joint1,target.joint2,position.joint1,position.joint2
+    0.000,0.1,0.5,0.1002,0.4997
+    0.005,,,0.1001,0.4998
+
+``time`` [s] ascends; the targets [rad or m] of a row were sent then, its positions [rad or m] read then; cells without news are
+empty. The first row has targets. Lines that begin with # are notes.
+"""
+
+import csv
+import dataclasses
+import math
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from mjx_nero import files
+from mjx_nero.errors import UserError
+from mjx_nero.values import hint, short
+
+MAX_BYTES, MAX_ROWS = 64_000_000, 500_000
+_LARGEST = 1e4  # of a number: an arm's angles, metres and seconds are below
+_SHORTEST, _FEWEST = 10.0, 500  # [s], readings
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """Targets and readings of an arm's joints.
+
+    Attributes:
+        sent: [m], when targets were sent [s].
+        targets: [m, n] [rad or m].
+        times: [k], when the encoders were read [s].
+        positions: [k, n] [rad or m].
+    """
+
+    sent: np.ndarray
+    targets: np.ndarray
+    times: np.ndarray
+    positions: np.ndarray
+
+
+def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[str] = ()) -> None:
+    """Writes a log.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    rows: dict[float, list[str]] = {}
+    for times, values, first in ((log.sent, log.targets, 0), (log.times, log.positions, len(joints))):
+        for time, value in zip(np.round(times, 6).tolist(), values.tolist(), strict=True):
+            row = rows.setdefault(time, [""] * (2 * len(joints)))
+            row[first : first + len(joints)] = [f"{x:.7g}" for x in value]
+    head = ["time", *(f"target.{j}" for j in joints), *(f"position.{j}" for j in joints)]
+    lines = [*(f"# {note}" for note in notes), ",".join(head)]
+    lines += [",".join([f"{time:.6f}".rstrip("0").rstrip("."), *rows[time]]) for time in sorted(rows)]
+    with files.whole(path) as part:
+        part.write_text("\n".join(lines) + "\n")
+
+
+def read(path: pathlib.Path, joints: Sequence[str]) -> Log:
+    """Reads a log of a robot's arm; a stranger may have made it.
+
+    Args:
+        joints: of the arm, in their order here; the file may have them in another.
+
+    Raises:
+        UserError: there is none, it is too large, or it is no log of these joints; the message names the line.
+    """
+    try:
+        text = files.read_bytes(path, MAX_BYTES).decode()
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    if len(lines) > MAX_ROWS:
+        raise UserError(f"{path} has {len(lines):,} rows: more than {MAX_ROWS:,} are not read")
+    head = [name.strip() for name in lines[0][1].split(",")] if lines else []
+    wanted = ["time", *(f"target.{j}" for j in joints), *(f"position.{j}" for j in joints)]
+    for name in wanted:
+        if head.count(name) != 1:
+            raise UserError(f"{path} needs one column {name}{hint(name, head)}: its first line names {short(','.join(head))}")
+    columns, n, rows = [head.index(name) for name in wanted], len(joints), []
+    for (i, _), cells in zip(lines[1:], csv.reader(line for _, line in lines[1:]), strict=False):
+        if len(cells) != len(head):
+            raise UserError(f"{path} line {i} has {len(cells)} cells, the first line {len(head)}")
+        row = [_number(cells[c], f"{path} line {i} {head[c]}") for c in columns]
+        for part in (row[1 : n + 1], row[n + 1 :]):
+            if 0 < sum(map(math.isnan, part)) < n:
+                raise UserError(f"{path} line {i} has news of some joints and not of others: give all or none")
+        rows.append(row)
+    table = np.array(rows, float).reshape(-1, 2 * n + 1)
+    if not len(table) or np.isnan(table[:, 0]).any() or (np.diff(table[:, 0]) <= 0).any():
+        raise UserError(f"{path}: time has to be in every row, and to ascend")
+    told, seen = ~np.isnan(table[:, 1]), ~np.isnan(table[:, n + 1])
+    if not told[0]:
+        raise UserError(f"{path}: its first row has to have the targets that are in force at its beginning")
+    log = Log(table[told, 0], table[told, 1 : n + 1], table[seen, 0], table[seen, n + 1 :])
+    if len(log.times) < _FEWEST or log.times[-1] - log.times[0] < _SHORTEST:
+        raise UserError(f"{path} has {len(log.times)} readings: {_FEWEST} or more over {_SHORTEST:g} s or more are needed")
+    if table[-1, 0] - table[0, 0] > 3600:
+        raise UserError(f"{path} is longer than an hour: a minute is enough")
+    return log
+
+
+def _number(text: str, where: str) -> float:
+    if not text.strip():
+        return math.nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _LARGEST:
+        raise UserError(f"{where} takes a number up to {_LARGEST:g}, got {short(text)}")
+    return value

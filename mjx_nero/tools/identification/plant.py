@@ -1,0 +1,157 @@
+"""An arm and its drives as identification sees them: parameters and targets in, the encoders' readings out.
+
+In MuJoCo's C library, without contacts. A target is in force from ``delay`` after it was sent until the next one is; the drive
+then pulls the joint to it, and the encoder reads the joint's position plus an offset:
+
+    (M(q) + armature) qdd + c(q, qd) = stiffness (target - q) - damping qd - friction sign(qd),   reading = q + offset
+"""
+
+import copy
+import dataclasses
+import os
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import rollout
+
+from mjx_nero.errors import UserError
+from mjx_nero.sim import scene
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+
+REST = 0.5  # [s] before a log, in which its first target holds the arm
+FRICTION = 0.01  # of a drive's effort: the first guess where a model has no joint friction
+POSITIVE = ("stiffness", "damping", "armature", "friction")
+
+
+@dataclasses.dataclass(frozen=True)
+class Drives:
+    """What is identified; arrays along the arm's joints.
+
+    Attributes:
+        stiffness: [N m/rad or N/m].
+        damping: [N m s/rad or N s/m], of drive and joint together.
+        armature: [kg m2 or kg].
+        friction: dry friction [N m or N].
+        offset: what the encoder reads beside the joint's position [rad or m].
+        delay: from a target's sending until it is in force [s].
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    armature: np.ndarray
+    friction: np.ndarray
+    offset: np.ndarray
+    delay: float = 0.0
+
+    def vector(self) -> np.ndarray:
+        """[5 n + 1]: the parameters of all joints one after another, offsets, delay."""
+        return np.concatenate([*(getattr(self, name) for name in POSITIVE), self.offset, [self.delay]])
+
+    @classmethod
+    def of(cls, vector: np.ndarray) -> "Drives":
+        """The inverse of ``vector``."""
+        stiffness, damping, armature, friction, offset = np.split(np.asarray(vector, float)[:-1], 5)
+        return cls(stiffness, damping, armature, friction, offset, float(vector[-1]))
+
+
+class Plant:
+    """Simulates an arm's drives; the gripper's hold still.
+
+    Args:
+        robot: its model, gains and joints.
+        dt: physics step [s].
+
+    Attributes:
+        model: compiled, with the robot's own parameters.
+        nominal: the parameters that the model has, where it has any.
+
+    Raises:
+        UserError: the physics step cannot resolve the drives.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float):
+        if not 1e-4 <= dt <= 0.02:
+            raise UserError(f"dt takes a physics step from 0.0001 to 0.02 s, got {dt:g}")
+        self.robot, self.dt, self.n = robot, dt, len(robot.arm.joints)
+        self.model = scene.build(robot, SceneCfg(objects={}, table=False), SimCfg(dt=dt, iterations=50), visuals=False)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model.opt.tolerance = 1e-12  # finite differences see the solver's last digits
+        joints = self.model.actuator_trnid[: self.n, 0]
+        self._at, self._dof = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
+        armature, friction = self.model.dof_armature[self._dof], self.model.dof_frictionloss[self._dof]
+        self.nominal = Drives(
+            np.array(robot.arm.stiffness),
+            np.maximum(np.array(robot.arm.damping) + self.model.dof_damping[self._dof], 1e-3),
+            np.maximum(armature, 1e-4),
+            np.where(friction > 0, friction, FRICTION * np.array(robot.arm.effort)),
+            np.zeros(self.n),
+        )
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._data = [mujoco.MjData(self.model) for _ in range(threads)]
+        self._rollout = rollout.Rollout(nthread=threads).rollout
+
+    def with_drives(self, drives: Drives) -> mujoco.MjModel:
+        """The model with other parameters; their damping is all the drives'."""
+        model, n = copy.copy(self.model), self.n
+        model.actuator_gainprm[:n, 0], model.actuator_biasprm[:n, 1] = drives.stiffness, -drives.stiffness
+        model.actuator_biasprm[:n, 2], model.dof_damping[self._dof] = -drives.damping, 0.0
+        model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = drives.armature, drives.friction
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+    def readings(
+        self,
+        drives: list[Drives],
+        sent: Float[np.ndarray, " m"],
+        targets: Float[np.ndarray, "m n"],
+        start: np.ndarray,
+        times: Float[np.ndarray, " k"],
+    ) -> Float[np.ndarray, "b k n"]:
+        """What the encoders read at ``times``, for each of some parameters.
+
+        Args:
+            sent: times of the targets [s], ascending.
+            targets: [rad or m].
+            start: readings before the first target was sent [n].
+            times: [s], none before the first target.
+        """
+        m, n = self.model, self.n
+        begin = sent[0] - REST
+        steps = int(np.ceil((times[-1] - begin) / self.dt)) + 1
+        edges = begin + self.dt * np.arange(steps + 1)
+        states = np.zeros((len(drives), 1 + m.nq + m.nv))
+        states[:, 1 : 1 + m.nq] = m.qpos0
+        home = np.concatenate([targets[0], self.robot.gripper.home])
+        at = m.jnt_qposadr[m.actuator_trnid[:, 0]]
+        states[:, 1 + at] = home
+        ctrl = np.broadcast_to(home, (len(drives), steps, m.nu)).copy()
+        for i, d in enumerate(drives):
+            states[i, 1 + self._at] = start - d.offset
+            ctrl[i, :, :n] = in_force(sent + d.delay, targets, edges)
+        ctrl = np.clip(ctrl, *m.actuator_ctrlrange.T)
+        models = [self.with_drives(d) for d in drives]
+        path, _ = self._rollout(models, self._data, states, ctrl)
+        whole = np.concatenate([states[:, None], path], axis=1)[:, :, 1 + self._at]
+        if not np.isfinite(whole).all():
+            raise UserError("the simulated arm diverges: give a smaller --dt, or gains that hold it")
+        return np.stack([interpolate(times, edges, q) + d.offset for q, d in zip(whole, drives, strict=True)])
+
+
+def in_force(since: np.ndarray, targets: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The mean of the targets in force over each physics step [steps, n]: smooth in the delay, where their stairs are not.
+
+    Args:
+        since: when each target came into force [m].
+        edges: of the steps [steps + 1].
+    """
+    knots = np.concatenate([[min(edges[0], since[0]) - 1.0], since, [max(edges[-1], since[-1]) + 1.0]])
+    held = np.concatenate([targets[:1], targets])
+    integral = np.concatenate([np.zeros_like(held[:1]), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
+    return np.diff(interpolate(edges, knots, integral), axis=0) / np.diff(edges)[:, None]
+
+
+def interpolate(at: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Linear, of the columns of ``y``."""
+    return np.stack([np.interp(at, x, column) for column in y.T], axis=-1)

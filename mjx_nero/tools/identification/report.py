@@ -1,0 +1,86 @@
+"""What was identified: a table, a picture, a file."""
+
+import math
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+import yaml
+
+from mjx_nero import files
+from mjx_nero.console import Table
+from mjx_nero.tools.identification.fit import Fit
+from mjx_nero.tools.identification.log import Log
+from mjx_nero.tools.identification.plant import POSITIVE, Drives
+
+_HEAD = """\
+# Drives of {robot}, identified from {log}: values with 95% intervals. For make(identified=FILE) and --env.identified FILE.
+# stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], armature [kg m2 or kg], friction [N m or N], delay [s];
+# offset [rad or m]: what the encoder reads beside the joint's position, to be subtracted on the real arm.
+"""
+
+
+def table(joints: Sequence[str], fit: Fit, nominal: Drives) -> Table:
+    """A line a joint."""
+    unit = "error held out [mrad, mm]"
+    view = Table(
+        "identified, with 95% intervals (the model's own)", ("joint", *POSITIVE, "offset [mrad, mm]", unit, "the model's own")
+    )
+    for i, joint in enumerate(joints):
+        cells = []
+        for name in POSITIVE:
+            value, low, high, own = (float(getattr(x, name)[i]) for x in (fit.drives, fit.low, fit.high, nominal))
+            cells.append(f"{value:.4g} +-{(high - low) / 2:.1g} ({own:.3g})")
+        offset, width = fit.drives.offset[i], (fit.high.offset - fit.low.offset)[i] / 2
+        cells += [f"{1e3 * offset:.2f} +-{1e3 * width:.1g}", f"{1e3 * fit.rms[i]:.3f}", f"{1e3 * fit.nominal_rms[i]:.3f}"]
+        view.add(joint, *cells)
+    half = (fit.high.delay - fit.low.delay) / 2
+    view.caption = f"delay {1e3 * fit.drives.delay:.2f} +-{1e3 * half:.1g} ms"
+    return view
+
+
+def save(path: pathlib.Path, robot: str, log: str, joints: Sequence[str], fit: Fit) -> None:
+    """Writes the YAML that ``envs.identified`` reads."""
+
+    def number(name: str, i: int | None = None) -> dict[str, float]:
+        low, value, high = (
+            float(getattr(x, name) if i is None else getattr(x, name)[i]) for x in (fit.low, fit.drives, fit.high)
+        )
+        low, value, high = (float(f"{x:.6g}") for x in (low, value, high))
+        return {"value": value, "low": min(low, value), "high": max(high, value)}
+
+    rows = {j: {name: number(name, i) for name in (*POSITIVE, "offset")} for i, j in enumerate(joints)}
+    content = {"robot": robot, "delay": number("delay"), "joints": rows}
+    text = _HEAD.format(robot=robot, log=" ".join(log.split())) + yaml.safe_dump(
+        content, sort_keys=False, default_flow_style=None
+    )
+    with files.whole(path) as part:
+        part.write_text(text)
+
+
+def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> None:
+    """A panel a joint: the differences to the readings over time, of the identified arm and of the model's own."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(joints))
+    rows = math.ceil(len(joints) / columns)
+    figure = Figure(figsize=(12, 0.8 + 2.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    thin = slice(None, None, max(1, len(log.times) // 4000))
+    for i, (panel, joint) in enumerate(zip(panels, joints, strict=False)):
+        for path_, label, color in (
+            (fit.nominal, "the model's own drives", "tab:gray"),
+            (fit.readings, "identified", "tab:blue"),
+        ):
+            panel.plot(log.times[thin], 1e3 * (path_ - log.positions)[thin, i], label=label, color=color, linewidth=0.7)
+        panel.axvspan(log.times[fit.held][0], log.times[-1], color="tab:orange", alpha=0.12, label="held out")
+        panel.set_title(f"{joint}: held out {1e3 * fit.rms[i]:.3g} (was {1e3 * fit.nominal_rms[i]:.3g})", loc="left", fontsize=9)
+        panel.set_yscale("symlog", linthresh=float(max(1e-3, 3e3 * np.min(fit.rms))))
+        panel.grid(alpha=0.3)
+    for panel in panels[len(joints) :]:
+        panel.set_axis_off()
+    panels[0].legend(fontsize=7, loc="lower left")
+    figure.suptitle("simulated minus measured position [mrad, mm]", x=0.01, ha="left")
+    figure.supxlabel("time [s]", fontsize=9)
+    with files.whole(path) as part:
+        figure.savefig(part, dpi=110)

@@ -1,0 +1,66 @@
+"""Logs of a simulated arm: what ``record`` writes, with all that makes a real one hard to read."""
+
+import dataclasses
+
+import numpy as np
+
+from mjx_nero.bounds import NonNegative, Positive, check
+from mjx_nero.tools.identification.excitation import RATE, sweeps
+from mjx_nero.tools.identification.log import Log
+from mjx_nero.tools.identification.plant import POSITIVE, Drives, Plant
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordCfg:
+    """How a simulated arm is recorded.
+
+    Attributes:
+        seconds: of the log.
+        rate: of the readings [Hz].
+        noise: standard deviation of a reading [rad or m].
+        resolution: of the encoders, one count [rad or m]; 0: as fine as numbers are.
+        scatter: the arm's parameters are the model's times factors up to this, drawn log-uniformly; 1: the model's.
+        offset: of the encoders, at most [rad or m].
+        delay: at most [s]; with a scatter above 1 it is drawn, too.
+        amplitude: of the swings, at most [rad or m].
+        seed: of all that is drawn.
+    """
+
+    seconds: Positive = 60.0
+    rate: Positive = 200.0
+    noise: NonNegative = 0.0
+    resolution: NonNegative = 0.0
+    scatter: Positive = 1.0
+    offset: NonNegative = 0.0
+    delay: NonNegative = 0.0
+    amplitude: Positive = 0.5
+    seed: int = 0
+
+    def __post_init__(self):
+        check(self)
+
+
+def record(plant: Plant, cfg: RecordCfg) -> tuple[Log, Drives]:
+    """A log of the simulated arm under ``excitation.sweeps``, and the parameters that it has.
+
+    Raises:
+        UserError: the arm has no room, or the simulation diverges.
+    """
+    rng, n = np.random.default_rng(cfg.seed), plant.n
+    truth = draw(plant.nominal, cfg, rng)
+    targets = sweeps(plant.robot, cfg.seconds, cfg.amplitude)
+    sent, times = np.arange(len(targets)) / RATE, np.arange(round(cfg.seconds * cfg.rate)) / cfg.rate
+    # A second at rest comes before the log, as before a real one.
+    (positions,) = plant.readings([truth], sent, targets, targets[0] + truth.offset, times)
+    positions = positions + cfg.noise * rng.standard_normal((len(times), n))
+    if cfg.resolution:
+        positions = np.round(positions / cfg.resolution) * cfg.resolution
+    return Log(sent, targets, times, positions), truth
+
+
+def draw(nominal: Drives, cfg: RecordCfg, rng: np.random.Generator) -> Drives:
+    """Parameters about the model's."""
+    n, width = len(nominal.offset), abs(float(np.log(cfg.scatter)))
+    factors = {name: getattr(nominal, name) * np.exp(rng.uniform(-width, width, n)) for name in POSITIVE}
+    delay = cfg.delay * (rng.uniform() if width else 1.0)
+    return Drives(**factors, offset=rng.uniform(-cfg.offset, cfg.offset, n), delay=delay)

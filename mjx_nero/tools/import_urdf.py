@@ -1,0 +1,149 @@
+"""The command ``import-urdf``."""
+
+import pathlib
+import shlex
+from collections.abc import Mapping, Sequence
+
+from mjx_nero import cli, console, values
+from mjx_nero.console import Table
+from mjx_nero.errors import UserError
+from mjx_nero.urdf import files
+from mjx_nero.urdf.importer import import_urdf
+from mjx_nero.urdf.report import Report
+
+MOST_LINES = 12  # of warnings shown; report.json has all
+
+_EPILOG = """\
+Files are read from the URDF's folder, from the package that it lies in (a package.xml up to five folders above; without one the
+folder above urdf/, robots/ or xacro/), from packages that it names which lie beside these, and from those given with --package.
+
+  python -m mjx_nero import-urdf my_arm.urdf --out my_arm
+  python -m mjx_nero import-urdf urdf/arm.urdf --out arm --package arm_description=. --gripper finger_joint --ee tcp
+  python -m mjx_nero import-urdf urdf/arm.urdf.xacro --out arm --arg hand:=true --package ../gripper_description
+"""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Imports a URDF and prints what came of it.
+
+    Raises:
+        UserError: as ``import_urdf``, or the arguments are wrong.
+    """
+    parser = cli.Parser(
+        prog=cli.called_as("import-urdf"),
+        description="Makes a model folder of a URDF: model.xml, meshes/, robot.yaml (edit it) and report.json.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("file", type=cli.path(), help="URDF or xacro file")
+    parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to make")
+    parser.add_argument(
+        "--package", action="append", default=[], metavar="[NAME=]DIR", help="where package://NAME/ lies; again for more"
+    )
+    parser.add_argument(
+        "--arg", action="append", default=[], metavar="NAME:=VALUE", help="argument of a xacro file; again for more"
+    )
+    parser.add_argument("--gains", type=cli.path(), metavar="FILE", help="YAML: joint -> stiffness, damping, effort, speed")
+    parser.add_argument("--chain", metavar="BASE:TIP", help="the arm of a robot that is more than one: the rest is held still")
+    parser.add_argument("--fix", action="append", default=[], metavar="JOINT[=VALUE]", help="hold a joint still; again for more")
+    parser.add_argument(
+        "--gripper", metavar="J1,J2", help="joints that drive the gripper; none for an arm without (default: guessed)"
+    )
+    parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point, in metres (default: amid the fingers' ends)")
+    parser.add_argument("--home", metavar="J=VALUE,...", help="home positions of some joints [rad, m] (default: guessed)")
+    parser.add_argument("--strict", action="store_true", help="a warning is an error")
+    parser.add_argument("--force", action="store_true", help="replace an earlier import")
+    args, rest = parser.parse_known_args(argv)
+    if rest:
+        parser.error(f"unknown argument {rest[0]!r}")
+    gripper = None if args.gripper is None else [] if args.gripper == "none" else args.gripper.split(",")
+    report = import_urdf(
+        args.file,
+        args.out,
+        _packages(args.package),
+        args.gains,
+        args=_pairs(args.arg, "--arg takes NAME:=VALUE", ":="),
+        chain=args.chain,
+        fix=_fixed(args.fix),
+        gripper=gripper,
+        ee=args.ee,
+        home=_positions(args.home),
+        strict=args.strict,
+        force=args.force,
+    )
+    _print(report)
+
+
+def _packages(items: Sequence[str]) -> Mapping[str, pathlib.Path]:
+    """Name -> folder; where no name is given the folder's package.xml has it."""
+    named = [item if "=" in item else f"{files.package_name(pathlib.Path(item).resolve())}={item}" for item in items]
+    return {name: pathlib.Path(folder) for name, folder in _pairs(named, "--package takes NAME=DIR or DIR").items()}
+
+
+def _pairs(items: Sequence[str], usage: str, sign: str = "=") -> dict[str, str]:
+    out = {}
+    for item in items:
+        name, equals, value = item.partition(sign)
+        if not (name and equals and (value or sign == ":=")):
+            raise UserError(f"{usage}, got {values.short(item)}")
+        out[name] = value
+    return out
+
+
+def _positions(text: str | None) -> Mapping[str, float]:
+    pairs = _pairs(text.split(",") if text else [], "--home takes JOINT=VALUE,...")
+    return {name: values.read(float, value, f"--home {name}") for name, value in pairs.items()}
+
+
+def _fixed(items: Sequence[str]) -> Mapping[str, float | None]:
+    out: dict[str, float | None] = {}
+    for item in items:
+        name, equals, value = item.partition("=")
+        try:
+            out[name] = float(value) if equals else None
+        except ValueError:
+            raise UserError(f"--fix takes JOINT or JOINT=VALUE with a number, got {item!r}") from None
+    return out
+
+
+def _print(report: Report) -> None:
+    screen, robot = console.screen(), report.robot
+    console.line(screen, f"{robot.name} -> {report.folder}", style="bold")
+    screen.print(_facts(report))
+    screen.print(_shapes(report))
+    for kind, style in (("warning", "yellow"), ("repaired", "cyan"), ("guessed", "dim")):
+        found = [n for n in report.notes if n.kind == kind]
+        shown = [n for n in found if kind != "guessed" or n.where == "robot"][:MOST_LINES]
+        for note in shown:
+            console.line(screen, f"{kind} {note.where} {note.name}: {note.text}", style)
+        if len(found) > len(shown):
+            console.line(screen, f"{kind} and {len(found) - len(shown)} more in report.json", style)
+    # A bare name might be one of the package's robots.
+    folder = shlex.quote(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
+    console.line(screen, f"next: {cli.called_as('inspect')} {folder}; {cli.called_as('train')} --env reach --robot {folder}")
+
+
+def _facts(report: Report) -> Table:
+    facts, robot = Table("", ("", ""), left=("",)), report.robot
+    moving = [row for row in report.joints.values() if not row.get("merged")]
+    mimics = sum("mimic" in row for row in moving)
+    bodies = len({row["body"] for row in report.links.values()})
+    facts.add("links", f"{len(report.links)} in {bodies} bodies, {report.mass:.3f} kg (URDF {report.mass_read:.3f} kg)")
+    facts.add("joints", f"{len(moving)} moving{f', {mimics} of them by mimic' if mimics else ''}; arm {len(robot.arm.joints)}")
+    facts.add("gripper", ", ".join(robot.gripper.joints) or "none")
+    table, cube = report.contacts["table"], report.contacts["table_and_cube"]
+    facts.add("contacts", f"at most {table} with the table, {cube} with a cube on it")
+    for name in ("workspace", "pick", "hold"):
+        if box := getattr(robot, name):
+            facts.add(name, ", ".join(f"{k} {a:g} .. {b:g} m" for k, (a, b) in zip("xyz", box, strict=True)))
+    return facts
+
+
+def _shapes(report: Report) -> Table:
+    columns = ("collision shape", "kind", "covers", "filled", "meets")
+    about = "covers: share of the part's surface inside the shape; filled: volume of the part's convex hull over the shape's"
+    shapes = Table("", columns, left=("kind", "meets"), caption=about)
+    for row in report.links.values():
+        for shape in row["shapes"]:
+            covers, filled = (f"{100 * shape[name]:.0f}%" if shape[name] else "-" for name in ("covered", "fill"))
+            shapes.add(shape["name"], shape["kind"], covers, filled, ", ".join(shape["meets"]) or "nothing")
+    return shapes

@@ -1,0 +1,20 @@
+"""What a robot or an environment is made of: python -m mjx_nero inspect nero --move --render nero.png"""
+
+from mjx_nero.sim.contacts import constraint_rows, contact_pairs
+from mjx_nero.tools.inspection.motion import moves
+from mjx_nero.tools.inspection.report import environments, find, inspect, inspect_robot, picture
+from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
+
+__all__ = [
+    "constraint_rows",
+    "contact_pairs",
+    "environment_table",
+    "environments",
+    "find",
+    "inspect",
+    "inspect_robot",
+    "move_table",
+    "moves",
+    "picture",
+    "tables",
+]

@@ -1,0 +1,54 @@
+"""The commands ``inspect`` and ``list-envs``."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from mjx_nero import cli, console, files
+from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tools.inspection.motion import moves
+from mjx_nero.tools.inspection.report import environments, find, inspect, picture
+from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line of ``inspect``."""
+    parser = cli.Parser(prog=cli.called_as("inspect"), description="Shows what a robot or an environment is made of.")
+    parser.add_load()
+    parser.add_argument("name", help="robot, environment, or folder of an imported robot")
+    parser.add_argument("--preset", help="of the environment (default: its first)")
+    parser.add_argument("--robot", help="for the environment: name, or folder of an imported robot")
+    parser.add_argument("--move", action="store_true", help="move every joint to its limits and the gripper open and closed")
+    parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
+    parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="everything, for programs")
+    args, _ = parser.parse(argv)
+    for path in filter(None, (args.render, args.json)):
+        files.check_writable(path)
+    robot, cfg = find(args.name, args.preset, args.robot)
+    report, screen = inspect(args.name, args.preset, args.robot), console.screen()
+    for view in tables(report):
+        screen.print(view)
+    moved = moves(robot, cfg.sim if cfg else SimCfg()) if args.move else ()
+    if moved:
+        screen.print(move_table(moved))
+    if args.render:
+        import imageio.v3 as imageio
+
+        image = picture(robot, cfg)
+        with files.whole(args.render) as part:
+            imageio.imwrite(part, image)
+        console.wrote(screen, "picture", args.render)
+    if args.json:
+        content: dict[str, Any] = {**dataclasses.asdict(report), "moves": [dataclasses.asdict(m) for m in moved]}
+        with files.whole(args.json) as part:
+            part.write_text(json.dumps(content, indent=2) + "\n")
+        console.wrote(screen, "json", args.json)
+
+
+def list_envs_main(argv: Sequence[str]) -> None:
+    """The command line of ``list-envs``."""
+    parser = cli.Parser(prog=cli.called_as("list-envs"), description="Lists the environments.")
+    parser.add_load()
+    parser.parse(argv)
+    console.screen().print(environment_table(environments()))

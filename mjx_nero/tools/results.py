@@ -1,0 +1,149 @@
+"""The table of results, made by one command for all environments: python -m mjx_nero results --json results.json. See --help."""
+
+import argparse
+import dataclasses
+import gc
+import json
+import pathlib
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from mjx_nero import cli, console, files
+from mjx_nero.envs import registry
+from mjx_nero.envs.task import for_controllers
+from mjx_nero.errors import UserError
+from mjx_nero.learn import evaluation, policy, run_cfg
+from mjx_nero.sim.physics import warp_available
+from mjx_nero.tools.benchmark import learning, machine
+
+Row = dict[str, Any]
+WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the policies that ship"}
+TARGETS = {"lift": 0.95, "reach": 0.98}  # success that a seed is trained to
+EVALUATIONS = 48  # of a seed, if it needs all of its env steps
+_COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
+    parser = cli.Parser(
+        prog=cli.called_as("results"),
+        description="Measures how every environment learns and what the policies that ship achieve, and makes the table of it.",
+        epilog=f"what can be measured:\n{lines}",
+    )
+    parser.add_load()
+    parser.add_argument("--json", type=cli.path(".json"), required=True, help="the figures; what it holds already is kept")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write the table of all that the JSON file holds")
+    parser.add_argument(
+        "--what", help=f"list of {', '.join(WHATS)}; none: only the table (default: all)", default=",".join(WHATS)
+    )
+    parser.add_argument("--envs", help="list (default: all that are there to be learnt)")
+    parser.add_argument("--seeds", type=cli.positive, default=8, help="of an environment (default: %(default)s)")
+    parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=1000, help="of a policy (default: %(default)s)")
+    args, _ = parser.parse(argv)
+    whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
+    envs = cli.choices(args.envs, "env", registry.list_envs()) if args.envs else learnable()
+    files.check_writable(args.json)
+    held = read(args.json)
+    cli.setup_jax()
+    measured_with = {"version": machine.versions()["mjx-nero"], "machine": machine.name(machine.machine())}
+    for what in whats:
+        for env in envs:
+            for name, row in _learning(env, args) if what == "learning" else _policies(env, args):
+                held.setdefault(env, {})[name] = row | measured_with
+                files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
+                print(f"{env}  {name}  {_seeds(row) if what == 'learning' else _success(row)}", file=sys.stderr)
+            gc.collect()
+    cells = list(rows(held))
+    table = console.Table("results", _COLUMNS, left=("measured with",))
+    for line in cells:
+        table.add(*line)
+    console.screen().print(table)
+    if args.markdown:
+        with files.whole(args.markdown) as part:
+            part.write_text(markdown(cells))
+
+
+def learnable() -> list[str]:
+    """Environments with a robot of their own, and with actions that are made to be learnt."""
+    cfgs = {name: registry.env_cfg(name) for name in registry.list_envs() if registry.robot_of(name) is not None}
+    return [name for name, cfg in cfgs.items() if for_controllers(cfg) is not cfg]
+
+
+def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
+    """Figures by environment and kind.
+
+    Raises:
+        UserError: the file is none that this command wrote.
+    """
+    if not path.exists():
+        return {}
+    try:
+        held = json.loads(path.read_text())
+        list(rows(held))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        raise UserError(f"{path} holds no results: name another file") from None
+    return held
+
+
+def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
+    """All seeds of an environment, by the settings that ``train.py --env`` has."""
+    run, _ = run_cfg.fit_machine(run_cfg.resolve(env, "default", None, {}, {}))
+    run = dataclasses.replace(run, eval_every=run.num_timesteps // EVALUATIONS)
+    *_, total = learning.measure_learning(run, args.seeds, TARGETS["lift" if run.env.scene.objects else "reach"])
+    yield "learning", total
+
+
+def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
+    """The policy that ships, in MuJoCo's C library and, where there is a GPU, on Warp."""
+    if not policy.shipped(env).exists():
+        return
+    backends = {"native": "mujoco"} | ({"warp": "mjx"} if warp_available() else {})
+    for name, backend in backends.items():
+        cfg = evaluation.EvalCfg(env, agent="policy", episodes=args.episodes, backend=backend)
+        result = evaluation.play(cfg).result
+        yield name, {n: result[n] for n in ("success_rate", "success_rate_95", "episodes", "nan_count", "overflow_count")}
+
+
+def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
+    """Cells of the table, a row an environment."""
+    for env, kinds in held.items():
+        learnt, native, warp = (kinds.get(name) for name in ("learning", "native", "warp"))
+        of = dict.fromkeys(f"{row['version']}, {row['machine']}" for row in (learnt, native, warp) if row)
+        spread = [""] * 4
+        if learnt:
+            spread = [
+                f"{learnt['target']:.0%}",
+                _seeds(learnt),
+                _spread(learnt, "seconds"),
+                _spread(learnt, "env_steps", 1e-6, " M"),
+            ]
+        yield (env, *spread, _success(native), _success(warp), "; ".join(of))
+
+
+def markdown(cells: Sequence[tuple[str, ...]]) -> str:
+    """The table as Markdown."""
+    lines = [_COLUMNS, tuple("---" for _ in _COLUMNS), *cells]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _seeds(row: Row) -> str:
+    return f"{row['reached']} of {row['seeds']}"
+
+
+def _spread(row: Row, name: str, unit: float = 1.0, word: str = "") -> str:
+    """Median and worst of the seeds."""
+
+    def text(which: str) -> str:
+        value = row[f"{name}_{which}"]
+        return "never" if value is None else f"{unit * value:.1f}{word}"
+
+    return f"median {text('median')}, worst {text('worst')}"
+
+
+def _success(row: Row | None) -> str:
+    if not row:
+        return ""
+    low, high = row["success_rate_95"]
+    return f"{row['success_rate']:.1%} ({100 * low:.1f} to {100 * high:.1f}), {row['episodes']:,} episodes"

@@ -1,0 +1,120 @@
+"""The command ``robustness``."""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import mjx_nero
+from mjx_nero import cli, config, console, files
+from mjx_nero.envs import registry
+from mjx_nero.errors import UserError
+from mjx_nero.tools.robustness import sweeps
+
+STEP = "physics step [factor]"
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    parser = cli.Parser(
+        prog=cli.called_as("robustness"),
+        description="Plays a policy over the range of each parameter of the world, one at a time and all at once.",
+    )
+    parser.add_environment(registry.list_envs())
+    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the one that ships for the environment)")
+    parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="of each setting (default: %(default)s)")
+    parser.add_seed(90210)
+    parser.add_impl()
+    parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="parameters with this in their name; again")
+    parser.add_argument("--json", type=cli.path(".json"), help="write the figures as JSON")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write the curves")
+    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    for path in filter(None, (args.json, args.plot)):
+        files.check_writable(path)
+    cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
+    names = [name for name in (*sweeps.sweeps(cfg), STEP) if not args.only or any(text in name for text in args.only)]
+    if not names:
+        raise UserError(
+            f"no parameter has {' or '.join(args.only)} in its name: choose from {', '.join(sweeps.sweeps(cfg))}, {STEP}"
+        )
+    cli.setup_jax()
+    result = measure(args, cfg, names)
+    screen = console.screen()
+    screen.print(table(result))
+    if args.json:
+        files.write_json(args.json, result)
+        console.wrote(screen, "figures", args.json)
+    if args.plot:
+        save_plot(args.plot, result)
+        console.wrote(screen, "curves", args.plot)
+
+
+def measure(args: Any, cfg: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Success over the parameters ``names``: plain JSON."""
+    from mjx_nero.tools.robustness.measure import Bench
+
+    curves: dict[str, list[dict[str, Any]]] = {}
+    bench = Bench(args.env, cfg, args.policy, args.episodes, args.impl, args.seed)
+    for name, points in sweeps.sweeps(cfg).items():
+        if name in names:
+            curves[name] = [{"value": value, **bench.success(point)} for value, point in points]
+            _progress(name, curves[name])
+    if STEP in names:
+        curves[STEP] = []
+        for factor, decimation in ((0.5, 2 * cfg.sim.decimation), (2.0, cfg.sim.decimation // 2)):
+            if decimation:
+                other = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, dt=factor * cfg.sim.dt, decimation=decimation))
+                played = Bench(args.env, other, args.policy, args.episodes, args.impl, args.seed).success(sweeps.Point())
+                curves[STEP].append({"value": factor, **played})
+        _progress(STEP, curves[STEP])
+    return {
+        "env": args.env,
+        "preset": args.preset,
+        "policy": args.policy and args.policy.name,
+        "backend": bench.env.backend,
+        "episodes": args.episodes,
+        "seed": args.seed,
+        "version": mjx_nero.__version__,
+        "curves": curves,
+    }
+
+
+def _progress(name: str, curve: Sequence[dict[str, Any]]) -> None:
+    shares = ", ".join(f"{point['value']:g}: {point['success_rate']:.1%}" for point in curve)
+    console.line(console.screen(stderr=True), f"{name}: {shares}")
+
+
+def table(result: dict[str, Any]) -> console.Table:
+    """A line a setting."""
+    title = f"{result['env']} · {result['backend']} · {result['episodes']} episodes a setting"
+    view = console.Table(title, ("parameter", "value", "success", "95% interval"))
+    for name, curve in result["curves"].items():
+        for point in curve:
+            low, high = point["success_rate_95"]
+            view.add(name, f"{point['value']:g}", f"{point['success_rate']:.1%}", f"{low:.1%} to {high:.1%}")
+    return view
+
+
+def save_plot(path: pathlib.Path, result: dict[str, Any]) -> None:
+    """A panel a parameter: success with its intervals."""
+    from matplotlib.figure import Figure
+
+    curves = result["curves"]
+    columns = min(4, len(curves))
+    rows = math.ceil(len(curves) / columns)
+    figure = Figure(figsize=(3.2 * columns, 0.6 + 2.3 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for panel, (name, curve) in zip(panels, curves.items(), strict=False):
+        values, rates = [p["value"] for p in curve], [p["success_rate"] for p in curve]
+        low, high = zip(*(p["success_rate_95"] for p in curve), strict=True)
+        panel.plot(values, rates, marker="o", markersize=3, color="tab:blue")
+        panel.fill_between(values, low, high, color="tab:blue", alpha=0.2)
+        panel.set_title(name, loc="left", fontsize=9)
+        panel.set_ylim(-0.02, 1.02)
+        panel.grid(alpha=0.3)
+    for panel in panels[len(curves) :]:
+        panel.set_axis_off()
+    figure.suptitle(f"success of {result['env']}, version {result['version']}", x=0.01, ha="left")
+    with files.whole(path) as part:
+        figure.savefig(part, dpi=110)

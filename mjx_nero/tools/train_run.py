@@ -1,0 +1,130 @@
+"""What ``train`` does once its flags are read: starts a run or goes on with one, and tells what it came to."""
+
+import argparse
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from mjx_nero import cli, console
+from mjx_nero.errors import UserError
+from mjx_nero.learn import learner, machines, resume, seeds, track, training
+from mjx_nero.learn.checkpoints import saved
+from mjx_nero.learn.run_cfg import RunCfg
+from mjx_nero.learn.run_folder import CONFIG
+from mjx_nero.sim import render
+
+
+def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], flags: Collection[str]) -> None:
+    """Trains as the flags say.
+
+    Args:
+        dotted: fields by prefix.
+        flags: those that the user gave.
+    """
+    sizes = {k: v for k, v in (("num_envs", args.num_envs), ("num_timesteps", args.num_timesteps)) if v}
+    learner.find(args.learner)
+    track.check(args.track)
+    if args.seeds and (args.restore or args.resume):
+        raise UserError("--seeds starts new runs: go on with one of them by --restore RUN/seed_N alone")
+    run = training.resolve(
+        args.env,
+        args.preset,
+        args.robot,
+        dotted["env"],
+        {**sizes, **dotted[args.learner]},
+        learner=args.learner,
+        impl=args.impl,
+        seed=args.seed,
+        out=args.out,
+        restore=args.restore,
+        checkpoint_minutes=args.checkpoint_minutes,
+        on_nan=args.on_nan,
+        auto=args.resume == "auto",
+        eval_every=args.eval_every,
+        checkpoint_every=args.checkpoint_every,
+        keep=args.keep,
+        max_minutes=args.max_minutes,
+        num_devices=args.num_devices,
+        track=args.track,
+    )
+    run = going_on(run, flags, dotted)
+    cli.setup_jax()
+    machines.join()
+    if "num_devices" not in flags and machines.several():
+        run = dataclasses.replace(run, num_devices=machines.default_devices())
+    if args.seeds:
+        rows, folder, code = seeds.train(run, args.seeds, command=cli.called_as("train"))
+        report_seeds(rows, folder)
+        sys.exit(code)
+    summary = training.train(run, command=cli.called_as("train"))
+    if not machines.first():
+        sys.exit(summary["code"])
+    films = args.video and not summary["code"]
+    report(summary, films)
+    if films:
+        video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
+        training.film(run, pathlib.Path(summary["folder"]), video)
+    if summary["code"]:
+        sys.exit(summary["code"])
+
+
+def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]]) -> RunCfg:
+    """The run itself, or that of the folder which it is to go on with.
+
+    Raises:
+        UserError: flags that contradict each other or that run.
+    """
+    folder = run.restore
+    if run.auto:
+        if not run.out or run.restore:
+            raise UserError("--resume auto needs --out, the folder to go on with or to start in, and no --restore")
+        folder = run.out if saved(run.out) else None
+    if folder is None or not (folder / CONFIG).is_file() or run.out not in (None, folder):
+        return run
+    return dataclasses.replace(resume.same_run(folder, run, flags, dotted), auto=run.auto)
+
+
+def report(summary: dict[str, Any], films: bool) -> None:
+    """What a run came to, for people."""
+    pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
+    print(f"{pace}, success {summary['evaluation']['success_rate']:.1%}")
+    names = "policy.safetensors, best.safetensors, curve.png, metrics.jsonl, checkpoints/"
+    print(f"{summary['folder']}: {names}{', video.mp4 (to be drawn now)' if films else ''}", flush=True)
+    if summary["nan_count"] or summary["overflow_count"]:
+        print(
+            f"physics: {summary['nan_count']} environments reset after NaN, {summary['overflow_count']} steps with lost contacts"
+        )
+    if summary["lost"]:
+        print(f"lost for want of a disk to write to: {', '.join(f'{n} x {name}' for name, n in summary['lost'].items())}")
+
+
+def report_seeds(rows: list[dict[str, Any]], folder: pathlib.Path) -> None:
+    """A row a seed, and what they come to together, for people."""
+    table = console.Table(
+        f"{folder}", ("seed", "success", "95% interval", "s to 95%", "env steps", "s", "ended"), left=("ended",)
+    )
+    for row in rows:
+        table.add(
+            str(row["seed"]),
+            f"{row['success_rate']:.1%}",
+            _span(row["success_rate_95"], "{:.1%}"),
+            "-" if row["seconds_to_95"] is None else f"{row['seconds_to_95']:.1f}",
+            f"{row['env_steps']:,}",
+            f"{row['train_s']:.0f}",
+            row["stopped"],
+        )
+    about, screen = seeds.summary(rows), console.screen()
+    screen.print(table)
+    text = f"{about['reached_95']} of {about['seeds']} seeds reached 95% ({_span(about['reached_95_interval'], '{:.0%}')})"
+    if about["seconds_to_95_median"] is not None:
+        text += f", after {about['seconds_to_95_median']:.1f} s in the median"
+    if about["seconds_to_95_interval"] is not None:
+        text += f" (mean: {_span(about['seconds_to_95_interval'], '{:.1f}')})"
+    text += f"; mean success {about['success_rate_mean']:.1%} ({_span(about['success_rate_interval'], '{:.1%}')})"
+    console.line(screen, f"{text}. In brackets: 95% intervals")
+
+
+def _span(interval: Sequence[float] | None, form: str) -> str:
+    return "-" if interval is None else " to ".join(form.format(end) for end in interval)

@@ -1,0 +1,28 @@
+"""Gains for a robot's drives from its own model: python -m mjx_nero tune-gains --robot nero --out gains.yaml --plot gains.png
+
+In MuJoCo's C library, without contacts and without a limit on the targets' speed: the drives themselves are seen. ``proposal``
+says how gains are chosen, from the ``load`` that each drive has to move; ``response`` shows what they do with it.
+"""
+
+from mjx_nero.tools.tuning.command import main
+from mjx_nero.tools.tuning.load import Load, loads
+from mjx_nero.tools.tuning.model import drives_model
+from mjx_nero.tools.tuning.proposal import Tuning, gains, propose, tune
+from mjx_nero.tools.tuning.report import plot, table
+from mjx_nero.tools.tuning.response import Response, respond, steps
+
+__all__ = [
+    "Load",
+    "Response",
+    "Tuning",
+    "drives_model",
+    "gains",
+    "loads",
+    "main",
+    "plot",
+    "propose",
+    "respond",
+    "steps",
+    "table",
+    "tune",
+]

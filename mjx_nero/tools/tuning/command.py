@@ -1,0 +1,51 @@
+"""The command ``tune-gains``."""
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+
+from mjx_nero import cli, console, files
+from mjx_nero.envs import registry
+from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tools.tuning.proposal import tune
+from mjx_nero.tools.tuning.report import save_gains, save_plot, table
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    parser = cli.Parser(
+        prog=cli.called_as("tune-gains"),
+        description="Proposes stiffness and damping for a robot's drives, and shows the step responses before and after.",
+    )
+    parser.add_load()
+    parser.add_argument("--robot", required=True, help="name, or folder of an imported robot")
+    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML of the gains, for import-urdf --gains")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of the step responses")
+    parser.add_argument(
+        "--step",
+        type=cli.positive_float,
+        default=0.1,
+        help="of the target, within the drives' effort, rad or m; at most a tenth of a joint's range (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--frequency", type=cli.positive_float, help="bound of the natural frequency, Hz (default: one radian a control step)"
+    )
+    parser.add_argument("--dt", type=cli.positive_float, default=SimCfg.dt, help="physics step, s (default: %(default)s)")
+    parser.add_argument(
+        "--gravity-compensation", action=argparse.BooleanOptionalAction, help="instead of the robot's own setting"
+    )
+    args, _ = parser.parse(argv)
+    for path in filter(None, (args.out, args.plot)):
+        files.check_writable(path)
+    robot = registry.robot(args.robot)
+    if args.gravity_compensation is not None:
+        robot = dataclasses.replace(robot, gravity_compensation=args.gravity_compensation)
+    tuning = tune(robot, args.step, args.frequency, SimCfg(dt=args.dt))
+    screen = console.screen()
+    screen.print(*table(tuning))
+    if args.plot:
+        save_plot(tuning, args.plot)
+        console.wrote(screen, "plot", args.plot)
+    if args.out:
+        save_gains(tuning, args.out)
+        console.wrote(screen, "gains", args.out)

@@ -1,0 +1,124 @@
+"""Step responses of drives, in MuJoCo's C library."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from mjx_nero.tools.tuning.model import driven, leaders, pose_model, ranges
+
+SECONDS = 5.0  # of a response: several time constants of the slowest drive in the package
+_SHARE = 0.1  # a step is at most this share of the joint's range: 5 mm on a finger's slide of 50 mm
+_BAND = 0.02  # settled: within this share of the way
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """A joint's answer to a step of its drive's target.
+
+    Attributes:
+        joint: its name.
+        step: by which the target moved [rad or m].
+        time: [n] since the step, from 0 [s].
+        position: [n] way since the step [rad or m].
+        force: [n - 1] of the drive, during each physics step [N m or N].
+        error: what lacks to the target at the end [rad or m]; gravity's sag included.
+        effort: the drive's limit [N m or N].
+    """
+
+    joint: str
+    step: float
+    time: np.ndarray
+    position: np.ndarray
+    force: np.ndarray
+    error: float
+    effort: float
+
+    @property
+    def share(self) -> np.ndarray:
+        """[n] of the way to where the joint comes to rest; NaN where it does not move."""
+        end = self.position[-1]
+        return self.position / end if abs(end) > 1e-6 * abs(self.step) else np.full_like(self.position, np.nan)
+
+    @property
+    def rise(self) -> float:
+        """From 10% to 90% of the way [s]."""
+        return self._first(0.9) - self._first(0.1)
+
+    @property
+    def overshoot(self) -> float:
+        """Beyond the end, as a share of the way."""
+        return float(np.max(self.share)) - 1.0
+
+    @property
+    def settling(self) -> float:
+        """Until within 2% of the way for good [s]; inf if the joint still moves at the end."""
+        share = self.share
+        outside = np.flatnonzero(~(np.abs(share - 1) <= _BAND))
+        last = outside[-1] if len(outside) else -1
+        return float(self.time[last + 1]) if last < 0.9 * len(share) else math.inf
+
+    @property
+    def saturation(self) -> float:
+        """Share of the time until settled that the drive pushes with all its effort."""
+        full = np.abs(self.force) >= self.effort * (1 - 1e-6)
+        return float(np.mean(full[self.time[1:] <= max(self.settling, self.time[1])]))
+
+    def _first(self, level: float) -> float:
+        share = self.share
+        above = np.flatnonzero(share >= level)
+        if not len(above):
+            return math.nan
+        k = above[0]
+        return float(np.interp(level, share[k - 1 : k + 1], self.time[k - 1 : k + 1]))
+
+
+def steps(model: mujoco.MjModel, pose: Sequence[float], step: float) -> np.ndarray:
+    """[nu] steps of the drives' targets: ``step``, at most a tenth of the joint's range, away from its nearer end."""
+    (joints, _), (leader, ratio), at = driven(model), leaders(model), np.asarray(pose)
+    lower, upper = ranges(model)[joints].T
+    size = np.minimum(step, _SHARE * (upper - lower)) * np.where(at - lower > upper - at, -1, 1)
+    first = np.array([np.flatnonzero(leader == c)[0] for c in leader])  # coupled joints step together
+    return size[first] * ratio / ratio[first]
+
+
+def respond(model: mujoco.MjModel, pose: Sequence[float], step: float, seconds: float = SECONDS) -> tuple[Response, ...]:
+    """Step responses of all drives of a model, one after another; the others hold ``pose``. Coupled joints step together.
+
+    Args:
+        model: with position drives on joints.
+        pose: [nu], where the drives hold the joints before the step [rad or m].
+        step: see ``steps``.
+    """
+    data, (joints, _) = mujoco.MjData(model), driven(model)
+    at = model.jnt_qposadr[joints]
+    held, change, (leader, _) = np.asarray(pose, float), steps(model, pose, step), leaders(model)
+    pose_model(model, data, held)
+    n = max(2, round(seconds / model.opt.timestep))
+    for _ in range(n):  # gravity sags the joints
+        mujoco.mj_step(model, data)
+    rest = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
+    out: dict[int, Response] = {}
+    efforts = np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf)
+    for c in np.unique(leader):
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = rest
+        data.ctrl[:] = held + np.where(leader == c, change, 0)
+        path, force = [data.qpos[at].copy()], []
+        for _ in range(n):
+            mujoco.mj_step(model, data)
+            path.append(data.qpos[at].copy())
+            force.append(data.actuator_force.copy())
+        positions, forces = np.array(path), np.array(force)
+        for i in map(int, np.flatnonzero(leader == c)):
+            out[i] = Response(
+                joint=model.joint(joints[i]).name,
+                step=float(change[i]),
+                time=model.opt.timestep * np.arange(n + 1),
+                position=positions[:, i] - positions[0, i],
+                force=forces[:, i],
+                error=float(data.ctrl[i] - positions[-1, i]),
+                effort=float(efforts[i]),
+            )
+    return tuple(out[i] for i in range(model.nu))

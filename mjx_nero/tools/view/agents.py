@@ -1,0 +1,105 @@
+"""Who can act in a viewed environment: policies, controllers, and the user's own hand on the joints."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_nero import control
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.interop import actions
+from mjx_nero.learn import checkpoint, header, policy, rollout
+from mjx_nero.types import UserError
+
+SLIDERS = "joint sliders"
+Make = Callable[[], rollout.Agent]
+
+
+@struct.dataclass
+class _Trained:
+    """What a viewer reads of a training's checkpoint."""
+
+    normalizer: object
+    params: object
+
+
+def known(env: ManipulationEnv, env_name: str, files: list[pathlib.Path]) -> dict[str, Make]:
+    """Name -> how to make it: policy files and the policy that ships, controllers, sliders, and who knows nothing."""
+    found: dict[str, Make] = {}
+    shipped = policy.shipped(env_name)
+    for path in [*files, *([shipped] if shipped.is_file() else [])]:
+        name = f"policy {path.stem}" if path == shipped else f"policy {path}"
+        found[name] = lambda path=path: of_policy(load(env, env_name, path))  # type: ignore[misc]
+    able: dict[str, Mapping[str, Any]] = dict(env.cfg.controllers)
+    if not able and env.cfg.scene.goal == "frame":  # a pose is commanded, which is all that a follower asks for
+        able["ik"] = {}
+        if (env.cfg.robot.xml.parent / "rmpflow").is_dir():
+            able["rmpflow"] = {}
+    for name, fields in able.items():
+        found[name] = lambda name=name, fields=fields: of_controller(  # type: ignore[misc]
+            env, control.make(name, env.cfg.robot, env.dt, fields)
+        )
+    found[SLIDERS] = lambda: of_targets(env)
+    found["zero"] = lambda: _always(lambda key, n: jnp.tile(jnp.asarray(env.home_action), (n, 1)))
+    found["random"] = lambda: _always(lambda key, n: jax.random.uniform(key, (n, env.action_size), minval=-1, maxval=1))
+    return found
+
+
+def load(env: ManipulationEnv, env_name: str, path: pathlib.Path) -> policy.Policy:
+    """A policy for ``env``, of a policy file or of a training's checkpoint.
+
+    Raises:
+        UserError: missing, damaged, or it does not fit.
+    """
+    if checkpoint.load_meta(path).get("kind") != "checkpoint":
+        return policy.load_for(env, env_name, path)
+    meta = checkpoint.load_meta(path)
+    header.check(meta, path)
+    sizes = {name: tuple(size) for name, size in meta["observation_size"].items()}
+    if (meta["env"], sizes["state"]) != (env_name, env.observation_size["state"]):
+        raise UserError(f"{path} is a checkpoint of {meta['env']} (preset {meta['preset']}): pass these with --env and --preset")
+    cfg: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in meta["network"].items()}
+    nets = policy.make_networks(sizes, meta["action_size"], policy.NetworkCfg(**{"max_observation": 0.0, **cfg}))
+    template = jax.eval_shape(lambda key: _Trained(*policy.init_params(nets, sizes, key)), jax.random.PRNGKey(0))
+    trained = checkpoint.load(path, template)
+    params = (trained.normalizer, trained.params)
+    return policy.Policy(meta=meta, params=params, act=policy.make_act(nets, params))
+
+
+def of_policy(trained: policy.Policy) -> rollout.Agent:
+    """Deterministic."""
+    return rollout.policy_agent(lambda params, obs, key: trained.act(obs))
+
+
+def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollout.Agent:
+    """In any environment: its drive targets as the action that gives them."""
+    steering = rollout.controller_agent(env, controller)
+
+    def act(params, memory, state, key):
+        targets, memory = steering.act(params, memory, state, key)
+        return actions.for_targets(env, targets), memory
+
+    return dataclasses.replace(steering, act=act)
+
+
+def of_targets(env: ManipulationEnv) -> rollout.Agent:
+    """Takes the drives' position targets [joints] as its parameters."""
+
+    def act(targets, memory, state, key):
+        return actions.for_targets(env, jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))), memory
+
+    return rollout.Agent(act, init=lambda state: ())
+
+
+def _always(draw: Callable) -> rollout.Agent:
+    return rollout.Agent(lambda params, memory, state, key: (draw(key, state.done.shape[0]), memory), init=lambda state: ())
+
+
+def newest(run: pathlib.Path) -> pathlib.Path | None:
+    """The last policy or checkpoint that a training has written into its folder."""
+    files = [*run.glob("policy.safetensors"), *run.glob("checkpoints/*.safetensors")]
+    return max(files, key=lambda path: (path.stat().st_mtime, path.name), default=None)

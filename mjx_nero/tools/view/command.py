@@ -1,0 +1,188 @@
+"""The command line of ``view``, and what it starts."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import pathlib
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from mjx_nero import cli, config
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.interop import need
+from mjx_nero.tools.view import agents
+from mjx_nero.types import UserError
+
+WATCH_S = 2.0  # how often a followed run is looked at
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line.
+
+    Raises:
+        UserError: unknown names, a policy that does not fit, the extra ``view`` is missing, or the port is taken.
+    """
+    parser = cli.Parser(prog=cli.called_as("view"), description="Shows environments in a browser: watch them, and take part.")
+    parser.add_environment(registry.list_envs())
+    parser.add_argument("--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint; again for more")
+    parser.add_argument("--agent", help="who acts first: a controller, zero, random, or 'joint sliders' (default: a policy)")
+    parser.add_argument(
+        "--run", type=pathlib.Path, metavar="FOLDER", help="follow a training: its environment, its newest checkpoint"
+    )
+    parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="side by side (default: %(default)s)")
+    parser.add_seed(1)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at; others than this machine's need a token")
+    parser.add_argument("--port", type=cli.at_most(65535), default=8080, help="(default: %(default)s)")
+    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    given = parser.given(argv)  # else what the run says
+    serve(
+        env_name=args.env if "env" in given else None,
+        preset=args.preset if "preset" in given else None,
+        robot=args.robot,
+        policies=args.policy,
+        agent=args.agent,
+        run=args.run,
+        num_envs=args.num_envs,
+        seed=args.seed,
+        host=args.host,
+        port=args.port,
+        overrides=dotted["env"],
+    )
+
+
+def serve(**kwargs: Any) -> None:
+    """Serves the page until Ctrl-C.
+
+    Args:
+        kwargs: of ``open_view``.
+    """
+    need("viser", "view")
+    cli.setup_jax()
+    view = open_view(**kwargs)
+    print(f"{view.url}  (Ctrl-C ends it)", flush=True)
+    try:
+        view.wait()
+    finally:
+        view.close()
+
+
+class View:
+    """A page that is being served.
+
+    Attributes:
+        url: to open, with the token where there is one.
+        session: what it shows.
+        panel: its controls.
+    """
+
+    def __init__(self, server, door, session, panel, run: pathlib.Path | None, env_name: str):
+        self._server, self._door, self.session, self.panel = server, door, session, panel
+        self.url = door.url if door else f"http://localhost:{server.get_port()}"
+        self._run, self._env_name = run, env_name
+        self._seen: pathlib.Path | None = None
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, shown) -> None:
+        """Lets the session run."""
+        self._thread = threading.Thread(target=self.session.run, args=(shown,), daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Until the simulation fails; follows the run meanwhile."""
+        while self.session.failure is None and not self._ended.wait(WATCH_S):
+            self.follow()
+        if self.session.failure is not None:
+            raise self.session.failure
+
+    def follow(self) -> None:
+        """Plays the newest checkpoint of the run, if there is one that did not play yet."""
+        newest = agents.newest(self._run) if self._run else None
+        if newest is None or newest == self._seen:
+            return
+        self._seen, env = newest, self.session.env
+        self.panel.add(f"run {newest.stem}", lambda: agents.of_policy(agents.load(env, self._env_name, newest)))
+        self.session.reset()
+
+    def close(self) -> None:
+        """Ends simulation and server."""
+        self._ended.set()
+        self.session.stop()
+        if self._thread:
+            self._thread.join(timeout=5)
+        if self._door:
+            self._door.close()
+        with contextlib.redirect_stdout(io.StringIO()):  # it tells of it
+            self._server.stop()
+
+
+def open_view(
+    env_name: str | None = None,
+    preset: str | None = None,
+    robot: str | None = None,
+    policies: Sequence[pathlib.Path] = (),
+    agent: str | None = None,
+    run: pathlib.Path | None = None,
+    num_envs: int = 1,
+    seed: int = 1,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    overrides: Mapping[str, Any] | None = None,
+) -> View:
+    """Serves the page, and lets the environments run.
+
+    Args:
+        agent: a name of ``agents.known``; None: a policy, a controller, or if there is none the joint sliders.
+        run: folder of a training to follow.
+        host: address to listen at; with another than this machine's own the page asks for a token.
+        port: the first free one from here on.
+
+    Raises:
+        UserError: as the command.
+    """
+    viser = need("viser", "view")
+    from mjx_nero.tools.view import door, panel, scene, session
+
+    described = _described(run) if run else {}
+    env_name = env_name or described.get("env_name", "nero_lift")
+    cfg = registry.env_cfg(env_name, preset or described.get("preset", "default"), robot)
+    env = ManipulationEnv(
+        config.override(dataclasses.replace(cfg, corruption=False), overrides or {}), impl="native", num_envs=num_envs
+    )
+    makers = agents.known(env, env_name, list(policies))
+    chosen = _chosen(agent, list(makers), env_name)
+    home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
+    sim = session.Session(env, num_envs, makers[chosen](), home, seed)
+    local = host in ("127.0.0.1", "localhost", "::1")
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints an address, which with a door is not the one to open
+        server = viser.ViserServer(host="127.0.0.1", port=port if local else 0, verbose=False)
+    guard = None if local else door.Door(host, port, server.get_port())
+    picture, controls = scene.Scene(server, sim, env.mj_model), panel.Panel(server, sim, makers, chosen)
+    view = View(server, guard, sim, controls, run, env_name)
+
+    def shown(frame) -> None:
+        picture.show(frame)
+        controls.show(frame)
+
+    view.start(shown)
+    return view
+
+
+def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
+    """Who acts first; a policy may be named without that word."""
+    found = next((name for name in (agent or names[0], f"policy {agent}") if name in names), None)
+    if found is None:
+        raise UserError(f"nobody called {agent!r} can act in {env_name}: choose one of {', '.join(names)}")
+    return found
+
+
+def _described(run: pathlib.Path) -> dict[str, Any]:
+    try:
+        return json.loads((run / "config.json").read_text())
+    except (OSError, ValueError):
+        raise UserError(f"{run} is not the folder of a training: give what train.py wrote to (--out)") from None

@@ -1,0 +1,151 @@
+"""The picture: each body of the model as a mesh in the browser, one instance an environment."""
+
+from collections.abc import Callable, Iterator
+from typing import cast
+
+import mujoco
+import numpy as np
+import trimesh
+
+from mjx_nero.sim.touch import OBSTACLE
+from mjx_nero.tools.view.session import Frame, Session, free_joints
+
+HIDDEN = 3  # geom groups from here on: what collides
+APART = 1.5  # between environments [m]
+
+
+class Scene:
+    """Shows frames, and turns drags of goals and things into orders to the session.
+
+    Args:
+        server: a ``viser.ViserServer``.
+        model: with visual shapes (``ManipulationEnv.mj_model``).
+    """
+
+    def __init__(self, server, session: Session, model: mujoco.MjModel):
+        self._server, self._session, self._model, self._data = server, session, model, mujoco.MjData(model)
+        across = int(np.ceil(np.sqrt(session.size)))
+        self._corners = np.array([(i // across * APART, i % across * APART, 0.0) for i in range(session.size)])
+        server.scene.set_up_direction("+z")
+        server.scene.configure_environment_map(hdri=None)  # the maps there are come from the internet
+        server.scene.configure_default_lights(cast_shadow=False)  # shadows are dear for a browser that draws in software
+        server.scene.add_light_hemisphere("/light", sky_color=(255, 255, 255), ground_color=(170, 160, 150), intensity=1.5)
+        middle = self._corners.mean(0)
+        camera = model.camera("front")
+        # One environment as in the package's pictures, several from farther off.
+        server.initial_camera.look_at = tuple(middle + model.stat.center)
+        server.initial_camera.position = tuple(middle + model.stat.center + (camera.pos - model.stat.center) * across)
+        server.initial_camera.fov = float(np.radians(camera.fovy[0]))
+        positions, quats = self._poses(session.frame)
+        self._standing = [int(geom) for geom in np.flatnonzero(model.geom_contype & OBSTACLE)]
+        self._stand: np.ndarray = np.empty(0)
+        self._place(session.frame)
+        self._bodies = []
+        for body, name, mesh, rgba in _meshes(model):
+            handle = server.scene.add_batched_meshes_simple(
+                name,
+                mesh.vertices.astype(np.float32),
+                mesh.faces,
+                batched_positions=positions[body],
+                batched_wxyzs=quats[body],
+                batched_colors=tuple(int(255 * c) for c in rgba[:3]),
+                opacity=float(rgba[3]) if rgba[3] < 1 else None,
+                lod="off",
+            )
+            self._bodies.append((body, handle))
+            self._draggable(handle, model.body(body).name)
+
+    def show(self, frame: Frame) -> None:
+        """Moves the bodies."""
+        positions, quats = self._poses(frame)
+        with self._server.atomic():
+            for body, handle in self._bodies:
+                if body:  # the world stands
+                    handle.batched_positions, handle.batched_wxyzs = positions[body], quats[body]
+            self._place(frame)
+
+    def _place(self, frame: Frame) -> None:
+        """Draws obstacles anew where an episode has others (see ``ManipulationEnv.scenery``)."""
+        boxes = frame.goal[:, 7:].reshape(len(frame.goal), -1, 10)
+        if np.array_equal(boxes, self._stand):
+            return
+        self._stand = boxes
+        for i, corner in enumerate(self._corners):
+            for geom, box in zip(self._standing, boxes[i], strict=False):
+                color = tuple(int(255 * c) for c in self._model.geom_rgba[geom][:3])
+                name = f"/obstacles/{i}/{self._model.geom(geom).name}"
+                self._server.scene.add_box(name, color, dimensions=box[7:], position=box[:3] + corner, wxyz=box[3:7])
+
+    def _poses(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [bodies, n, 3] and orientations [bodies, n, 4] of all bodies."""
+        model, data, n = self._model, self._data, len(frame.qpos)
+        positions, quats = np.empty((model.nbody, n, 3), np.float32), np.empty((model.nbody, n, 4), np.float32)
+        for i in range(n):
+            data.qpos[:] = frame.qpos[i]
+            data.mocap_pos[0], data.mocap_quat[0] = frame.goal[i, :3], frame.goal[i, 3:7]
+            mujoco.mj_kinematics(model, data)
+            positions[:, i], quats[:, i] = data.xpos + self._corners[i], data.xquat
+        return positions, quats
+
+    def _draggable(self, handle, body: str) -> None:
+        things = free_joints(self._model)
+        if body not in things and body != "goal":
+            return
+
+        grabbed: dict[int, np.ndarray] = {}  # by browser, from where the mouse took hold to the middle
+
+        @handle.on_drag
+        async def _(event) -> None:  # a coroutine, for these alone come in order
+            i = event.instance_index or 0
+            if event.phase == "start":  # later on the browser's picture is behind what it has been told
+                grabbed[event.client_id] = np.asarray(handle.batched_positions[i]) - event.start_position
+            to = event.end_position + grabbed[event.client_id] - self._corners[i]
+            if body == "goal":
+                self._session.move_goal(i, to)
+            else:
+                self._session.move_object(i, things[body], to)
+
+
+def _meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:
+    """(body, name, mesh in the body's frame, colour): the visible geoms of a body, those of one colour in one mesh."""
+    for body in range(model.nbody):
+        found: dict[tuple[float, ...], list[trimesh.Trimesh]] = {}
+        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < HIDDEN)):
+            if model.geom_contype[geom] & OBSTACLE:  # differ from one environment to the other
+                continue
+            material = model.geom_matid[geom]
+            rgba = tuple(float(x) for x in (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]))
+            make = _SHAPES.get(int(model.geom_type[geom]))
+            if make is None or rgba[3] == 0:
+                continue
+            pose = np.eye(4)
+            rotation = np.empty(9)
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+            found.setdefault(rgba, []).append(make(model, int(geom)).apply_transform(pose))
+        for i, (rgba, meshes) in enumerate(found.items()):
+            yield body, f"/{model.body(body).name or 'body'}/{i}", cast(trimesh.Trimesh, trimesh.util.concatenate(meshes)), rgba
+
+
+def _flat(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.unmerge_vertices()  # edges stay sharp
+    return mesh
+
+
+def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+    of = model.mesh(model.geom_dataid[geom])
+    vertices = model.mesh_vert[of.vertadr[0] :][: of.vertnum[0]]
+    return trimesh.Trimesh(vertices, model.mesh_face[of.faceadr[0] :][: of.facenum[0]], process=False)
+
+
+_Shape = Callable[[mujoco.MjModel, int], trimesh.Trimesh]
+_SHAPES: dict[int, _Shape] = {
+    int(mujoco.mjtGeom.mjGEOM_BOX): lambda m, g: _flat(trimesh.creation.box(2 * m.geom_size[g])),
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda m, g: trimesh.creation.icosphere(3, m.geom_size[g][0]),
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): lambda m, g: trimesh.creation.icosphere(3).apply_scale(m.geom_size[g]),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): lambda m, g: trimesh.creation.capsule(2 * m.geom_size[g][1], m.geom_size[g][0]),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): lambda m, g: _flat(
+        trimesh.creation.cylinder(m.geom_size[g][0], 2 * m.geom_size[g][1], sections=32)
+    ),
+    int(mujoco.mjtGeom.mjGEOM_MESH): _mesh,
+}

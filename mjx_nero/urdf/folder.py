@@ -1,0 +1,126 @@
+"""The model folder: written whole or not at all."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import re
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+
+from mjx_nero import files
+from mjx_nero.sim import robot_file
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError
+from mjx_nero.urdf.report import Report
+
+_REPORT = "report.json"
+_NAMES = re.compile(r"model\.xml|robot\.yaml|report\.json|meshes/[^/]+\.stl")  # all that an import writes
+_MAX_REPORT = 50_000_000  # bytes
+_MAX_FILE = 1_000_000_000  # bytes
+
+
+def check(out: pathlib.Path, force: bool) -> None:
+    """Whether the folder may be made: there is none, it is empty, or with ``force`` it holds what an import has written alone.
+
+    Raises:
+        UserError: it may not; the line names the first file that is not an import's, or was changed since.
+    """
+    try:
+        if out.is_symlink() or out.exists() and not out.is_dir():
+            raise UserError(f"{out} is not a folder: pass another --out")
+        found = sorted(_entries(out)) if out.exists() else []
+    except (OSError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}; pass another --out") from None
+    if not found:
+        return
+    written = _written(out)
+    if not written:
+        raise UserError(f"{out} holds other files: pass another --out")
+    if not force:
+        raise UserError(f"{out} holds an imported robot: pass --force to replace it, or another --out")
+    for name in found:
+        if name not in written:
+            raise UserError(f"{out / name} is no file of an import: move it out of {out}, or pass another --out")
+        if name != _REPORT and _hash(files.read_bytes(out / name, _MAX_FILE)) != written[name]:
+            raise UserError(f"{out / name} was changed since it was imported: move it out of {out}, or pass another --out")
+
+
+def _entries(out: pathlib.Path) -> Iterator[str]:
+    """All that lies in the folder but its ``meshes``; links are not followed."""
+    for entry in os.scandir(out):
+        if entry.name == "meshes" and entry.is_dir(follow_symlinks=False):
+            yield from (f"meshes/{inner.name}" for inner in os.scandir(entry.path))
+        else:
+            yield entry.name
+
+
+def _written(out: pathlib.Path) -> dict[str, str]:
+    """File -> hash, as the report of the import says that made the folder; empty if there is none that says so."""
+    try:
+        listed = json.loads(files.read_bytes(out / _REPORT, _MAX_REPORT))["files"]
+        return {name: str(value) for name, value in listed.items() if _NAMES.fullmatch(name)} | {_REPORT: ""}
+    except (UserError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def write(out: pathlib.Path, text: str, stl: Mapping[str, bytes], robot: RobotCfg, report: Report, force: bool) -> None:
+    """Makes the folder beside its place, hidden, and moves it there once MuJoCo has taken the model.
+
+    Raises:
+        UserError: it cannot be written, or MuJoCo refuses the model.
+    """
+    made = out.parent / f".{out.name[:200]}.{uuid.uuid4().hex[:8]}"
+    absent = [folder for folder in (out.parent, *out.parent.parents) if not os.path.exists(folder)]
+    try:
+        made.mkdir(parents=True)
+        (made / "model.xml").write_text(text, encoding="utf-8")
+        if stl:
+            (made / "meshes").mkdir()
+        for name, content in stl.items():
+            (made / "meshes" / f"{name}.stl").write_bytes(content)
+        robot_file.write(made, dataclasses.replace(robot, folder=str(made)))
+        listed = {name: _hash((made / name).read_bytes()) for name in sorted(_entries(made))}
+        (made / _REPORT).write_text(report.json(listed), encoding="utf-8")
+        robot_file.read(made)
+        _move(made, out, force)
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}; pass another --out") from None
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            if made.exists():
+                shutil.rmtree(made, ignore_errors=True)
+            for folder in absent:  # those that it made, innermost first, if they are still empty
+                folder.rmdir()
+
+
+def _move(made: pathlib.Path, out: pathlib.Path, force: bool) -> None:
+    """``made`` takes the place of ``out``, of which nothing but an earlier import's files is deleted."""
+    check(out, force)
+    if not out.exists():
+        made.rename(out)
+        return
+    old = out.parent / f"{made.name}.old"
+    out.rename(old)
+    try:
+        check(old, force)
+        made.rename(out)
+    except BaseException:
+        old.rename(out)
+        raise
+    for name in _written(old):
+        (old / name).unlink(missing_ok=True)
+    for folder in (old / "meshes", old):
+        with contextlib.suppress(OSError):
+            folder.rmdir()

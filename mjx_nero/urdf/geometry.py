@@ -1,0 +1,302 @@
+"""Shapes of the links: what is drawn, and the surfaces that collision shapes are fitted to."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import trimesh
+
+from mjx_nero.sim import model_file
+from mjx_nero.types import UserError
+from mjx_nero.urdf import files, meshes, primitives
+from mjx_nero.urdf.report import Notes
+from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Pose, Shape, Tree, Vec
+
+MAX_FACES = 100_000  # a part; MuJoCo takes 200,000 of an STL
+LEAST_FACES = 1_000  # that a part keeps
+MAX_DRAWN = 300_000  # triangles of all meshes that are drawn, shared by them alike; finer ones cost seconds and show no more
+MAX_PARTS = 8  # colours of one mesh that are kept apart
+MAX_SHAPES = 4_000  # visuals and collisions of a robot
+MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once for every scale
+MAX_FILES = model_file.MAX_MESHES  # that are drawn
+MAX_SECONDS = 60.0  # [s] of processor time
+MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
+GREY = (0.75, 0.76, 0.78, 1.0)
+STAND_IN = (0.9, 0.6, 0.2, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """A visual geom: of MuJoCo's type ``kind`` and size (a mesh: the name of its file), at ``pose`` in the link [4, 4]."""
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Pose
+    rgba: tuple[float, ...]
+    mesh: str = ""
+
+
+@dataclasses.dataclass
+class Look:
+    """Of one link: visual geoms, and the surface to fit, in the link's frame: points [n, 3] and volume [m3] of each collision.
+
+    ``exact`` are those collisions that are primitives already. ``guessed``: a stand-in, for want of meshes.
+    """
+
+    drawn: list[Drawn]
+    surfaces: list[tuple[Points, float]]
+    exact: list[primitives.Primitive | None]
+    guessed: bool = False
+
+    @functools.cached_property
+    def points(self) -> Points | None:
+        return np.concatenate([points for points, _ in self.surfaces]) if self.surfaces else None
+
+
+class Looks:
+    """Loads the meshes and gathers the files to write.
+
+    Attributes:
+        stl: name -> content of the mesh files of the model.
+        of: link -> its ``Look``.
+
+    Raises:
+        UserError: a mesh lies outside the folders or is too large, or the robot has more shapes than the limits above allow.
+    """
+
+    def __init__(self, tree: Tree, parts: dict[str, Body], loader: meshes.Meshes, notes: Notes):
+        self.stl: dict[str, bytes] = {}
+        self._meshes, self._notes = loader, notes
+        self._written: dict[tuple, list[tuple[str, tuple[float, ...]]]] = {}
+        self._sampled: dict[tuple, tuple[Points, float]] = {}
+        self._work, self._started = 0, time.process_time()
+        shapes = sum(len(link.visuals) + len(link.collisions) for link in tree.links.values())
+        if shapes > MAX_SHAPES:
+            raise UserError(f"the URDF has {shapes:,} visuals and collisions: more than {MAX_SHAPES:,} are not read")
+        drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
+        self._share = MAX_DRAWN // max(len(drawn), 1)
+        self._absent: dict[str, str] = {}  # name of a mesh -> where it was looked for
+        seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
+        self._beside = {n for links in seen for n in links}  # links whose body has looks: what has none of its own is hidden
+        self.of = {name: self._look(link) for name, link in tree.links.items()}
+        if self._absent:
+            notes.add("warning", "robot", tree.name, _told(self._absent))
+        for body in parts.values():
+            for name in body.links:
+                link, look = tree.links[name], self.of[name]
+                if not look.drawn and not look.surfaces and (link.visuals or link.collisions):
+                    self.of[name] = self._stand_in(name, tree)
+
+    def _look(self, link: Link) -> Look:
+        """A link's shapes. Without a visual the collision's mesh is drawn, unless the link is fixed to one with a visual; without
+        a collision the visual's is fitted."""
+        loaded: dict[str, list[tuple[Shape, str, list[meshes.Part]]]] = {"visual": [], "collision": []}
+        failed: dict[str, list[str]] = {"visual": [], "collision": []}
+        kind = "note"  # of files that are absent one warning tells, of all together
+        for tag, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for shape in shapes:
+                try:
+                    loaded[tag].append((shape, *self._load(shape)))
+                except files.Missing as error:
+                    failed[tag].append(f"{shape.file!r}: {error}")
+                    if isinstance(error, files.Absent):
+                        self._absent[shape.file] = str(error)
+                    else:
+                        kind = "warning"
+        if any(failed.values()) and not any(loaded.values()):
+            lost = "; ".join(dict.fromkeys(failed["visual"] + failed["collision"]))
+            self._notes.add(kind, "link", link.name, f"mesh {lost}; a stand-in is drawn and fitted")
+            return Look([], [], [])
+        for tag, other in (("visual", "collision"), ("collision", "visual")):
+            what = f"{tag} mesh {'; '.join(failed[tag])}"
+            use = {"visual": "drawn", "collision": "fitted"}[tag]
+            if failed[tag] and loaded[tag]:
+                self._notes.add(kind, "link", link.name, f"{what}; left out")
+            elif failed[tag] and loaded[other]:
+                self._notes.add(kind, "link", link.name, f"{what}; the {other}'s is {use}")
+            elif tag == "visual" and link.name in self._beside and not link.visuals:
+                continue
+            elif not loaded[tag] and loaded[other]:
+                self._notes.add("guessed", "link", link.name, f"no {tag} in the URDF: the {other}'s is {use}")
+        shown = loaded["visual"] or (loaded["collision"] if link.visuals or link.name not in self._beside else [])
+        drawn = [d for item in shown for d in self._draw(item, link.name)]
+        fitted = loaded["collision"] or loaded["visual"]
+        count = min(primitives.SAMPLES, max(MAX_POINTS // max(len(fitted), 1), 20))
+        surfaces = [self._surface(shape, parts, count) for shape, _, parts in fitted]
+        return Look(drawn, surfaces, [_exact(shape) for shape, _, _ in fitted])
+
+    def _surface(self, shape: Shape, parts: list[meshes.Part], count: int) -> tuple[Points, float]:
+        """Points on the shape in the link's frame [count, 3], and the volume of its convex hull [m3]."""
+        key = (shape.kind, shape.file, shape.size, count)
+        if key not in self._sampled:
+            self._spend(parts)
+            scale = shape.size if shape.kind == "mesh" else (1.0,) * 3
+            points = primitives.sample(_scaled(meshes.joined([m for m, _ in parts]), scale), count)
+            self._sampled[key] = points, _volume(shape) or primitives.hull(points)
+        points, volume = self._sampled[key]
+        return points @ shape.origin[:3, :3].T + shape.origin[:3, 3], volume
+
+    def _spend(self, parts: list[meshes.Part]) -> None:
+        """Counts work that grows with triangles.
+
+        Raises:
+            UserError: that was too much.
+        """
+        self._work += sum(len(mesh.faces) for mesh, _ in parts)
+        seconds = time.process_time() - self._started
+        if self._work > MAX_WORK or seconds > MAX_SECONDS:
+            spent = f"{self._work:,} triangles in {seconds:.0f} s"
+            raise UserError(
+                f"its meshes, a time for each scale, come to {spent}: {MAX_WORK:,} in {MAX_SECONDS:g} s are the most; "
+                "use simpler ones"
+            )
+
+    def _load(self, shape: Shape) -> tuple[str, list[meshes.Part]]:
+        return self._meshes.load(shape.file) if shape.kind == "mesh" else ("", [(_solid(shape.kind, shape.size), None)])
+
+    def _draw(self, item: tuple[Shape, str, list[meshes.Part]], link: str) -> list[Drawn]:
+        shape, stem, parts = item
+        if shape.kind == "box":
+            return [Drawn("box", tuple(s / 2 for s in shape.size), shape.origin, shape.rgba or GREY)]
+        if shape.kind == "sphere":
+            return [Drawn("sphere", shape.size, shape.origin, shape.rgba or GREY)]
+        if shape.kind == "cylinder":
+            return [Drawn("cylinder", (shape.size[0], shape.size[1] / 2), shape.origin, shape.rgba or GREY)]
+        key = (shape.file, shape.size)
+        if key not in self._written:
+            self._written[key] = self._write(stem, parts, shape.size, link)
+        return [Drawn("mesh", (), shape.origin, shape.rgba or rgba, name) for name, rgba in self._written[key]]
+
+    def _write(self, stem: str, parts: list[meshes.Part], scale: tuple, link: str) -> list[tuple[str, tuple[float, ...]]]:
+        self._spend(parts)
+        if len(parts) > MAX_PARTS:
+            merged = meshes.joined([mesh for mesh, _ in parts[MAX_PARTS - 1 :]])
+            parts = [*parts[: MAX_PARTS - 1], (merged, parts[MAX_PARTS - 1][1])]
+        out, share = [], self._share / max(sum(len(mesh.faces) for mesh, _ in parts), 1)
+        for mesh, rgba in parts:
+            mesh = _scaled(mesh, scale)
+            limit = min(max(int(share * len(mesh.faces)), LEAST_FACES), MAX_FACES)
+            if len(mesh.faces) > limit:
+                before, mesh = len(mesh.faces), _coarser(mesh, limit)
+                self._notes.add("note", "link", link, f"mesh of {before} triangles drawn with {len(mesh.faces)}")
+            content = trimesh.exchange.stl.export_stl(mesh)
+            if not _loads(content):
+                self._notes.add("note", "link", link, f"a part of mesh {stem!r} is too flat or small to draw: left out")
+                continue
+            name, n = stem, 1
+            while name in self.stl:
+                n += 1
+                name = f"{stem}_{n}"
+            self.stl[name] = content
+            if len(self.stl) > MAX_FILES or sum(map(len, self.stl.values())) > model_file.MAX_MESH_BYTES:
+                most = f"{MAX_FILES} files of {model_file.MAX_MESH_BYTES / 1e6:.0f} MB"
+                raise UserError(f"its meshes, one for each scale and colour, are more than {most}: use fewer or simpler ones")
+            out.append((name, rgba or GREY))
+        return out
+
+    def _stand_in(self, name: str, tree: Tree) -> Look:
+        """A capsule from the link's origin to the next joint, or about twice as far as its centre of mass; or a ball.
+
+        Its radius follows from the mass at 1500 kg/m3, within 15 to 60 mm.
+        """
+        ends = [j.origin[:3, 3] for j in tree.joints.values() if j.parent == name]
+        ends = [e for e in ends if np.linalg.norm(e) > 0.02] or [2 * tree.links[name].mass.com]
+        end = max(ends, key=np.linalg.norm)
+        length = float(np.linalg.norm(end))
+        if length > 2.0 or length < 0.02:
+            end, length = np.zeros(3), 0.0
+        mass = tree.links[name].mass.mass
+        radius = float(np.clip(np.sqrt(mass / 1500 / np.pi / max(length, 0.05)), 0.015, 0.06))
+        if length == 0.0:
+            shape = primitives.Primitive("sphere", (radius,), np.eye(4))
+        else:
+            radius = min(radius, length / 2)
+            place = primitives.pose(_along(end / length), end / 2)
+            shape = primitives.Primitive("capsule", (radius, max(length / 2 - radius, 5e-4)), place)
+        self._notes.add("guessed", "link", name, f"{shape.kind} of radius {radius:.3f} m in place of its meshes")
+        mesh = _mesh(shape)
+        drawn = Drawn(shape.kind, shape.size, shape.pose, STAND_IN)
+        return Look([drawn], [(primitives.sample(mesh), shape.volume)], [shape], guessed=True)
+
+
+@functools.lru_cache(maxsize=100)
+def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
+    """The surface of a URDF's box, sphere or cylinder."""
+    if kind == "box":
+        return trimesh.creation.box(size)
+    return trimesh.creation.icosphere(3, size[0]) if kind == "sphere" else trimesh.creation.cylinder(size[0], size[1])
+
+
+def _told(absent: Mapping[str, str]) -> str:
+    """One line on meshes that are not there."""
+    names, reasons = list(absent), list(dict.fromkeys(absent.values()))
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    lines = "; ".join(reasons[:3]) + ", ..." * (len(reasons) > 3)
+    which = f"mesh {names[0]!r}" if len(names) == 1 else f"{len(names)} meshes, {', '.join(map(repr, names[:3]))}{more}"
+    return f"{which}: {lines}; the links' other meshes or stand-ins take their place (report.json has which)"
+
+
+def _mesh(shape: primitives.Primitive) -> trimesh.Trimesh:
+    if shape.kind == "sphere":
+        return trimesh.creation.icosphere(subdivisions=2, radius=shape.size[0]).apply_transform(shape.pose)
+    mesh = trimesh.creation.capsule(height=2 * shape.size[1], radius=shape.size[0], count=(12, 12))
+    return mesh.apply_translation(-mesh.bounds.mean(0)).apply_transform(shape.pose)
+
+
+def _along(z: Vec) -> Matrix:
+    """Some frame [3, 3] whose last column is the unit vector ``z``."""
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _exact(shape: Shape) -> primitives.Primitive | None:
+    if shape.kind == "box":
+        return primitives.Primitive("box", tuple(s / 2 for s in shape.size), shape.origin)
+    return primitives.Primitive("sphere", shape.size, shape.origin) if shape.kind == "sphere" else None
+
+
+def _scaled(mesh: trimesh.Trimesh, scale: tuple[float, ...]) -> trimesh.Trimesh:
+    faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces  # a mirror turns the triangles inside out
+    return trimesh.Trimesh(mesh.vertices * np.array(scale), faces, process=False)
+
+
+def _volume(shape: Shape) -> float | None:
+    """Of a primitive [m3]."""
+    if shape.kind == "box":
+        return float(np.prod(shape.size))
+    if shape.kind == "sphere":
+        return float(4 / 3 * np.pi * shape.size[0] ** 3)
+    return float(np.pi * shape.size[0] ** 2 * shape.size[1]) if shape.kind == "cylinder" else None
+
+
+def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+    """Vertices moved together on a grid, about the finest that leaves at most so many triangles."""
+    lower, extent, cells = mesh.vertices.min(0), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0, 512
+    while True:
+        grid = np.floor((mesh.vertices - lower) / (extent / cells)).astype(np.int64)
+        _, first, group = np.unique(grid @ [1 << 20, 1 << 10, 1], return_index=True, return_inverse=True)
+        faces = group[mesh.faces]
+        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
+        if len(faces) > most:  # equal ones
+            key = (faces[:, 0] * len(first) + faces[:, 1]) * len(first) + faces[:, 2]
+            faces = faces[np.unique(key, return_index=True)[1]]
+        if len(faces) <= most:
+            return trimesh.Trimesh(mesh.vertices[first], faces, process=False)
+        cells = int(cells * min(0.8, np.sqrt(most / len(faces))))  # a surface has as many as the square of the cells
+
+
+def _loads(stl: bytes) -> bool:
+    """Whether MuJoCo takes the mesh: not, if it is flat."""
+    spec = mujoco.MjSpec()
+    spec.assets = {"m.stl": stl}
+    spec.add_mesh(name="m", file="m.stl")
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="m", contype=0, conaffinity=0, mass=0)
+    try:
+        spec.compile()
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,196 @@
+"""Where the gripper can grasp on the table, and where it can hold what it has grasped: by inverse kinematics."""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_nero.sim import grasp
+from mjx_nero.urdf.cloud import Cloud
+from mjx_nero.urdf.fingers import Hand
+from mjx_nero.urdf.primitives import Primitive
+from mjx_nero.urdf.report import Notes
+from mjx_nero.urdf.tree import Points, Poses, Values, Vec
+from mjx_nero.urdf.workspace import Box
+
+CELLS = 16  # of the reach
+NEAR, ASIDE = 0.25, 0.3125  # of the reach: the nearest before the shoulder, the farthest to its side
+LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
+OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
+TALL = 0.4  # of the reach: the highest above the table that anything is held
+LEAN = np.radians(45)  # of a hand that cannot point down
+HELD = np.radians(60)  # of one that holds something
+DESCENTS, STARTS = 8, 12  # of the inverse kinematics, for a cell and for a point of a region
+TURNS = 5  # joints of an arm that can turn its hand at will while that points down
+SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4)
+Quat = tuple[float, float, float, float]
+Shapes = list[tuple[str, Primitive]]  # that meet the table, with their links
+
+
+@dataclasses.dataclass(frozen=True)
+class Reaching:
+    """Inverse kinematics that keeps above the table.
+
+    Attributes:
+        shapes: what must not get below it.
+        shun, tilt, along: as ``Cloud.solve`` takes them.
+    """
+
+    cloud: Cloud
+    shapes: Shapes
+    shun: Bool[np.ndarray, " n"]
+    tilt: float = 0.0
+    along: Vec | None = None
+
+    def __call__(self, goals: Points, starts: int) -> Bool[np.ndarray, " g"]:
+        """Which of the goals [g, 3] the grasp point gets to."""
+        if not len(goals):
+            return np.zeros(0, bool)
+        q = self.cloud.solve(goals, True, starts, tilt=self.tilt, along=self.along, shun=self.shun)
+        there = ~np.isnan(q[:, :, 0])
+        there[there] = _above(self.cloud, self.shapes, self.cloud.at(q[there]))
+        return there.any(1)
+
+    def everywhere(self, box: Box) -> bool:
+        """Whether it gets to the corners of a box and to the points midway."""
+        return bool(self(np.array(list(itertools.product(*(dict.fromkeys((a, (a + b) / 2, b)) for a, b in box)))), STARTS).all())
+
+
+def _above(cloud: Cloud, shapes: Shapes, poses: Mapping[str, Poses]) -> Bool[np.ndarray, " n"]:
+    """In which of the poses no shape is below the table."""
+    heights = [cloud.lowest(link, shape, poses) for link, shape in shapes]
+    return np.min(heights, axis=0) > 0 if heights else np.ones(len(next(iter(poses.values()))), bool)
+
+
+def find(
+    cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes, name: str, notes: Notes
+) -> tuple[Box | None, Box | None, Quat]:
+    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, None where there are none; and ``down``, or half a turn from it.
+
+    The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
+    which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
+    ``OVER`` it, and with nothing below the table. Where there are none either way round the hand may be turned any way about
+    the vertical, and where there are none of those either, lean by up to ``LEAN``. The rectangle of such cells is taken whose
+    area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG`` times ``WIDE``; then
+    inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held may be brought as
+    far up from there as the arm gets with the hand within ``HELD`` of down.
+
+    Args:
+        work: the workspace; it says on which side the work is.
+        down: orientation of the grasp point with the hand pointing down, wxyz.
+        shapes: what must not get below the table.
+    """
+    if not hand.joints or hand.gap <= 0 or work is None:
+        return None, None, down
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.array(down))
+    along = turn.reshape(3, 3).T @ np.array([0.0, 1.0, 0.0])
+    low = grasp.height(hand.gap, hand.pad) + hand.grip @ hand.approach - cloud.height
+    shun = ~_above(cloud, shapes, cloud.poses)
+    w, x, y, z = down
+    other = (-z + 0.0, -y + 0.0, x, w)  # half a turn on about the vertical
+    exact = "pointing down, fingers along y"
+    ways = [
+        (exact, 0.0, along, down),
+        (exact, 0.0, -along, other),
+        ("pointing down", 0.0, None, down),
+        ("leaning", LEAN, None, down),
+    ]
+    for how, tilt, opening, turned in ways if len(cloud.arm) >= TURNS else ways[2:]:
+        pick = _pick(Reaching(cloud, shapes, shun, tilt, opening), work, low)
+        if pick is not None:
+            hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
+            notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
+            notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
+            return pick, hold, turned
+    notes.add("warning", "robot", name, "no place found to grasp at on the table: lift needs pick and hold in robot.yaml")
+    return None, None, down
+
+
+def _text(box: Box) -> str:
+    return ", ".join(f"{k} {a:g} .. {b:g}" for k, (a, b) in zip("xyz", box, strict=True))
+
+
+def _reach(cloud: Cloud) -> float:
+    return float(np.quantile(np.linalg.norm(cloud.site[1:, :3, 3] - cloud.shoulder, axis=1), 0.99))
+
+
+def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
+    cloud = reaching.cloud
+    reach, origin = _reach(cloud), cloud.shoulder
+    cell = reach / CELLS
+    middle = np.mean(work, axis=1)[:2] - origin[:2]
+    axis = int(np.argmax(np.abs(middle)))
+    sign = float(np.sign(middle[axis])) or 1.0
+    ahead = np.arange(np.ceil(NEAR * CELLS), CELLS + 1) * cell
+    aside = np.arange(-ASIDE * CELLS, ASIDE * CELLS + 1) * cell
+    grid = np.zeros((len(ahead), len(aside), 3))
+    grid[:, :, axis], grid[:, :, 1 - axis] = origin[axis] + sign * ahead[:, None], origin[1 - axis] + aside
+    met = np.ones(grid.shape[:2], bool)
+    for height in (low, low + OVER):
+        grid[:, :, 2] = height
+        met[met] = reaching(grid[met], DESCENTS)
+    # What a few descents left out amid the others; all of the region is looked at again.
+    beside = np.pad(met.astype(int), 1)
+    met |= beside[2:, 1:-1] + beside[:-2, 1:-1] + beside[1:-1, 2:] + beside[1:-1, :-2] >= 3
+    found = _largest(met, ahead / reach, aside / reach)
+    if found is None:
+        return None
+    (a, b), (c, d) = found
+    ends = np.sort([sign * ahead[[a, b]] + origin[axis], aside[[c, d]] + origin[1 - axis]], axis=1)
+    ends = ends if axis == 0 else ends[::-1]
+    for shrink in SHRINKS:
+        box = (*_about(ends, shrink), (_rounded(low), _rounded(low + OVER)))
+        if reaching.everywhere(box):
+            return _raised(reaching, box, TALL * reach, cell)
+    return None
+
+
+def _hold(reaching: Reaching, pick: Box, reach: float) -> Box:
+    """Above ``pick``, as high as it gets; at its own top where that is nowhere."""
+    low = pick[2][0] + max(0.05, 0.1 * reach)
+    for shrink in SHRINKS:
+        box = (*_about(np.array(pick[:2]), shrink), (_rounded(low), _rounded(low)))
+        if reaching.everywhere(box):
+            return _raised(reaching, box, TALL * reach, reach / CELLS)
+    return (*pick[:2], (pick[2][1], pick[2][1]))
+
+
+def _raised(reaching: Reaching, box: Box, most: float, step: float) -> Box:
+    """The box, higher by up to ``most``, as long as every layer is reached everywhere."""
+    x, y, (low, high) = box
+    while high + step <= low + most and reaching.everywhere((x, y, (high + step, high + step))):
+        high += step
+    return x, y, (low, _rounded(high))
+
+
+def _largest(
+    met: Bool[np.ndarray, "a b"], ahead: Float[np.ndarray, " a"], aside: Float[np.ndarray, " b"]
+) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Of the rectangles of cells that are met, at least two cells either way, the best: first and last of both axes."""
+    total = np.pad(met.astype(int), ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+
+    def spans(places: Values, most: float) -> list[tuple[int, int]]:
+        return [(i, k) for i, k in itertools.combinations(range(len(places)), 2) if places[k] - places[i] <= most + 1e-9]
+
+    best, score = None, 0.0
+    for (a, b), (c, d) in itertools.product(spans(ahead, LONG), spans(aside, WIDE)):
+        if total[b + 1, d + 1] - total[a, d + 1] - total[b + 1, c] + total[a, c] == (b + 1 - a) * (d + 1 - c):
+            away = ((ahead[a] + ahead[b]) / 2 - 0.5) ** 2 / 0.3**2 + ((aside[c] + aside[d]) / 2) ** 2 / 0.15**2
+            value = (b - a) * (d - c) * np.exp(-0.5 * away)
+            if value > score:
+                best, score = ((a, b), (c, d)), value
+    return best
+
+
+def _about(ends: Float[np.ndarray, "2 2"], shrink: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The rectangle, smaller about its centre."""
+    x, y = ((_rounded(m - h), _rounded(m + h)) for m, h in zip(ends.mean(1), shrink * np.ptp(ends, axis=1) / 2, strict=True))
+    return x, y
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 3) + 0.0

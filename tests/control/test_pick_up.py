@@ -1,0 +1,99 @@
+"""The controller that picks up: how it turns the hand, where it grasps, when it goes on. The task tests what comes of it."""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_nero import UserError, control
+from mjx_nero.control import pick_up
+from mjx_nero.control.pick_up import PickUp, PickUpCfg
+from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.types import ObjectView, View
+
+CFG = PickUpCfg(object="target", heading=(0, 2, 0), turns=(4, 2, 0), lowest=0.03)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return PickUp(COBOTTA_PRO_900, 0.02, CFG)
+
+
+def seen(index: int, quat=(1.0, 0.0, 0.0, 0.0), others=(), height=0.05) -> View:
+    """The commanded object at (0.5, 0.1), others beside it along x and y [m]."""
+    still = {"linvel_w": jnp.zeros(3), "angvel_local": jnp.zeros(3)}
+    target = ObjectView(pos_w=jnp.array([0.5, 0.1, height]), quat_w=jnp.array(quat), **still)
+    away = {f"other{i}": dataclasses.replace(target, pos_w=target.pos_w + jnp.array([*xy, 0.0])) for i, xy in enumerate(others)}
+    joints = jnp.array(COBOTTA_PRO_900.home)
+    zero, still_4 = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+    return View(
+        joint_pos=joints,
+        joint_vel=jnp.zeros(8),
+        default_joint_pos=joints,
+        ctrl=joints,
+        ee_pos_w=jnp.array([0.5, 0.0, 0.28]),
+        ee_quat_w=jnp.array(COBOTTA_PRO_900.down),
+        objects={"itself": target, **away, "target": target},
+        root_pos_w=zero,
+        command=zero,
+        goal_pos_w=jnp.array([0.5, 0.0, 0.3]),
+        goal_quat_w=still_4,
+        goal_linvel_w=zero,
+        action=zero,
+        last_action=zero,
+        step=jnp.zeros((), jnp.int32),
+        time=jnp.zeros(()),
+        target=jnp.array(index),
+    )
+
+
+def turned(degrees: float) -> tuple[float, ...]:
+    return math.cos(math.radians(degrees) / 2), 0.0, 0.0, math.sin(math.radians(degrees) / 2)
+
+
+def test_the_ways_to_turn_the_hand_by_hand(controller):
+    """A box turned by 20 degrees: every quarter fits; a lying capsule that points there: every half; a ball: every eighth."""
+    half = 0.5**0.5
+    w, _, _, z = turned(20)
+    lying = (w * half, -z * half, w * half, z * half)  # its z axis along x, then turned
+    for index, quat, wanted in (
+        (0, turned(20), np.tile([20, 110, 200, 290], 2)),
+        (1, lying, np.tile([20, 200], 4)),
+        (2, turned(77), 45 * np.arange(8)),
+    ):
+        angles = np.degrees(controller._angles(seen(index, quat)))
+        np.testing.assert_allclose(np.mod(angles - wanted + 1, 360), 1, atol=1e-3)
+
+
+def test_room_beside_others_by_hand(controller):
+    """Fingers at 75.5 mm to both sides, along y: 5.5 mm from another at 70 mm; turned by a quarter, as far as counts."""
+    room = controller._room(seen(0, others=[(0.0, 0.07)]), jnp.array([0.0, math.pi / 2, math.pi]))
+    np.testing.assert_allclose(room, [0.0055, 0.0755, 0.0055], atol=1e-5)
+
+
+def test_it_grasps_at_the_objects_middle_or_as_low_as_the_pads_allow(controller):
+    np.testing.assert_allclose(controller._pick(seen(0), jnp.array(0.3)), [0.5, 0.1, 0.05], atol=1e-6)
+    np.testing.assert_allclose(controller._pick(seen(0, height=0.01), jnp.array(0.3)), [0.5, 0.1, 0.03], atol=1e-6)
+
+
+def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
+    zero, q = jnp.zeros((), jnp.int32), jnp.zeros(6)
+    memory = pick_up.PickUpMemory(zero, zero, q, q, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3), zero)
+
+    def ends(phase, count=0, error=0.0, arrived=True, qd=0.0) -> bool:
+        now = dataclasses.replace(memory, phase=jnp.array(phase), count=jnp.array(count), qd=jnp.full(6, qd))
+        return bool(controller._ended(now, jnp.array(error), jnp.array(arrived)))
+
+    assert ends(pick_up.ABOVE, error=0.009) and not ends(pick_up.ABOVE, error=0.011) and not ends(pick_up.ABOVE, qd=0.2)
+    assert ends(pick_up.ABOVE, error=1.0, count=125)
+    assert ends(pick_up.DOWN, error=0.003) and not ends(pick_up.DOWN, error=0.005) and not ends(pick_up.DOWN, arrived=False)
+    assert not ends(pick_up.CLOSE, count=20) and ends(pick_up.CLOSE, count=23)  # 0.3 s of closing and 0.15 s
+    assert ends(pick_up.UP) and not ends(pick_up.UP, arrived=False) and not ends(pick_up.CARRY, count=10_000)
+
+
+@pytest.mark.parametrize("fields", [{"turns": (4, 2)}, {"heading": (0, 3), "turns": (1, 1)}, {"turns": (-1,)}])
+def test_what_does_not_say_how_objects_lie_is_refused(fields):
+    with pytest.raises(UserError, match="heading and turns are an axis .0, 1, 2. and a number an object, got"):
+        control.make("pick_up", COBOTTA_PRO_900, 0.02, fields)

@@ -1,0 +1,175 @@
+"""Tasks for any robot: where the cube lies, where it has to go and how large it is; and robots that cannot."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import urdf_files as files
+from scipy import optimize
+from scipy.spatial.transform import Rotation
+
+from mjx_nero import UserError, env_cfg, make
+from mjx_nero.envs.arms.nero import NERO
+from mjx_nero.learn import evaluation
+from mjx_nero.sim import contacts, grasp, robot_file, scene
+from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.urdf import import_urdf
+
+OWN = {"nero": "nero", "piper": "piper", "cobotta_pro_900": "cobotta", "so_arm100": "so100", "so_arm101": "so101"}
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory):
+    """Six joints with two fingers that open by 10 cm, imported: the folder."""
+    folder = tmp_path_factory.mktemp("hand")
+    import_urdf(
+        files.write(folder / "in", files.robot(files.base(), *files.six(), *files.fingers(folder, "link6"), name="hand")),
+        folder / "out",
+    )
+    return folder / "out"
+
+
+@pytest.mark.parametrize(
+    ("opening", "pad", "edge", "height"),
+    [
+        (0.1, (0.01, 0.02, 0.006), 0.04, 0.02),  # two fifths of the opening, held in its middle
+        (0.1, (0.04, 0.02, 0.006), 0.05, 0.025),  # the pads' length, and 5 mm clear of the table and of the top
+        (0.06, (0.04, 0.02, 0.006), 0.036, 0.025),  # three fifths of the opening at most: the pads stand out above
+        (0.3, (0.01, 0.02, 0.006), 0.06, 0.03),  # no larger than this
+    ],
+)
+def test_a_cube_that_fits_by_hand(opening, pad, edge, height):
+    assert grasp.edge(opening, pad) == pytest.approx(edge) and grasp.height(opening, pad) == pytest.approx(height)
+
+
+@pytest.mark.parametrize(("robot", "own"), OWN.items())
+def test_the_packages_arms_lift_where_their_own_task_does(robot, own):
+    fitted, tuned = env_cfg("lift", robot=robot), env_cfg(f"{own}_lift")
+    assert fitted.events == tuned.events and fitted.command == tuned.command
+    assert list(fitted.rewards) == list(tuned.rewards) and fitted.observations == tuned.observations
+    size = fitted.scene.objects["cube"].size[0]
+    assert 0.3 * fitted.robot.opening < size <= 0.6 * fitted.robot.opening
+
+
+def test_an_imported_arm_has_its_regions_in_the_task(hand):
+    robot, cfg = robot_file.read(hand), env_cfg("lift", robot=hand)
+    assert cfg.scene.objects["cube"].size == pytest.approx((0.04,) * 3) and cfg.scene.objects["cube"].mass == pytest.approx(0.064)
+    start = cfg.events["reset_object_position"].params
+    assert (start["x"], start["y"]) == robot.pick[:2]
+    assert tuple(cfg.command.params[axis] for axis in "xyz") == robot.hold
+    (low, _), (edge, _) = robot.pick[2], cfg.scene.objects["cube"].size[:2]
+    assert low == pytest.approx(edge / 2, abs=2e-3)  # the grasp point amid the pads, these amid the cube
+    assert robot.hold[2][0] > 0.05 + low and robot.hold[2][1] > 0.2
+    x, y = (np.array(ends) for ends in robot.pick[:2])
+    assert 0.1 < np.ptp(x) < 0.3 and 0.2 < np.ptp(y) < 0.5 and abs(y.mean()) < 0.1  # of a reach of 0.8 m
+    table = np.array(cfg.scene.table_center)[:, None] + np.outer(np.array(cfg.scene.table_size) / 2, (-1, 1))
+    assert table[0, 0] < x[0] - 0.1 and table[0, 1] > x[1] + 0.1 and table[1, 0] < y[0] - 0.1 and table[1, 1] > y[1] + 0.1
+
+
+def test_pick_is_reached_pointing_down_and_hold_somehow(hand):
+    """At every corner, by scipy's own inverse kinematics on the compiled model, joints within limits."""
+    robot = robot_file.read(hand)
+    model = scene.robot_model(robot)
+    data, ids = mujoco.MjData(model), [model.joint(j).qposadr[0] for j in robot.arm.joints]
+    bounds = np.array([model.joint(j).range for j in robot.arm.joints]).T
+    down = Rotation.from_quat(robot.down, scalar_first=True)
+    rng = np.random.default_rng(0)
+
+    def miss(q, goal, turns):
+        data.qpos[ids] = q
+        mujoco.mj_kinematics(model, data)
+        now = Rotation.from_matrix(data.site("ee").xmat.reshape(3, 3))
+        return np.concatenate([data.site("ee").xpos - goal, turns * 0.1 * (down * now.inv()).as_rotvec()])
+
+    for box, turns in ((robot.pick, 1.0), (robot.hold, 0.0)):
+        for goal in itertools.product(*box):
+            starts = [np.array(robot.arm.home), *rng.uniform(*bounds, (15, len(ids)))]
+            found = (optimize.least_squares(miss, s, bounds=bounds, args=(np.array(goal), turns)) for s in starts)
+            assert any(np.linalg.norm(f.fun) < 5e-3 for f in found), goal
+
+
+def test_each_region_can_be_overridden(hand):
+    fields = {
+        "events.reset_object_position.params.x": "0.3,0.3",
+        "command.params.z": "0.2,0.2",
+        "scene.objects.cube.mass": "0.01",
+    }
+    cfg = env_cfg("lift", robot=hand, **fields)
+    assert cfg.events["reset_object_position"].params["x"] == (0.3, 0.3) and cfg.command.params["z"] == (0.2, 0.2)
+    assert cfg.scene.objects["cube"].mass == 0.01
+
+
+def test_edits_of_the_robots_file_count(hand):
+    robot = robot_file.read(hand)
+    wide = dataclasses.replace(robot, pick=((0.3, 0.4), (0.0, 0.1), (0.03, 0.1)), opening=0.05)
+    cfg = env_cfg("lift", robot=wide)
+    assert cfg.events["reset_object_position"].params["x"] == (0.3, 0.4) and cfg.scene.objects["cube"].size[0] == 0.03
+    beside = dataclasses.replace(wide, base_pos=(1.0, -1.0, 0.1))
+    start = env_cfg("lift", robot=beside).events["reset_object_position"].params  # of the world
+    assert (start["x"], start["y"]) == ((1.3, 1.4), (-1.0, -0.9))
+    assert env_cfg("lift", robot=beside).command == cfg.command  # of the robot
+    assert env_cfg("pick_place", robot=beside).command.params["z"] == pytest.approx((0.015 - 0.1,) * 2)
+
+
+def test_buffers_of_an_imported_arm_hold_the_worst_case(hand):
+    for name in ("lift", "nero_lift"):
+        cfg = env_cfg(name, robot=hand)
+        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
+        assert cfg.sim.contacts_per_env == sum(pair.contacts for pair in contacts.contact_pairs(model)) > 16
+        assert cfg.sim.constraints_per_env == sum(contacts.constraint_rows(model).values())
+    assert env_cfg("lift", robot="nero").sim == env_cfg("nero_lift").sim
+
+
+def test_an_imported_arm_steps(hand):
+    env = make("lift", robot=hand, impl="native", num_envs=4)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
+    step = jax.jit(jax.vmap(env.step))
+    for i in range(20):
+        state = step(state, jnp.full((4, env.action_size), (-1.0) ** i))
+    assert np.isfinite(np.asarray(state.pipeline_state.qpos)).all() and np.isfinite(np.asarray(state.reward)).all()
+    assert not np.asarray(state.metrics["nan"]).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["hand", "cobotta_pro_900"])
+def test_scripted_pick_lifts_the_cube(robot, hand):
+    """By inverse kinematics alone, wherever the cube starts: what lift asks for can be done."""
+    robot = str(hand) if robot == "hand" else robot
+    result = evaluation.play(evaluation.EvalCfg("pick_place", robot=robot, controller="pick_place", episodes=8)).result
+    assert result["grasp_rate"] >= 7 / 8 and result["nan_count"] == 0
+
+
+@pytest.mark.slow
+def test_an_imported_arm_follows_a_target(hand):
+    how = {"robot": str(hand), "preset": "static", "controller": "ik", "episodes": 2}
+    result = evaluation.play(evaluation.EvalCfg("follow_target", **how, env_fields={"episode_length_s": 4.0})).result
+    assert result["success_rate"] == 1 and result["warning"] == ""
+
+
+@pytest.mark.parametrize(
+    ("env", "changes", "message"),
+    [
+        ("lift", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one; reach does without"),
+        ("pick_place", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one; reach does without"),
+        (
+            "lift",
+            {"opening": 0.0},
+            r"how far the gripper of nero opens is unknown: give opening, between its pads \[m\], in its config",
+        ),
+        (
+            "lift",
+            {"pick": None},
+            r"nero has no pick, where on the table it can grasp: give it in its config as ranges of x, y and z",
+        ),
+        ("lift", {"pick": None, "folder": "x"}, "give it in its robot.yaml as ranges of x, y and z .*, or import it anew$"),
+        ("lift", {"hold": None}, "nero has no hold, where it can hold what it has grasped: give it in its config"),
+        ("follow_target", {"pick": None, "workspace": None}, "nero has no workspace, where it can work: give it in its config"),
+    ],
+)
+def test_robots_that_do_not_do(env, changes, message):
+    with pytest.raises(UserError, match=message):
+        env_cfg(env, robot=dataclasses.replace(NERO, **changes))

@@ -1,0 +1,385 @@
+"""A fuzzer over all readers of files: python tests/hostile/fuzz.py --minutes 60 [--reader yaml] [--seed 7].
+
+Files of the corpus are cut, doubled, exchanged and filled with words that readers stumble over. A reader takes the result or
+refuses it by a UserError of one line; anything else is a find, which is shrunk and shown: too much time or memory, a file left
+behind, a file opened that is not the reader's, a program run. A run of the same reader and seed tries the same files.
+What was found once is in ``corpus``, one folder a reader, so that it is tried again.
+"""
+
+import argparse
+import contextlib
+import functools
+import os
+import pathlib
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+
+HERE = pathlib.Path(__file__).resolve().parent
+if __name__ == "__main__":
+    sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent)]
+
+import hypothesis  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+import urdf_files as make  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+
+from mjx_nero import UserError, files  # noqa: E402
+from mjx_nero.control import rmpflow_config  # noqa: E402
+from mjx_nero.learn import checkpoint, header  # noqa: E402
+from mjx_nero.sim import model_file, robot_file  # noqa: E402
+from mjx_nero.urdf import drives, import_urdf, meshes, xacro  # noqa: E402
+from mjx_nero.urdf import files as urdf_files  # noqa: E402
+from mjx_nero.urdf.report import Notes  # noqa: E402
+from mjx_nero.urdf.xacro.expander import URIS  # noqa: E402
+
+SECONDS = 20.0  # of processor time that a file may take, most of it MuJoCo's
+WAIT = 6 * SECONDS  # by the clock, which on a busy machine says little; what hangs takes no processor time
+LIMITS = {signal.SIGPROF: (signal.ITIMER_PROF, SECONDS), signal.SIGALRM: (signal.ITIMER_REAL, WAIT)}
+MEMORY = 6_000_000_000  # bytes of addresses beyond those at the start
+LONGEST = 500  # characters of a message
+ASSETS = HERE.parents[1] / "assets"
+WORDS = """
+0 -1 1e999 -1e999 nan .nan inf .inf 1_0 0x10 0o7 1e-400 99999999999999999999 2024-99-99 ~ null true yes
+" ' < > & ; : , [ ] { } ( ) - ? ! * & | % @ ` # = / \\ .. ../../../etc/passwd /dev/zero file:///etc/passwd package://x/y
+!!int !!float !!python/object/apply:os.system !!binary !!set !!omap &a *a << --- ... %YAML
+&#10; &lt; <![CDATA[ <!-- --> <?x ?> </a> <a>
+name mesh joint body free ball include replicate size flexcomp link robot limit mimic floating planar world link1 é x
+visual collision geometry origin
+xacro:include xacro:macro xacro:property xacro:if xacro:insert_block xacro:call xacro:element xacro:arg filename value params ns
+${} ${p} ${1/0} $(arg $(find $(eval $(env *o **o ^| := .__class__ .__globals__ lambda: import os.system subprocess __builtins__
+range(9**9) [x for x in 9**9**9 <<99999 %99999d .format .join() load_yaml() str list dict len eval open exec getattr
+__metadata__ meta dtype shape data_offsets F32 F8_E4M3 actor critic state env solid facet vertex endfacet v f vn g o usemtl mtllib
+""".split()
+TOKENS = [word.encode() for word in WORDS]
+TOKENS += [b"\0", b"\n", b"\r\n", b"\t", b" ", b"\x1b[2J", b"\x9b", b"\xff\xfe", b"\xef\xbb\xbf", b"\xc2\x9b", b"\xe2\x80\xae"]
+TOKENS += [b"9" * 400, b"[" * 500, b"{" * 500, b"<a>" * 300, b"(" * 300, b"\xff" * 4, b"\x00\x00\xc0\x7f", b"\xff" * 7 + b"\x7f"]
+EDIT = st.tuples(
+    st.sampled_from(("put", "cut", "double", "swap", "over", "number", "word")),
+    st.floats(0, 1, exclude_max=True),
+    st.floats(0, 1, exclude_max=True),
+    st.one_of(st.sampled_from(TOKENS), st.binary(max_size=8)),
+)
+
+
+def edited(content: bytes, edits: list[tuple[str, float, float, bytes]]) -> bytes:
+    """The file after some changes; places are shares of its length, so that they mean something in every file."""
+    for kind, start, length, piece in edits:
+        at = int(start * (len(content) + 1))
+        end = min(len(content), at + int(length**4 * len(content)) + 1)
+        if kind in ("number", "word"):  # the next run of such characters
+            wanted = (
+                b"+-.0123456789eE" if kind == "number" else b"abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ_0123456789."
+            )
+            while at < len(content) and content[at] not in wanted:
+                at += 1
+            end = at
+            while end < len(content) and content[end] in wanted:
+                end += 1
+        if kind == "put":
+            content = content[:at] + piece + content[at:]
+        elif kind == "cut":
+            content = content[:at] + content[end:]
+        elif kind == "double":
+            content = content[:end] + content[at:end] * 2 + content[end:]
+        elif kind == "swap":
+            content = content[end:] + content[at:end] + content[:at]
+        else:
+            content = content[:at] + piece + content[end:]
+    return content
+
+
+def read_yaml(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "a.yaml").write_bytes(content)
+    files.read_yaml(folder / "a.yaml")
+
+
+def read_gains(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "a.yaml").write_bytes(content)
+    drives.load_gains(folder / "a.yaml", dict.fromkeys(("joint1", "joint2", "joint3", "finger")))
+
+
+def read_descriptor(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "a.yaml").write_bytes(content)
+    rmpflow_config.load(rmpflow_config.DescriptorCfg, folder / "a.yaml")
+
+
+def read_flow(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "a.yaml").write_bytes(content)
+    rmpflow_config.load(rmpflow_config.RmpFlowCfg, folder / "a.yaml")
+
+
+@functools.cache
+def a_robot() -> dict[str, bytes]:
+    """The files of an imported robot with a mesh."""
+    folder = pathlib.Path(tempfile.mkdtemp())
+    make.box(folder / "in" / "m.stl", (0, 0, 0), (0.1, 0.06, 0.02))
+    body = make.link("e", make.inertial(0.1), make.mesh("m.stl"))
+    import_urdf(make.write(folder / "in", make.arm(2, body, make.joint("j", "l2", "e"))), folder / "out")
+    found = {str(p.relative_to(folder / "out")): p.read_bytes() for p in (folder / "out").rglob("*") if p.is_file()}
+    shutil.rmtree(folder)
+    return found
+
+
+def read_robot(folder: pathlib.Path, content: bytes, name: str) -> None:
+    for other, own in a_robot().items():
+        (folder / other).parent.mkdir(exist_ok=True)
+        (folder / other).write_bytes(content if other == name else own)
+    robot_file.read(folder)
+
+
+def read_model(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "model.xml").write_bytes(content)
+    try:
+        model_file.read(folder / "model.xml").compile()
+    except ValueError as error:  # the compiler's, which robot_file.read takes for the user's mistake
+        raise error if isinstance(error, UserError) else UserError(str(error)) from None
+
+
+def read_policy(folder: pathlib.Path, content: bytes) -> None:
+    (folder / "a.safetensors").write_bytes(content)
+    header.check(checkpoint.load_meta(folder / "a.safetensors"), folder / "a.safetensors")
+    held, _ = header.read(folder / "a.safetensors")
+    checkpoint.load(folder / "a.safetensors", {})
+    assert sum(len(name) for name in held) < header.MAX_HEAD
+
+
+def read_mesh(folder: pathlib.Path, content: bytes, kind: str) -> None:
+    with contextlib.suppress(urdf_files.Missing):
+        parts = meshes._parse(content, kind)
+        assert parts and all(mesh.vertices.shape[1] == 3 and len(mesh.faces) for mesh, _ in parts)
+
+
+def read_urdf(folder: pathlib.Path, content: bytes) -> None:
+    make.box(folder / "in" / "m.stl", (0, 0, 0), (0.1, 0.06, 0.02))
+    (folder / "in" / "robot.urdf").write_bytes(content)
+    try:
+        import_urdf(folder / "in" / "robot.urdf", folder / "out")
+        model = mujoco.MjModel.from_xml_path(str(folder / "out" / "model.xml"))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        assert np.isfinite(data.qacc).all()
+    except UserError:
+        assert not (folder / "out").exists()
+        raise
+    finally:
+        assert {p.name for p in folder.iterdir()} <= {"in", "out"} and {p.name for p in (folder / "in").iterdir()} <= {
+            "m.stl",
+            "robot.urdf",
+        }
+
+
+def read_xacro(folder: pathlib.Path, content: bytes) -> None:
+    root = urdf_files.parse_xml(content, "robot.xacro")
+    if xacro.is_xacro(root):
+        _expand(folder, root)
+
+
+def read_expression(folder: pathlib.Path, content: bytes, form: str = "${%s}") -> None:
+    """What stands between the braces of a xacro file."""
+    root = make.etree.fromstring(f'<robot name="r" xmlns:xacro="{URIS[0]}"><link/></robot>')
+    with contextlib.suppress(ValueError):  # what no attribute can hold
+        root[0].set("name", form % content.decode(errors="replace"))
+    _expand(folder, root)
+
+
+def read_loaded(folder: pathlib.Path, content: bytes) -> None:
+    """A YAML file that a xacro file loads."""
+    (folder / "a.yaml").write_bytes(content)
+    read_expression(folder, b"xacro.load_yaml('a.yaml')")
+
+
+def _expand(folder: pathlib.Path, root: make.etree._Element) -> None:
+    """Beside the file lie one to include and one to load."""
+    for other in (HERE / "corpus" / "beside").iterdir():
+        shutil.copy(other, folder)
+    path = folder / "robot.xacro"
+    xacro.expand(root, path, urdf_files.Roots(path, {}), {}, Notes())
+
+
+READERS: dict[str, Callable[[pathlib.Path, bytes], None]] = {
+    "yaml": read_yaml,
+    "gains": read_gains,
+    "descriptor": read_descriptor,
+    "flow": read_flow,
+    "robot": functools.partial(read_robot, name="robot.yaml"),
+    "model": read_model,
+    "model_in_folder": functools.partial(read_robot, name="model.xml"),
+    "mesh_in_folder": functools.partial(read_robot, name="meshes/m.stl"),
+    "policy": read_policy,
+    "stl": functools.partial(read_mesh, kind="stl"),
+    "obj": functools.partial(read_mesh, kind="obj"),
+    "dae": functools.partial(read_mesh, kind="dae"),
+    "urdf": read_urdf,
+    "xacro": read_xacro,
+    "expression": read_expression,
+    "eval": functools.partial(read_expression, form="$(eval %s)"),
+    "loaded": read_loaded,
+}
+BATCH = 100  # files of a run of one seed, and ...
+SLOW = dict.fromkeys(("robot", "model_in_folder", "mesh_in_folder", "urdf"), 10)  # ... of readers that take longer
+
+
+@functools.cache
+def corpus(reader: str) -> list[bytes]:
+    """What to start from: files of the package's own, and those of the folder ``corpus``."""
+    own = [p.read_bytes() for p in sorted((HERE / "corpus" / reader).glob("*"))]
+    flow = ASSETS / "cobotta_pro_900" / "rmpflow"
+    made = a_robot()
+    good = {
+        "descriptor": lambda: [(flow / "robot_descriptor.yaml").read_bytes()],
+        "flow": lambda: [(flow / "rmpflow_common.yaml").read_bytes()],
+        "robot": lambda: [made["robot.yaml"]],
+        "model": lambda: [(ASSETS / "nero" / "nero.xml").read_bytes(), (ASSETS / "so_arm101" / "so_arm101.xml").read_bytes()],
+        "model_in_folder": lambda: [made["model.xml"]],
+        "mesh_in_folder": lambda: [made["meshes/m.stl"]],
+        "policy": lambda: [_small_policy()],
+        "stl": lambda: [made["meshes/m.stl"]],
+        "urdf": lambda: [
+            make.arm(2, make.link("e", make.inertial(0.1), make.mesh("m.stl")), make.joint("j", "l2", "e")).encode()
+        ],
+    }
+    return [*own, *good.get(reader, list)()]
+
+
+def _small_policy() -> bytes:
+    """The head of a policy that ships, with its smallest array alone."""
+    import json
+
+    content = (ASSETS / "policies" / "nero_reach.safetensors").read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    head = json.loads(content[8 : 8 + length])
+    sizes = {name: entry["data_offsets"][1] - entry["data_offsets"][0] for name, entry in head.items() if name != "__metadata__"}
+    name = min(sizes, key=sizes.__getitem__)
+    small = {"__metadata__": head["__metadata__"], name: {**head[name], "data_offsets": [0, sizes[name]]}}
+    text = json.dumps(small).encode()
+    return len(text).to_bytes(8, "little") + text + bytes(sizes[name])
+
+
+_RUNS = ("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
+_OWN = (sys.prefix, sys.base_prefix, str(HERE.parents[1]), "/proc/", "/sys/", "/dev/null", "/dev/urandom")
+_watched: list[str] = []  # the folder of the file that is being judged, while one is
+_seen: list[str] = []
+
+
+def _watch(event: str, args: tuple) -> None:
+    """Notes programs that are run, and files that are opened which are neither the reader's nor Python's."""
+    if not _watched:
+        return
+    if event in _RUNS:
+        _seen.append(f"{event} {args!r:.200}")
+    elif event == "open" and isinstance(args[0], str | bytes):
+        path = os.path.realpath(os.fsdecode(args[0]))
+        if not path.startswith((_watched[0], *_OWN)):
+            _seen.append(f"open {path}")
+
+
+sys.addaudithook(_watch)
+
+
+def judge(reader: str, content: bytes) -> bool:
+    """Whether the file is taken; raises if it does harm."""
+    folder = pathlib.Path(tempfile.mkdtemp())
+    here = pathlib.Path.cwd()
+    before = set(here.iterdir())
+
+    def late(number, _):
+        raise TimeoutError(f"more than {LIMITS[number][1]:g} s")
+
+    for number, (timer, seconds) in LIMITS.items():
+        signal.signal(number, late)
+        signal.setitimer(timer, seconds)
+    _seen.clear()
+    _watched.append(os.path.realpath(folder))
+    try:
+        READERS[reader](folder, content)
+    except UserError as error:
+        assert str(error).isprintable() and len(str(error)) <= LONGEST, str(error)
+        return False
+    finally:
+        for timer, _ in LIMITS.values():
+            signal.setitimer(timer, 0)
+        _watched.clear()
+        shutil.rmtree(folder)
+        assert not _seen, _seen
+        assert set(here.iterdir()) == before, set(here.iterdir()) - before
+    return True
+
+
+def fuzz(reader: str, seed: int, start: list[bytes] | None = None) -> tuple[int, int]:
+    """Tries some files; how many were tried, and how many of them were taken.
+
+    Args:
+        start: the files that are changed, in place of the corpus.
+    """
+    start, counts = start or corpus(reader), [0, 0]
+
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=SLOW.get(reader, BATCH),
+        deadline=None,
+        database=None,
+        suppress_health_check=list(hypothesis.HealthCheck),
+        print_blob=False,
+    )
+    @hypothesis.given(st.sampled_from(range(len(start))), st.lists(EDIT, min_size=1, max_size=4))
+    def attempt(which, edits):
+        content = edited(start[which], edits)
+        counts[0] += 1
+        try:
+            counts[1] += judge(reader, content)
+        except BaseException as error:
+            again = f"again: fuzz.py --reader {reader} --seed {seed} --minutes 0"
+            error.add_note(f"{len(content)} bytes: {content[:2000]!r}; {again}")
+            raise
+
+    attempt()
+    return counts[0], counts[1]
+
+
+def limit_memory() -> None:
+    """No more than ``MEMORY`` beyond what is in use now."""
+    used = 4096 * int(pathlib.Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, resource.RLIM_INFINITY))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0, help="shared by the readers; each has one run at least")
+    parser.add_argument("--seed", type=int, default=1, help="of the first run; the next has the next")
+    parser.add_argument("--reader", choices=READERS, action="append", help="again for more (default: all)")
+    parser.add_argument("--finds", type=pathlib.Path, default=pathlib.Path("finds.txt"), help="where finds are written")
+    args = parser.parse_args()
+    limit_memory()
+    finds_file = args.finds.resolve()
+    os.chdir(tempfile.mkdtemp())  # where nobody else leaves files
+    readers = args.reader or list(READERS)
+    finds = total = 0
+    for reader in readers:
+        began, seed, tried, taken, found = time.monotonic(), args.seed, 0, 0, []
+        while seed == args.seed or time.monotonic() - began < 60 * args.minutes / len(readers):
+            try:
+                if seed == args.seed:
+                    for content in corpus(reader):
+                        judge(reader, content)
+                more = fuzz(reader, seed)
+                tried, taken = tried + more[0], taken + more[1]
+            except Exception as error:
+                found.append(f"{reader}, seed {seed}\n{''.join(traceback.format_exception(error))}\n")
+            seed += 1
+        with finds_file.open("a") as file:
+            file.writelines(found)
+        finds, total = finds + len(found), total + tried
+        print(f"{reader:<16} {tried:>8,} files, {taken:,} taken, {len(found)} finds, seeds {args.seed} to {seed - 1}", flush=True)
+    print(f"{total:,} files in {args.minutes:g} minutes in one process; {finds} finds")
+    return 1 if finds else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

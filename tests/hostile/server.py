@@ -1,0 +1,116 @@
+"""Runs commands on hostile files, each in a forked child with limits: python server.py, a JSON line a command on stdin.
+
+The package is imported once; JAX starts no threads before a child needs it, so that forking is safe.
+"""
+
+import contextlib
+import json
+import os
+import pathlib
+import resource
+import signal
+import sys
+import time
+
+SECONDS, MEMORY = 30, 2e9  # of processor time and of the clock, of bytes that are really there
+_BACKSTOP = 16 << 30  # bytes of addresses: JAX asks for many that it never uses
+_WRITES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "os.chmod"}
+_ELSEWHERE = ("/dev/", "/proc/self/")
+
+
+def child(argv: list[str], folder: pathlib.Path) -> None:
+    """Becomes the command, in ``folder/work``; what Python writes outside ``folder`` is noted in ``folder/outside``."""
+    os.setsid()
+    resource.setrlimit(resource.RLIMIT_AS, (_BACKSTOP, _BACKSTOP))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
+    home = {"HOME": "home", "TMPDIR": "home", "XDG_CACHE_HOME": "home/cache"}
+    os.environ.update({name: str(folder / value) for name, value in home.items()})
+    os.chdir(folder / "work")
+    for stream, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT, 0o600), stream)
+    outside = os.open(folder / "outside", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+
+    def watch(event: str, args: tuple) -> None:
+        writes = event in _WRITES or event == "open" and isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR)
+        if writes and isinstance(args[0], str | bytes | os.PathLike):
+            path = os.path.abspath(os.fsdecode(args[0]))
+            if not path.startswith((f"{folder}/", *_ELSEWHERE)):
+                os.write(outside, f"{event} {path}\n".encode())
+
+    sys.addaudithook(watch)
+    sys.argv = ["mjx-nero", *argv]
+    from mjx_nero import __main__, cli
+
+    cli.run(__main__.main)
+
+
+def run(argv: list[str], folder: pathlib.Path) -> dict[str, object]:
+    """Forks, waits, and says how it ended.
+
+    The time in which a busy machine gives the child no core is none of the child's, so it is taken off the clock's.
+    """
+    started, memory, waited, why = time.monotonic(), 0.0, 0.0, ""
+    pid = os.fork()
+    if not pid:
+        code = 70
+        try:
+            child(argv, folder)
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 70
+        except BaseException:
+            sys.excepthook(*sys.exc_info())
+        finally:
+            with contextlib.suppress(Exception):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(code)
+    while True:
+        done, status, used = os.wait4(pid, os.WNOHANG)
+        if done:
+            break
+        memory, waited = max(memory, _resident(pid)), max(waited, _queued(pid))
+        if time.monotonic() - started - waited > SECONDS or memory > MEMORY:
+            why = "time" if memory <= MEMORY else "memory"
+            os.killpg(pid, signal.SIGKILL) if os.getpgid(pid) == pid else os.kill(pid, signal.SIGKILL)
+            _, status, used = os.wait4(pid, 0)
+            break
+        time.sleep(0.02)
+    memory = max(memory, 1024.0 * used.ru_maxrss)
+    code, seconds = os.waitstatus_to_exitcode(status), max(used.ru_utime + used.ru_stime, time.monotonic() - started - waited)
+    why = "time" if code in (-signal.SIGXCPU, -signal.SIGKILL) and not why else why
+    return {"code": code, "killed": why, "seconds": seconds, "memory": memory}
+
+
+def _resident(pid: int) -> float:
+    """Bytes of memory."""
+    try:
+        return 4096.0 * int(pathlib.Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+
+
+def _queued(pid: int) -> float:
+    """Time that its main thread was ready to run and had no core [s]."""
+    try:
+        return 1e-9 * int(pathlib.Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+
+
+def main() -> None:
+    """Serves until stdin ends."""
+    import mjx_nero.control.rmpflow
+    import mjx_nero.tools.eval
+    import mjx_nero.tools.import_urdf
+    import mjx_nero.tools.inspection.command
+    import mjx_nero.tools.train  # noqa: F401
+
+    print("ready", flush=True)
+    for line in sys.stdin:
+        order = json.loads(line)
+        print(json.dumps(run(order["argv"], pathlib.Path(order["folder"]))), flush=True)
+
+
+if __name__ == "__main__":
+    main()

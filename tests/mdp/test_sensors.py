@@ -1,0 +1,95 @@
+"""Sensors and pushes, on a view made by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_nero.mdp import actions, pushes, sensors
+from mjx_nero.types import ObjectView, View
+
+ZERO, UP = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+KEYS = jax.random.split(jax.random.PRNGKey(0), 500)
+
+
+def view(x=0.4, time=0.0, bias=None):
+    cube = ObjectView(pos_w=jnp.array([x, 0.0, 0.1]), quat_w=UP, linvel_w=ZERO, angvel_local=ZERO)
+    root = jnp.array([0.1, 0.0, 0.0])
+    two, action = jnp.array([0.5, -0.5]), jnp.zeros(2)
+    return View(
+        two, two, two, two, ZERO, UP, {"cube": cube}, root, ZERO, ZERO, UP, ZERO, action, action, 0, jnp.asarray(time), bias, 100
+    )
+
+
+def seen(sensor, views, keys=KEYS):
+    def episode(key):
+        memory, out = sensor.init(key, views[0]), []
+        for one in views:
+            memory, there = sensor.step(memory, one)
+            out.append(there.objects["cube"].pos_w)
+        return jnp.stack(out)
+
+    return np.asarray(jax.vmap(episode)(keys))
+
+
+def test_an_offset_stays_for_an_episode_and_noise_does_not():
+    pos = seen(sensors.ObjectPosition(offset=0.01), [view(), view(0.5)])
+    off = pos - [[0.4, 0.0, 0.1], [0.5, 0.0, 0.1]]
+    np.testing.assert_allclose(off[:, 0], off[:, 1], atol=1e-6)
+    assert 0.0095 < np.abs(off).max() <= 0.01 + 1e-6 and np.abs(off.mean(axis=(0, 1))).max() < 1e-3
+    noise = seen(sensors.ObjectPosition(noise=0.01), [view(), view()]) - [0.4, 0.0, 0.1]
+    assert 0.0095 < np.abs(noise).max() <= 0.01 + 1e-6
+    assert abs(np.corrcoef(noise[:, 0, 0], noise[:, 1, 0])[0, 1]) < 0.15
+
+
+def test_an_object_is_seen_late():
+    places = [view(x) for x in (0.1, 0.2, 0.3, 0.4)]
+    np.testing.assert_allclose(seen(sensors.ObjectPosition(delay=(2, 2)), places)[0, :, 0], [0.1, 0.1, 0.1, 0.2], atol=1e-6)
+    late = seen(sensors.ObjectPosition(delay=(0, 2)), places)[:, 3, 0]
+    assert {round(float(x), 1) for x in late} == {0.2, 0.3, 0.4}
+
+
+def test_a_base_elsewhere_moves_all_objects_about_it():
+    """0.3 m before the base, a turn of 0.1 rad moves an object by 0.3 sin 0.1 = 0.02995 m to the side."""
+    pos = seen(sensors.BasePose(turn=0.1), [view()])[:, 0]
+    np.testing.assert_allclose(np.hypot(pos[:, 0] - 0.1, pos[:, 1]), 0.3, atol=1e-6)
+    assert 0.029 < np.abs(pos[:, 1]).max() <= 0.02995 + 1e-5
+    moved = seen(sensors.BasePose(offset=0.02), [view(), view()]) - [0.4, 0.0, 0.1]
+    assert 0.019 < np.abs(moved).max() <= 0.02 + 1e-6
+    np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
+
+
+def test_encoders_read_beside_the_joints():
+    _, there = sensors.Encoders().step((), view(bias=jnp.array([0.01, -0.02])))
+    np.testing.assert_allclose(there.joint_pos, [0.51, -0.52])
+    one = view()
+    assert sensors.Encoders().step((), one)[1] is one
+
+
+def test_pushes_come_in_their_interval_and_not_between():
+    push = pushes.Push(speed=0.5, interval=(0.1, 0.2))
+    times = np.arange(0.0, 1.0, 0.02)
+
+    def episode(key):
+        memory, out = push.init(key, view()), []
+        for time in times:
+            memory, speed = push.step(memory, view(time=time))
+            out.append(speed)
+        return jnp.stack(out)
+
+    speeds = np.asarray(jax.vmap(episode)(KEYS[:50]))
+    for hit in (np.abs(speeds) > 0).any(axis=2):
+        at = times[hit]
+        assert 0.09 < at[0] < 0.23 and (np.diff(at) > 0.09).all() and (np.diff(at) < 0.23).all()
+    assert 0.45 < np.abs(speeds).max() <= 0.5
+
+
+def test_command_noise_stays_within_its_amount_and_the_joints_ranges():
+    high = np.array([1.0, 0.2], np.float32)
+    zero = np.zeros(2, np.float32)
+    arm = actions.Drives(zero, -high, high, high, zero, zero)
+    none = actions.Drives(*(np.zeros(0, np.float32),) * 6)
+    noise = actions.Noise({"arm": arm, "gripper": none}, amount=0.1)
+    act = actions.Act(jnp.zeros(2), {}, {}, {"arm": jnp.array([0.0, 0.2]), "gripper": jnp.zeros(0)})
+    off = np.stack([noise.step(noise.init(key, act), jnp.zeros(0), act)[1].targets["arm"] for key in KEYS[:100]])
+    assert 0.09 < np.abs(off[:, 0]).max() <= 0.1 and 0.1 <= off[:, 1].min() and off[:, 1].max() == pytest.approx(0.2)

@@ -1,0 +1,163 @@
+"""Command lines: kinds of numbers and paths, help of every field, and programs outside their environment."""
+
+import argparse
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import mjx_nero
+from mjx_nero import cli, config, control, env_cfg, list_envs, list_presets
+from mjx_nero.envs import registry
+from mjx_nero.learn import training
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [
+        (cli.positive, "7", 7),
+        (cli.positive, "1e6", 1_000_000),
+        (cli.positive, "8000000000", 8_000_000_000),
+        (cli.seed, "0", 0),
+        (cli.seed, "999999999999999999", 999_999_999_999_999_999),
+        (cli.positive_float, ".5", 0.5),
+        (cli.non_negative, "0", 0.0),
+        (cli.share, "1", 1.0),
+        (cli.at_most(100), "100", 100),
+    ],
+)
+def test_numbers_of_flags(kind, text, value):
+    assert kind(text) == value and type(kind(text)) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "message"),
+    [
+        (cli.positive, "many", "takes a whole number, got 'many'"),
+        (cli.positive, "0", "must be at least 1, got '0'"),
+        (cli.positive, "2.5", "takes a whole number, got '2.5'"),
+        (cli.positive, "1_000", "takes a whole number, got '1_000'"),
+        (cli.positive, "inf", "takes a whole number, got 'inf'"),
+        (cli.positive, "1e999", "takes a whole number, got '1e999'"),
+        (cli.positive, "9" * 400, "takes a whole number, got '9{20,30}\\.\\.\\.9{20,30}'"),
+        (cli.positive, "", "takes a whole number, got ''"),
+        (cli.seed, "-1", "must be at least 0, got '-1'"),
+        (cli.seed, "18446744073709551616", "takes a whole number, got '18446744073709551616'"),
+        (cli.non_negative, "nan", "takes a finite number, got 'nan'"),
+        (cli.non_negative, "-0.1", "must be at least 0, got '-0.1'"),
+        (cli.positive_float, "inf", "takes a finite number, got 'inf'"),
+        (cli.positive_float, "0", "must be above 0, got '0'"),
+        (cli.share, "0", "must be above 0 and at most 1, got '0'"),
+        (cli.at_most(1_000), "1e12", "must be at least 1 and at most 1000, got '1e12'"),
+        (cli.path(), "x" * 300, "takes a path with names of at most 255 bytes, got 'x{20,30}\\.\\.\\.x{20,30}'"),
+        (cli.path(), "a\0b", "takes a path with names of at most 255 bytes"),
+        (cli.path(), "", "takes a path"),
+        (cli.path(".mp4"), "v.zzz", "takes a name that ends in .mp4, got 'v.zzz'"),
+    ],
+)
+def test_what_flags_refuse(kind, text, message):
+    with pytest.raises(argparse.ArgumentTypeError, match=message) as error:
+        kind(text)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 200
+
+
+def test_a_flag_and_its_fault_read_as_one_sentence():
+    parser = cli.Parser(prog="x")
+    parser.add_argument("--seed", type=cli.seed)
+    with pytest.raises(mjx_nero.UserError, match=r"^--seed takes a whole number, got '1e99' \(see --help\)$"):
+        parser.parse(["--seed", "1e99"])
+    with pytest.raises(mjx_nero.UserError, match=r"^--seed must be at least 0, got '-1' \(see --help\)$"):
+        parser.parse(["--seed=-1"])
+
+
+def test_an_empty_value_of_a_field_is_one():
+    assert cli.Parser(prog="x").parse(["--env.name=", "--env.a", ""], prefixes=("env",))[1] == {"env": {"name": "", "a": ""}}
+
+
+@pytest.mark.parametrize("name", list_envs())
+def test_help_describes_every_field(name):
+    for preset in list_presets(name):
+        cfg = env_cfg(name, preset, None if registry.robot_of(name) else "nero")
+        for described in (cfg, training.learner_cfg(cfg, preset)):
+            about = config.describe(described)
+            assert list(about) == list(config.flatten(described))
+            assert not [field for field, text in about.items() if not text]
+
+
+def test_help_describes_every_field_of_the_controllers():
+    for _, cfg in control.CONTROLLERS.values():
+        guest = not type(cfg).__module__.startswith("mjx_nero.")  # of another test
+        assert guest or all(config.describe(cfg).values())
+
+
+def test_help_takes_its_texts_from_where_the_fields_are():
+    about = config.describe(env_cfg("nero_lift"))
+    assert about["robot.arm.stiffness"] == "[N m/rad] or [N/m]"  # under Attributes
+    assert about["sim.dt"] == "physics step [s]"  # behind the field
+    assert about["rewards.reaching_object.weight"] == "times the function, per second of simulated time"  # of a term
+    assert about["rewards.goal_tracking.params.std"].startswith("of 1 - tanh(distance to the commanded point / std)")
+    lines = cli.fields_help({"env": env_cfg("nero_lift")}).splitlines()
+    assert lines[lines.index("  --env.sim.dt 0.01") + 1] == "        physics step [s]"
+
+
+def test_a_field_without_a_text_of_its_own_has_none():
+    @dataclasses.dataclass(frozen=True)
+    class Inner:
+        """Says nothing of its fields."""
+
+        bare: float = 1.0
+
+    @dataclasses.dataclass(frozen=True)
+    class Outer:
+        """Says something of one."""
+
+        inner: Inner = Inner()  # what Inner is for
+
+    assert config.describe(Outer()) == {"inner.bare": ""}
+
+
+def _python(*args: str, **env: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, *args], capture_output=True, text=True, env={**os.environ, **env}, cwd=ROOT)
+
+
+@pytest.mark.parametrize("argv", [["train.py"], ["eval.py"], ["-m", "mjx_nero", "list-envs"]], ids=" ".join)
+def test_outside_the_environment_a_program_ends_in_one_line(argv):
+    found = _python("-S", *argv)  # -S: without the installed packages
+    assert found.returncode == 2 and found.stdout == ""
+    assert found.stderr.count("\n") == 1 and found.stderr.startswith("error: ")
+    assert "does not have the package" in found.stderr and "activate the environment" in found.stderr
+
+
+def test_outside_the_environment_the_package_says_what_to_do():
+    found = _python("-S", "-c", "import mjx_nero; print(mjx_nero.__version__)\nfrom mjx_nero import make")
+    assert found.stdout == f"{mjx_nero.__version__}\n"
+    assert "activate the environment" in found.stderr.splitlines()[-1] and "ModuleNotFoundError" not in found.stderr
+    with pytest.raises(AttributeError, match="no attribute 'mak'"):
+        mjx_nero.mak  # noqa: B018
+
+
+def test_public_names_are_there():
+    assert set(mjx_nero.__all__) <= set(dir(mjx_nero))
+    assert all(getattr(mjx_nero, name) is not None for name in mjx_nero.__all__)
+
+
+def _seconds(*args: str) -> float:
+    """Of all imports, as Python itself counts it."""
+    lines = _python("-X", "importtime", *args).stderr.splitlines()
+    spent = [line.split("|") for line in lines if line.startswith("import time:") and line.split("|")[1].strip().isdigit()]
+    return sum(int(own.removeprefix("import time:")) for own, _, _ in spent) / 1e6
+
+
+@pytest.mark.slow
+def test_imports_are_quick():
+    """Beside JAX's in the same seconds, the median of several: other processes take their share of the machine."""
+    programs = ("-c", "import jax"), ("-c", "import mjx_nero"), ("train.py", "--help")
+    times = np.array([[_seconds(*args) for args in programs] for _ in range(5)])
+    package, program = np.median(times[:, 1:] / times[:, :1], axis=0)
+    assert package < 1.3 and program < 2

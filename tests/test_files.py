@@ -1,0 +1,75 @@
+"""Files are read with limits: what is regular, small and plain, and nothing else."""
+
+import os
+
+import pytest
+
+from mjx_nero import UserError, files
+
+
+def test_read_bytes(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    assert files.read_bytes(path, 5) == b"12345"
+    with pytest.raises(UserError, match="5e-06 MB: more than 4e-06 MB are not read"):
+        files.read_bytes(path, 4)
+    os.mkfifo(tmp_path / "pipe")
+    for name, words in (("pipe", "is not a file"), (".", "is not a file"), ("no", "there is no file"), ("x" * 300, "too long")):
+        with pytest.raises(UserError, match=words):
+            files.read_bytes(tmp_path / name, 5)
+    with pytest.raises(UserError, match="null byte"):
+        files.read_bytes(tmp_path / "a\0b", 5)
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    with pytest.raises(UserError, match="is not a file"):
+        files.read_bytes(tmp_path / "endless", 5)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", None),
+        ("a: 1\n2: [x, 2.5, true, ~]", {"a": 1, "2": ["x", 2.5, True, None]}),
+        ("on: {yes: no}", {"on": {"yes": False}}),  # keys are names, as written
+        ("when: 2024-99-99", {"when": "2024-99-99"}),
+        ("a: &a {b: 1}\nc: *a", {"a": {"b": 1}, "c": {"b": 1}}),
+        ("a: !!float 1", {"a": 1.0}),
+    ],
+)
+def test_read_yaml(tmp_path, text, value):
+    (tmp_path / "a.yaml").write_text(text)
+    assert files.read_yaml(tmp_path / "a.yaml") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\nb: 2\na: 3", "is not YAML in line 3: key 'a' stands twice"),
+        ("? [1]\n: 2", "a key that is no name"),
+        ("[" * 20, "deeper than 12 levels"),
+        ("[" + "1," * 30_000 + "]", "more than 20000 values"),
+        ("a: &a [*a]", "an alias within what it stands for"),
+        ("a: !!int b", "invalid literal"),
+        ("a: 9223372036854775808", "more than 64 bits"),
+        ("!!python/name:os.system", "the tag 'tag:yaml.org,2002:python/name:os.system' is not read"),
+    ],
+)
+def test_no_yaml(tmp_path, text, message):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(UserError) as error:
+        files.read_yaml(tmp_path / "a.yaml")
+    assert message in str(error.value)
+
+
+def test_ten_aliases_of_ten(tmp_path):
+    """What an alias stands for counts as often as it is named: 10 to the power of 5 values in 200 bytes."""
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 5)]
+    (tmp_path / "a.yaml").write_text("\n".join(lines))
+    with pytest.raises(UserError, match="more than 20000 values"):
+        files.read_yaml(tmp_path / "a.yaml")
+
+
+def test_messages_are_one_short_line():
+    message = str(UserError("a\nb\t\x1b[2J \u202e" + "x" * 1000 + " change it"))
+    assert message.startswith("a b \\x1b[2J \\u202exxx") and message.endswith("xxx change it")
+    assert message.isprintable() and len(message) <= 480

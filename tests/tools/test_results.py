@@ -1,0 +1,59 @@
+"""The table of results: what is measured is kept, and shown as it was measured."""
+
+import json
+
+import pytest
+
+from mjx_nero.tools import results
+
+LEARNT = {"target": 0.95, "seeds": 8, "reached": 7, "seconds_median": 10.04, "seconds_worst": None}
+LEARNT |= {"env_steps_median": 2_400_000, "env_steps_worst": None, "version": "9.9", "machine": "a GPU"}
+PLAYED = {"success_rate": 0.9, "success_rate_95": [0.8, 0.95], "episodes": 1000, "version": "9.9", "machine": "a CPU"}
+
+
+def test_cells():
+    assert list(results.rows({"x_lift": {"learning": LEARNT, "native": PLAYED}, "y_reach": {"warp": PLAYED}})) == [
+        (
+            *("x_lift", "95%", "7 of 8", "median 10.0, worst never", "median 2.4 M, worst never"),
+            *("90.0% (80.0 to 95.0), 1,000 episodes", "", "9.9, a GPU; 9.9, a CPU"),
+        ),
+        ("y_reach", "", "", "", "", "", "90.0% (80.0 to 95.0), 1,000 episodes", "9.9, a CPU"),
+    ]
+
+
+def test_markdown():
+    lines = results.markdown([("a",) * 8]).splitlines()
+    assert len(lines) == 3 and all(line.count("|") == 9 for line in lines)
+
+
+def test_environments_to_learn():
+    names = results.learnable()
+    assert {"nero_lift", "so101_reach", "cobotta_stack"} <= set(names)
+    assert "nero_pick_place" not in names and "reach" not in names  # a controller's, and any robot's
+
+
+@pytest.mark.slow
+def test_command(call, tmp_path):
+    """What the file holds already stays; what is measured anew takes its place."""
+    (tmp_path / "r.json").write_text(json.dumps({"so101_reach": {"learning": LEARNT, "native": PLAYED}}))
+    flags = ("--what", "policies", "--envs", "so101_reach", "--episodes", 4)
+    code, out, err = call("mjx_nero", "results", "--json", "r.json", "--markdown", "r.md", *flags)
+    assert code == 0, err
+    held = json.loads((tmp_path / "r.json").read_text())["so101_reach"]
+    assert held["learning"] == LEARNT and held["native"]["episodes"] == 4 and held["native"]["version"] != "9.9"
+    assert "7 of 8" in (tmp_path / "r.md").read_text() and "so101_reach" in out
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--json", "r.json", "--envs", "nope"), "unknown env nope: choose from"),
+        (("--json", "r.json", "--what", "x"), "unknown what x: choose from learning, policies"),
+        (("--json", "bad.json"), "bad.json holds no results: name another file"),
+        ((), "--json"),
+    ],
+)
+def test_mistakes(call, tmp_path, flags, said):
+    (tmp_path / "bad.json").write_text('{"a": 3}')
+    code, _, err = call("mjx_nero", "results", *flags)
+    assert code == 2 and said in err and not (tmp_path / "r.json").exists()

@@ -1,0 +1,36 @@
+"""What is varied to see how far a policy gets."""
+
+import pytest
+
+from mjx_nero import UserError, __main__
+from mjx_nero.envs.registry import env_cfg
+from mjx_nero.tools.robustness.sweeps import ALL, sweeps
+
+
+def test_a_lift_has_its_object_and_a_reach_only_its_arm():
+    lift, reach = sweeps(env_cfg("nero_lift")), sweeps(env_cfg("nero_reach"))
+    assert "object mass [factor]" in lift and "gravity compensation [factor]" not in lift  # Nero's drives do not compensate
+    assert set(reach) < set(lift) and not {name for name in reach if "object" in name or "pads" in name}
+    assert "gravity compensation [factor]" in sweeps(env_cfg("piper_lift"))
+
+
+def test_one_parameter_differs_at_a_time_and_the_others_stay():
+    value, point = sweeps(env_cfg("nero_lift"))["damping [factor]"][0]
+    (term,) = point.terms.values()
+    assert value == 0.5 and term.params["damping"] == (0.5, 0.5)
+    assert term.params["stiffness"] == term.params["effort"] == (1.0, 1.0) and term.params["actuators"][0] == "joint1"
+    assert point.delay == (0, 0) and point.offset == 0.0
+    steps, late = sweeps(env_cfg("nero_lift"))["action delay [control steps]"][3]
+    assert steps == 3 and late.delay == (3, 3) and not late.terms
+
+
+def test_all_at_once_widens_the_presets_ranges():
+    (zero, none), _, (one, preset), (more, wide) = sweeps(env_cfg("nero_lift"))[ALL]
+    assert (zero, one, more) == (0.0, 1.0, 1.5) and not none.terms and preset.delay == (0, 3) and wide.delay == (0, 4)
+    assert preset.terms["cube_mass"].params["scale"] == (0.5, 4.0) and wide.terms["cube_mass"].params["scale"] == (0.25, 5.5)
+    assert wide.terms["link_center"].params["offset"] == pytest.approx(0.015)
+
+
+def test_an_unknown_parameter_is_one_line():
+    with pytest.raises(UserError, match="no parameter has gravty in its name"):
+        __main__.main(["robustness", "--env", "nero_lift", "--only", "gravty"])

@@ -1,0 +1,88 @@
+"""Ratios of speed, measured in turn in one run, so that a slow machine or a busy one is as slow in both parts of a ratio.
+
+What counts are the CPU seconds of this process, all threads together: other processes make them longer by a little, not by half.
+Each bound lies between what was measured, in brackets (before JAX 0.11; since), and what it would be with the first part twice as
+dear.
+"""
+
+import dataclasses
+import statistics
+import time
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import mjx_nero
+from mjx_nero.envs import wrappers
+from mjx_nero.learn import ppo, run_cfg
+from mjx_nero.sim.physics import fusion
+from mjx_nero.sim.physics.mjx import JaxPhysics
+from mjx_nero.tools.benchmark import throughput
+from mjx_nero.tools.benchmark.program import Program
+
+NUM_ENVS, ROUNDS = 128, 9
+
+
+class Still:
+    """Physics that does nothing: what is left of a step is the MDP."""
+
+    compiler_options = fusion()  # as the other programs are compiled
+
+    def step(self, sim, ctrl):
+        return sim, jnp.zeros(())
+
+
+@pytest.fixture(scope="module")
+def optimised():
+    """XLA's optimisations, which the other tests do without."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(scope="module")
+def costs(env, optimised) -> dict[str, list[float]]:
+    """CPU seconds an env step, one entry a round."""
+    if jax.default_backend() != "cpu":
+        pytest.skip("on an accelerator the CPU's seconds tell little")
+    mjx_step = jax.jit(jax.vmap(JaxPhysics(env.physics_model, env.cfg.sim).step))
+    native = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
+    still = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
+    still.__dict__["physics"] = Still()
+    cfg = dataclasses.replace(run_cfg.learner_cfg(native.cfg, "default"), num_envs=NUM_ENVS)
+    sim = jax.vmap(env.sample)(jax.random.split(jax.random.PRNGKey(0), 8))[0]
+    programs = {
+        "physics": throughput.physics(native, 25),
+        "step": throughput.step(native, 25),
+        "terms": throughput.step(still, 100),
+        "ppo": throughput.training(ppo.Learner(wrappers.for_training(native), cfg), 1),
+        "mjx": Program(lambda sim, key: (mjx_step(sim, sim.ctrl)[0], {}), sim, 8),
+    }
+    programs["mjx"].run()  # compiles
+    found: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(ROUNDS):
+        for name, program in programs.items():
+            begun = time.process_time()
+            program.run()
+            found[name].append((time.process_time() - begun) / program.work)
+    return found
+
+
+# XLA's code for the terms is faster from JAX 0.11 on; MuJoCo's C library is the same for all.
+OLD = jax.__version_info__ < (0, 11)
+BOUNDS = [
+    pytest.param("terms", "physics", 0.12 if OLD else 0.07, id="the MDP beside the physics (0.08; 0.045)"),
+    pytest.param("ppo", "step", 4.0, id="training beside random actions (2.5; 2.8)"),
+    pytest.param("physics", "mjx", 0.07, id="MuJoCo's C library beside MJX-JAX (0.04)"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("what", "beside", "most"), BOUNDS)
+def test_cost(costs, what, beside, most):
+    ratio = statistics.median(a / b for a, b in zip(costs[what], costs[beside], strict=True))
+    seconds = {name: f"{1e6 * statistics.median(costs[name]):.1f}" for name in (what, beside)}
+    print(f"{what} {seconds[what]}, {beside} {seconds[beside]} us an env step: {ratio:.3f}")
+    assert ratio < most, f"{what} costs {ratio:.2f} of {beside}: {seconds} us an env step"
