@@ -177,3 +177,12 @@ def test_torch_shares_memory(reach):
     same.reset(seed=0)
     action = torch.linspace(-1, 1, N * 7).reshape(N, 7)
     np.testing.assert_array_equal(env.step(action)[0].numpy(), same.step(action.numpy())[0])
+
+
+@pytest.mark.slow
+def test_the_example_tells_a_rate(tmp_path):
+    program = pathlib.Path(__file__).resolve().parents[2] / "examples" / "gymnasium_rate.py"
+    command = [sys.executable, program, "--env", "nero_reach", "--num-envs", "4", "--steps", "3"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"4 x nero_reach, jax: [\d,]+ env steps/s", done.stdout)
