@@ -90,6 +90,13 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
     return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
 
 
+# Tasks that take all they need from the robot: the same for any, by name or imported.
+FITTING: dict[str, Presets] = {
+    "clutter": clutter.presets(),
+    "push": push.presets(),
+    "place": place.presets(),
+    "stack": stack.presets(),
+}
 ENVS: Envs = {
     "reach": (None, reach.presets()),
     "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real)),
@@ -97,8 +104,5 @@ ENVS: Envs = {
     "pick_place": (None, {"default": _pick_place}),
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
-    "clutter": (None, clutter.presets()),
-    "push": (None, push.presets()),
-    "place": (None, place.presets()),
-    "stack": (None, stack.presets()),
+    **{name: (None, presets) for name, presets in FITTING.items()},
 }

@@ -5,19 +5,9 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjx_nero.envs import fitted
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import (
-    clutter,
-    follow_target,
-    lift,
-    lift_obstacles,
-    pick_place,
-    place,
-    push,
-    reach,
-    reach_obstacles,
-    stack,
-)
+from mjx_nero.envs.tasks import follow_target, lift, lift_obstacles, pick_place, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
@@ -127,8 +117,5 @@ ENVS: Envs = {
     "cobotta_pick_place": (COBOTTA_PRO_900, pick_place.presets(PICK_PLACE)),
     "cobotta_reach_obstacles": (COBOTTA_PRO_900, reach_obstacles.presets(REACH_OBSTACLES)),
     "cobotta_lift_obstacles": (COBOTTA_PRO_900, lift_obstacles.presets(LIFT_OBSTACLES)),
-    "cobotta_clutter": (COBOTTA_PRO_900, clutter.presets()),
-    "cobotta_push": (COBOTTA_PRO_900, push.presets()),
-    "cobotta_place": (COBOTTA_PRO_900, place.presets()),
-    "cobotta_stack": (COBOTTA_PRO_900, stack.presets()),
+    **{f"cobotta_{task}": (COBOTTA_PRO_900, presets) for task, presets in fitted.FITTING.items()},
 }

@@ -3,19 +3,9 @@
 import dataclasses
 import math
 
+from mjx_nero.envs import fitted
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import (
-    clutter,
-    follow_target,
-    lift,
-    lift_obstacles,
-    pick_place,
-    place,
-    push,
-    reach,
-    reach_obstacles,
-    stack,
-)
+from mjx_nero.envs.tasks import follow_target, lift, lift_obstacles, pick_place, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
@@ -100,8 +90,5 @@ ENVS: Envs = {
     "nero_pick_place": (NERO, pick_place.presets(PICK_PLACE)),
     "nero_reach_obstacles": (REACH_NERO, reach_obstacles.presets(REACH_OBSTACLES)),
     "nero_lift_obstacles": (NERO, lift_obstacles.presets(LIFT_OBSTACLES)),
-    "nero_clutter": (NERO, clutter.presets()),
-    "nero_push": (NERO, push.presets()),
-    "nero_place": (NERO, place.presets()),
-    "nero_stack": (NERO, stack.presets()),
+    **{f"nero_{task}": (NERO, presets) for task, presets in fitted.FITTING.items()},
 }
