@@ -59,6 +59,7 @@ class Start:
     joint_pos: Float[Array, " nj"]  # arm joints, then gripper joints [rad, m]
     object_pos_w: dict[str, Float[Array, "3"]]  # [m]
     object_quat_w: dict[str, Float[Array, "4"]]  # wxyz
+    goal_pos_w: Float[Array, "3"] = struct.field(default_factory=lambda: jnp.zeros(3))  # the first command, drawn before [m]
     target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``EnvCfg.targets``
 
 

@@ -145,17 +145,18 @@ class ManipulationEnv(Env):
         """The start of an episode, before it is observed."""
         k_fields, k_memory = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY))
         rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
+        command, command_quat = self._sample_command(k_command)
         poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
         start = Start(
             joint_pos=jnp.asarray(self.cfg.robot.home),
             object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
             object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
+            goal_pos_w=jnp.asarray(self.cfg.robot.base_pos) + command,
         )
         for key, event in zip(k_events, self.cfg.events.values(), strict=True):
             start = event(key, start)
         fields = self._randomization(k_fields)
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
-        command, command_quat = self._sample_command(k_command)
         sim = Sim(
             qpos=qpos,
             qvel=jnp.zeros(nv),

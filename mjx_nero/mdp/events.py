@@ -18,6 +18,19 @@ def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Ra
     return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
 
 
+def object_apart_from_goal(key: Key, start: Start, *, x: Range, y: Range, apart: NonNegative, object: str = "cube") -> Start:
+    """Puts the object at a uniform ``x`` and ``y`` of the world, at least ``apart`` from the goal along the table [m].
+
+    The first of sixteen places that is; the farthest one, should none be.
+    """
+    low, high = jnp.array([x, y]).T
+    places = jax.random.uniform(key, (16, 2), minval=low, maxval=high)
+    away = jnp.linalg.norm(places - start.goal_pos_w[:2], axis=1)
+    place = places[jnp.argmax(jnp.minimum(away, apart))]  # the first of those that are far enough, which count alike
+    pos = jnp.append(place, start.object_pos_w[object][2])
+    return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
+
+
 def scatter(
     key: Key,
     start: Start,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.bounds import Positive
-from mjx_nero.mdp.rewards import held
+from mjx_nero.mdp.rewards import Heights, held
 from mjx_nero.mdp.success import touched
 from mjx_nero.types import Key, View
 
@@ -15,7 +15,7 @@ from mjx_nero.types import Key, View
 class Grasped:
     """Whether the object has been held (see ``rewards.held``) since the start."""
 
-    minimal_height: float
+    minimal_height: Heights
     grasp_radius: Positive
     object: str = "cube"
 
@@ -33,7 +33,7 @@ class Grasped:
 class GraspTime:
     """When the object was first held (see ``rewards.held``) [s]; 0: not yet."""
 
-    minimal_height: float
+    minimal_height: Heights
     grasp_radius: Positive
     object: str = "cube"
 

@@ -8,17 +8,21 @@ from mjx_nero.bounds import Count, Positive
 from mjx_nero.mdp import success
 from mjx_nero.types import View
 
+Heights = float | tuple[float, ...]  # [m]
+
 
 def _ee_distance(view: View, object: str) -> Float[Array, ""]:
     return jnp.linalg.norm(view.objects[object].pos_w - view.ee_pos_w)
 
 
-def held(view: View, *, minimal_height: float, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
+def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
     """The object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
-    A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point.
+    A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point. Several heights are those of
+    ``EnvCfg.targets``, for the object that the episode commands.
     """
-    return (view.objects[object].pos_w[2] > minimal_height) & (_ee_distance(view, object) < grasp_radius)
+    height = jnp.array(minimal_height)[view.target] if isinstance(minimal_height, tuple) else minimal_height
+    return (view.objects[object].pos_w[2] > height) & (_ee_distance(view, object) < grasp_radius)
 
 
 def object_ee_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:
@@ -64,13 +68,13 @@ def ee_goal_pose(view: View, *, std: Positive, angle_std: Positive) -> Float[Arr
     return ee_goal_distance(view, std=std) * (1.0 - jnp.tanh(success.ee_angle(view) / angle_std))
 
 
-def object_is_held(view: View, *, minimal_height: float, grasp_radius: Positive, object: str = "cube") -> Float[Array, ""]:
+def object_is_held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Float[Array, ""]:
     """1 while the object is held (see ``held``)."""
     return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object).astype(jnp.float32)
 
 
 def held_goal_distance(
-    view: View, *, std: Positive, minimal_height: float, grasp_radius: Positive, object: str = "cube"
+    view: View, *, std: Positive, minimal_height: Heights, grasp_radius: Positive, object: str = "cube"
 ) -> Float[Array, ""]:
     """1 - tanh(distance to the commanded point / std), while held."""
     gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)
@@ -78,7 +82,7 @@ def held_goal_distance(
 
 
 def held_at_goal(
-    view: View, *, threshold: Positive, minimal_height: float, grasp_radius: Positive, object: str = "cube"
+    view: View, *, threshold: Positive, minimal_height: Heights, grasp_radius: Positive, object: str = "cube"
 ) -> Float[Array, ""]:
     """1 while the object is held within ``threshold`` [m] of the commanded point."""
     gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)

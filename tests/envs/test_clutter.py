@@ -103,6 +103,21 @@ def test_it_stays_the_same_through_an_episode_and_changes_with_the_next(env):
     assert state.done.all() and (targets[3] != targets[0]).any()
 
 
+def test_what_counts_as_held_is_above_the_largest_of_its_kind(env, starts):
+    """By 5 mm: no object counts as held while it lies, whichever is commanded, and each has a height of its own."""
+    heights = CFG.rewards["holding_object"].params["minimal_height"]
+    for name, height in zip(NAMES, heights, strict=True):
+        lies = poses(env, starts, name)[:, 2].max()
+        assert lies < height - 0.004 and height < 1.15 * CFG.scene.objects[name].rest_height + 0.0051
+    paid = jax.vmap(lambda view: rewards.object_is_held(view, **CFG.rewards["holding_object"].params))
+    view = jax.vmap(env.view)(starts)
+    at = view.replace(ee_pos_w=view.objects["target"].pos_w)
+    assert float(paid(at).sum()) == 0
+    up = dataclasses.replace(view.objects["target"], pos_w=view.objects["target"].pos_w + jnp.array([0.0, 0.0, 0.02]))
+    raised = view.replace(objects={**view.objects, "target": up}, ee_pos_w=up.pos_w)
+    assert float(paid(raised).mean()) == 1
+
+
 def test_a_picture_shows_what_was_drawn_and_the_commanded_one_in_green(env, starts):
     looks = jax.vmap(env.looks)(starts)
     target = np.asarray(starts.info["carry"].memory["target"])

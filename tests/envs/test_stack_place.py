@@ -4,11 +4,12 @@ import dataclasses
 import functools
 import itertools
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero import UserError, env_cfg
+from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.pick_place import PickPlaceCfg
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.tasks import place, stack
@@ -53,6 +54,13 @@ def test_place_is_of_a_box_that_shows_how_it_is_turned():
     assert cfg.controllers["pick_place"]["turn"] and "aligning" in cfg.rewards
     raised = env_cfg("place", robot=dataclasses.replace(NERO, base_pos=(0.0, 0.0, 0.1)))
     assert raised.command.params["z"] == pytest.approx((-0.08, -0.08))  # of the robot's frame
+
+
+def test_a_box_that_is_to_be_placed_does_not_lie_there_already():
+    env = make("nero_place", impl="native")
+    view = jax.vmap(env.view)(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 500)))
+    away = np.linalg.norm((view.goal_pos_w - view.objects["box"].pos_w)[:, :2], axis=1)
+    assert away.min() > 0.08 and (away >= 0.1 - 1e-6).mean() > 0.99  # two and a half of its heights; the farthest, should none be
 
 
 def test_an_arm_of_four_joints_places_a_cube_without_a_turn():

@@ -125,6 +125,9 @@ def test_every_public_reward_is_tested():
 def test_held_and_at_goal():
     assert rewards.held(at_height(0.03), minimal_height=0.025, grasp_radius=0.04)
     assert not rewards.held(view(object_pos_w=[1.0, 2.0, 3.0]), minimal_height=0.025, grasp_radius=0.04)  # knocked up, not held
+    for target, up in ((0, True), (1, False)):  # of several objects each has its own height
+        commanded = at_height(0.03).replace(target=jnp.array(target))
+        assert bool(rewards.held(commanded, minimal_height=(0.025, 0.035), grasp_radius=0.04)) is up
     assert success.object_at_goal(view(), threshold=0.101) and not success.object_at_goal(view(), threshold=0.099)
 
 

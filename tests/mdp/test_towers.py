@@ -216,6 +216,22 @@ def test_objects_start_apart(x, y, along):
     assert abs(np.corrcoef(at[:, 0, along], at[:, 0, 1 - along])[0, 1]) < 0.1
 
 
+def test_an_object_starts_apart_from_the_goal():
+    """Uniform on what is left of the box; where nothing is left, at its far end."""
+    goal, box = start().replace(goal_pos_w=jnp.array([0.3, 0.0, 0.5])), {"x": (0.3, 0.4), "y": (-0.2, 0.2), "object": "b"}
+    draw = jax.jit(jax.vmap(lambda key: events.object_apart_from_goal(key, goal, apart=0.1, **box).object_pos_w))
+    placed = draw(jax.random.split(KEY, 4000))
+    at = np.asarray(placed["b"])
+    away = np.hypot(at[:, 0] - 0.3, at[:, 1])
+    assert away.min() > 0.1 - 1e-6 and (at[:, 2] == np.float32(0.01)).all()
+    assert (at[:, 0] >= 0.3 - 1e-6).all() and np.ptp(at[:, 0]) > 0.097 and np.ptp(at[:, 1]) > 0.39
+    # Half a disc of 10 cm covers 0.0157 of 0.04 m2; beyond 20 cm along y nothing lies, and beyond 10 cm 0.02 of the 0.0243 left.
+    assert (np.abs(at[:, 1]) > 0.1).mean() == pytest.approx(0.02 / (0.04 - np.pi * 0.1**2 / 2), abs=0.025)
+    np.testing.assert_array_equal(placed["a"], np.zeros((4000, 3)))
+    far = events.object_apart_from_goal(KEY, goal, apart=1.0, **box).object_pos_w["b"]
+    assert np.hypot(far[0] - 0.3, far[1]) > 0.15
+
+
 def test_no_room_for_objects_is_one_line():
     params = {"objects": ("a", "b", "c"), "x": (0.0, 0.1), "y": (-0.1, 0.15), "apart": 0.15}
     with pytest.raises(UserError, match=r"^3 objects 0.15 m apart take 0.3 m, and x \(0.0, 0.1\) and y .* are shorter$"):

@@ -21,6 +21,7 @@ COUNT = (3, 6)  # objects on the table, at least and at most
 MARGIN = 0.003  # [m] between an open hand and the nearest object
 OPEN = 1.5  # the hand opens so many times as far as the widest object asks for: in clutter it takes no more room than it must
 FOOT = 0.1  # [m] no object lies nearer to the robot's axis
+LIFTED = 0.005  # [m] an object that is held is that much higher than its largest like lies
 AWAY = 4.0  # [m] from the table's centre: the objects that an episode leaves out
 
 # Shape, lengths in units of the widest object's edge, and how it lies; along x those that are longer than wide.
@@ -67,14 +68,14 @@ def volume(item: ObjectCfg) -> float:
     return ends + np.pi * first**2 * sum(rest)
 
 
-def extent(item: ObjectCfg) -> tuple[float, float]:
-    """Radii of circles around an object's outline from above as it lies, and around all of it [m]."""
+def extent(item: ObjectCfg) -> float:
+    """Radius of a circle around an object's outline from above as it lies [m]."""
     first, *rest = item.size
     if item.shape == "box":
-        return float(np.linalg.norm(item.size[:2])) / 2, float(np.linalg.norm(item.size)) / 2
+        return float(np.linalg.norm(item.size[:2])) / 2
     if item.shape in ("cylinder", "can"):
-        return first, float(np.hypot(first, rest[0] / 2))
-    return (first + (rest[0] / 2 if rest else 0.0),) * 2
+        return first
+    return first + (rest[0] / 2 if rest else 0.0)
 
 
 def fitted(robot: RobotCfg) -> Setup:
@@ -88,7 +89,7 @@ def fitted(robot: RobotCfg) -> Setup:
     unit = edge / SIZES[1]
     objects = {name: _object(unit, **shape) for name, shape in SHAPES.items()}
     robot = grasp.opened(robot, OPEN * edge)
-    around = SIZES[1] * max(extent(item)[0] for item in objects.values())
+    around = SIZES[1] * max(extent(item) for item in objects.values())
     hand = float(np.hypot(min(OPEN * edge, robot.opening) / 2 + thickness, width / 2)) + MARGIN
     jitter = edge / 5
     pitch = round(around + max(around, hand) + 2 * jitter, 4)
@@ -115,8 +116,8 @@ def default(robot: RobotCfg) -> EnvCfg:
     """Lift's rewards for the commanded object; the others may be touched, but not leave the table."""
     setup = fitted(robot)
     scene, names, commanded = setup.scene, tuple(setup.scene.objects), {"object": TARGET}
-    up = SIZES[1] * max(extent(item)[1] for item in scene.objects.values())
-    held = {"minimal_height": round(up + 0.005, 4), "grasp_radius": setup.grasp_radius, **commanded}
+    heights = tuple(round(SIZES[1] * item.rest_height + LIFTED, 4) for item in scene.objects.values())
+    held = {"minimal_height": heights, "grasp_radius": setup.grasp_radius, **commanded}
     center = scene.table_center
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),

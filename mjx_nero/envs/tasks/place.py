@@ -15,6 +15,7 @@ from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 
 TURN = (-math.pi / 6, math.pi / 6)  # [rad] of the box at the start, and of its goal
 STILL = (0.0, 0.0)
+APART = 2.5  # from its start to its goal at least, in heights of the box: one that lies there already is best left alone
 LONG = 1.5  # its longest edge, along x, in shorter ones: its turn can be seen
 
 
@@ -56,8 +57,8 @@ def default(robot: RobotCfg) -> EnvCfg:
         ),
         events={
             "reset_object_position": Term(
-                events.object_position_uniform,
-                params={"x": there.cube[0], "y": there.cube[1], "z": STILL, **named},
+                events.object_apart_from_goal,
+                params={"x": there.cube[0], "y": there.cube[1], "apart": round(APART * box.size[2], 4), **named},
             ),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
@@ -67,6 +68,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         metrics=tower.metrics(),
         terminations=tower.terminations(),
         controllers=tower.controllers(),
+        training={"num_timesteps": 150_000_000},
     )
 
 
