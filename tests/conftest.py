@@ -4,6 +4,7 @@ import functools
 import getpass
 import os
 import pathlib
+import signal
 import sys
 import tempfile
 
@@ -35,6 +36,9 @@ _CHECKED = (
     "learn.policy",
     "learn.rollout",
 )
+# What a shell puts in the background ignores Ctrl-C, and so would the programs that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 # Most of the tests' time is XLA's. Set for the processes that tests start, too.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")

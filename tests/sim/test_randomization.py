@@ -240,9 +240,9 @@ def test_mjx_gives_the_same_physics_to_drawn_worlds(env, gripped):
     for name in ("body_mass", "body_inertia", "geom_friction"):
         getattr(model, name)[:] = sim.fields[name][heaviest]
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    one, target = jax.tree.map(lambda x: x[heaviest], (sim.replace(fields={}), ctrl))
-    steps = (jax.jit(JaxPhysics(m, env.cfg.sim).step) for m in (model, env.physics_model))
-    compiled, undrawn = (step(one, target)[0] for step in steps)
+    same = jax.tree.map(lambda x: jnp.stack([x[heaviest]] * 8), (sim.replace(fields={}), ctrl))  # as many, computed alike
+    steps = (jax.jit(jax.vmap(JaxPhysics(m, env.cfg.sim).step)) for m in (model, env.physics_model))
+    compiled, undrawn = (jax.tree.map(lambda x: x[heaviest], step(*same)[0]) for step in steps)
     np.testing.assert_allclose(ours.qpos[heaviest], compiled.qpos, rtol=0, atol=2e-6)
     np.testing.assert_allclose(ours.qvel[heaviest], compiled.qvel, rtol=0, atol=1e-3)
     assert np.abs(undrawn.qvel - compiled.qvel).max() > 0.01
