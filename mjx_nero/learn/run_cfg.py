@@ -89,11 +89,14 @@ def learner_cfg(cfg: EnvCfg, preset: str, name: str = "ppo") -> Any:
 def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
     """Fills in what the machine decides: number of environments, env steps, time limit. With a line that says so."""
     lifts, on_cpu = bool(run.env.scene.objects), jax.default_backend() == "cpu"
+    tasks_own = run.env.training.get("num_timesteps", 0)
     # Few environments learn from fewer steps, which is what a CPU is short of.
-    enough = (10_000_000 if lifts else 2_000_000) if on_cpu else (100_000_000 if lifts else 60_000_000)
-    short = not run.num_timesteps
+    enough = (10_000_000 if lifts else 2_000_000) if on_cpu else tasks_own or (100_000_000 if lifts else 60_000_000)
+    short = run.num_timesteps in (0, tasks_own)  # nobody has asked for another number
     hyperparameters = dataclasses.replace(
-        run.hyperparameters, num_envs=run.num_envs or (256 if on_cpu else 8192), num_timesteps=run.num_timesteps or enough
+        run.hyperparameters,
+        num_envs=run.num_envs or (256 if on_cpu else 8192),
+        num_timesteps=enough if short else run.num_timesteps,
     )
     run = dataclasses.replace(run, hyperparameters=hyperparameters)
     if not on_cpu:

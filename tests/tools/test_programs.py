@@ -207,6 +207,15 @@ def test_what_a_machine_without_a_gpu_trains():
     assert fitted("nero_reach", max_minutes=3.0)[:3] == (256, 2_000_000, 3)
     assert "256 environments for 2 M steps, at most 3 minutes" in fitted("nero_reach", max_minutes=3.0)[3]
     assert fitted("nero_lift", {"num_envs": 64, "num_timesteps": 5}) == (64, 5, 0, "")
+    assert fitted("nero_push")[:3] == (256, 10_000_000, 10)  # its own 300 M steps are for a GPU
+    assert fitted("nero_push", {"num_timesteps": 400_000_000})[1:] == (400_000_000, 0, "")
+
+
+def test_a_gpu_trains_for_as_long_as_the_task_needs(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for name, steps in (("nero_lift", 100_000_000), ("nero_reach", 60_000_000), ("nero_push", 300_000_000)):
+        run, note = training.fit_machine(training.resolve(name, "default", None, {}, {}))
+        assert (run.num_envs, run.num_timesteps, run.max_minutes, note) == (8192, steps, 0, "")
 
 
 def test_ctrl_c_while_native_physics_runs(call, tmp_path, monkeypatch):

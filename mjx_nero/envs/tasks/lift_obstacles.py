@@ -52,6 +52,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, and a box that is leant on
         episode_length_s=12.0,
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
+        training={"num_timesteps": 300_000_000},
         command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),

@@ -84,6 +84,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
+        training={"num_timesteps": 300_000_000},
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_off_table": DoneTerm(

@@ -101,6 +101,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5, gripper=False),
         controllers=controllers(robot, "detour"),
+        training={"num_timesteps": 100_000_000},
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.goal, strict=True)), resample_s=ONCE),
         obstacles=between(setup),
         success=SuccessCfg(

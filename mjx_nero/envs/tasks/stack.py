@@ -69,6 +69,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         metrics=tower.metrics(),
         terminations=tower.terminations(),
         controllers=tower.controllers(),
+        training={"num_timesteps": 250_000_000},
     )
 
 
