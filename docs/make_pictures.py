@@ -1,7 +1,7 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and
-docs/gallery/, every environment; a name makes one of the three.
+docs/gallery/, an episode of every environment; a name makes one of the three.
 """
 
 import dataclasses
@@ -17,9 +17,8 @@ from PIL import Image
 
 from mjx_nero import cli
 from mjx_nero.envs import registry
-from mjx_nero.learn import policy, rollout
+from mjx_nero.learn import evaluation, policy, rollout
 from mjx_nero.sim import render
-from mjx_nero.tools.inspection.report import find, picture
 
 HERE = pathlib.Path(__file__).parent
 STEPS = 150  # of an episode are shown: the cube is up by then
@@ -57,12 +56,20 @@ def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 
 def gallery(folder: pathlib.Path) -> None:
-    """A small picture of every environment that has a robot of its own."""
+    """A small moving picture of an episode of every environment that has a robot of its own, by who plays it by default."""
     folder.mkdir(exist_ok=True)
     for name in mjx_nero.list_envs():
-        if registry.robot_of(name):
-            image = Image.fromarray(picture(*find(name), width=640, height=480)).resize((320, 240))
-            image.save(folder / f"{name}.webp", quality=75)
+        if not registry.robot_of(name):
+            continue
+        played = evaluation.play(evaluation.EvalCfg(name, episodes=8, record=1, backend="mujoco"))
+        episode, frames = played.episodes, []
+        every = max(1, len(episode.qpos) // 40)
+        looks = {of: look[0] for of, look in episode.looks.items()}
+        with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
+            for t in range(0, len(episode.qpos), every):
+                frame = Image.fromarray(renderer.render(episode.qpos[t, 0], episode.goals[t, 0], looks))
+                frames.append(frame.resize((320, 240), Image.Resampling.BOX))
+        write(folder / f"{name}.webp", frames, every * played.env.dt, 35)
 
 
 def main() -> None:
