@@ -56,18 +56,20 @@ def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 
 def gallery(folder: pathlib.Path) -> None:
-    """A small moving picture of an episode of every environment that has a robot of its own, by who plays it by default."""
+    """A small moving picture of every environment that has a robot of its own: the first episode that succeeds, by who plays it
+    by default."""
     folder.mkdir(exist_ok=True)
     for name in mjx_nero.list_envs():
         if not registry.robot_of(name):
             continue
-        played = evaluation.play(evaluation.EvalCfg(name, episodes=8, record=1, backend="mujoco"))
+        played = evaluation.play(evaluation.EvalCfg(name, episodes=8, record=8, backend="mujoco"))
         episode, frames = played.episodes, []
         every = max(1, len(episode.qpos) // 40)
-        looks = {of: look[0] for of, look in episode.looks.items()}
+        k = int(np.argmax(episode.metrics["success"]))
+        looks = {of: look[k] for of, look in episode.looks.items()}
         with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
             for t in range(0, len(episode.qpos), every):
-                frame = Image.fromarray(renderer.render(episode.qpos[t, 0], episode.goals[t, 0], looks))
+                frame = Image.fromarray(renderer.render(episode.qpos[t, k], episode.goals[t, k], looks))
                 frames.append(frame.resize((320, 240), Image.Resampling.BOX))
         write(folder / f"{name}.webp", frames, every * played.env.dt, 35)
 
