@@ -114,6 +114,9 @@ class EnvCfg:
                 raise UserError(f"{name}.params.object is {wanted!r}, and the scene's objects are: {listed}")
             if unknown := [each for each in term.params.get("objects", ()) if each not in there]:
                 raise UserError(f"{name}.params.objects names {', '.join(unknown)}, and the scene's objects are: {listed}")
+            heights = term.params.get("minimal_height")
+            if isinstance(heights, tuple) and len(heights) != len(self.targets):
+                raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(self.targets)} targets")
 
     def view_terms(self) -> dict[str, Mapping[str, Term]]:
         """The terms of a view by the dotted names of their groups."""

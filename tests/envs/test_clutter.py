@@ -11,8 +11,8 @@ import pytest
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.tasks import clutter
 from mjx_nero.learn import evaluation
-from mjx_nero.mdp import rewards
-from mjx_nero.mdp.terms import RewardTerm
+from mjx_nero.mdp import metrics, rewards
+from mjx_nero.mdp.terms import MetricTerm, RewardTerm
 from mjx_nero.sim import contacts, scene
 from mjx_nero.sim.scene import ObjectCfg
 
@@ -178,6 +178,10 @@ def near(term: str) -> dict:
     [
         (near("bal"), "^rewards.near.params.object is 'bal', and the scene's objects are: box, .*, pill, target$"),
         ({"targets": ("box", "ball")}, "^targets names ball: not one of box, bar, cylinder, sphere, capsule, pill$"),
+        (
+            {"metrics": {"grasped": MetricTerm(metrics.Grasped, params={"minimal_height": (0.02, 0.03), "grasp_radius": 0.04})}},
+            "^metrics.grasped.params.minimal_height is one height, or one for each of 6 targets$",
+        ),
         ({"scene": dataclasses.replace(CFG.scene, objects={**CFG.scene.objects, "target": ObjectCfg()})}, "needs another name"),
     ],
 )
