@@ -18,6 +18,7 @@ from mjx_nero.sim.scene import ObjectCfg
 
 NAMES = ("box", "bar", "cylinder", "sphere", "capsule", "pill")
 CFG = env_cfg("nero_clutter")
+HELD = CFG.metrics["grasped"].params
 HAND = {"nero": (0.006, 0.023), "cobotta_pro_900": (0.008, 0.025), "so_arm100": (0.004, 0.012)}  # pads: thickness, width [m]
 
 
@@ -179,7 +180,7 @@ def near(term: str) -> dict:
         (near("bal"), "^rewards.near.params.object is 'bal', and the scene's objects are: box, .*, pill, target$"),
         ({"targets": ("box", "ball")}, "^targets names ball: not one of box, bar, cylinder, sphere, capsule, pill$"),
         (
-            {"metrics": {"grasped": MetricTerm(metrics.Grasped, params={"minimal_height": (0.02, 0.03), "grasp_radius": 0.04})}},
+            {"metrics": {"grasped": MetricTerm(metrics.Grasped, params={**HELD, "minimal_height": (0.02, 0.03)})}},
             "^metrics.grasped.params.minimal_height is one height, or one for each of 6 targets$",
         ),
         ({"scene": dataclasses.replace(CFG.scene, objects={**CFG.scene.objects, "target": ObjectCfg()})}, "needs another name"),
