@@ -97,6 +97,11 @@ class ObservationTerm(Term):
         return delay + ((History(self.history),) if self.history > 1 else ())
 
 
+def exact(group: Mapping[str, ObservationTerm]) -> dict[str, ObservationTerm]:
+    """The same observations without noise: what a critic may see."""
+    return {name: dataclasses.replace(term, noise=0.0) for name, term in group.items()}
+
+
 @dataclasses.dataclass(frozen=True)
 class MetricTerm(Term):
     """A figure of an episode."""

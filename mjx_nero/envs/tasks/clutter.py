@@ -8,7 +8,7 @@ import numpy as np
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -132,7 +132,6 @@ def default(robot: RobotCfg) -> EnvCfg:
         "ee_to_objects": ObservationTerm(observations.ee_to_objects, params={"objects": names, "limit": 0.3}, noise=0.002),
         "actions": ObservationTerm(observations.last_action),
     }
-    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
     return EnvCfg(
         robot=dataclasses.replace(setup.robot, gravity_compensation=True),  # as a robot's own controller does
         scene=scene,
@@ -154,7 +153,10 @@ def default(robot: RobotCfg) -> EnvCfg:
         },
         observations={
             "state": state,
-            "privileged_state": {**exact, "object_velocity": ObservationTerm(observations.object_velocity, params=commanded)},
+            "privileged_state": {
+                **exact(state),
+                "object_velocity": ObservationTerm(observations.object_velocity, params=commanded),
+            },
         },
         events={
             "scatter": Term(

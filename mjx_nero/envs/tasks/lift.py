@@ -7,7 +7,7 @@ from mjx_nero.bounds import Range
 from mjx_nero.envs.task import EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -112,13 +112,12 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         "target_object_position": ObservationTerm(observations.command),
         "actions": ObservationTerm(observations.last_action),
     }
-    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
     return dataclasses.replace(
         recipe,
         observations={
             "state": state,
             "privileged_state": {
-                **exact,
+                **exact(state),
                 "object_velocity": ObservationTerm(observations.object_velocity),
                 "object_orientation": ObservationTerm(observations.object_orientation),
             },

@@ -7,7 +7,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks.building import Tower
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -39,7 +39,6 @@ def default(robot: RobotCfg) -> EnvCfg:
         "object_turn_to_goal": ObservationTerm(towers.turn_to_goal, params=named, noise=0.01),
         "actions": ObservationTerm(observations.last_action),
     }
-    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
     seen = {
         "object_velocity": ObservationTerm(observations.object_velocity, params=named),
         "object_orientation": ObservationTerm(observations.object_orientation, params=named),
@@ -62,7 +61,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             ),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
-        observations={"state": state, "privileged_state": {**exact, **seen}},
+        observations={"state": state, "privileged_state": {**exact(state), **seen}},
         rewards=tower.rewards(),
         success=tower.success(),
         metrics=tower.metrics(),

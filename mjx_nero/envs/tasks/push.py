@@ -6,7 +6,7 @@ import math
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -46,7 +46,6 @@ def default(robot: RobotCfg) -> EnvCfg:
         "object_turn_to_goal": ObservationTerm(observations.object_turn_to_goal, params={"fold": FOLD, **object}, noise=0.02),
         "actions": ObservationTerm(observations.last_action),
     }
-    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
     return EnvCfg(
         robot=dataclasses.replace(robot, gripper=hand, gravity_compensation=True),  # as a robot's own controller does
         scene=scene,
@@ -64,7 +63,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         ),
         observations={
             "state": state,
-            "privileged_state": {**exact, "object_velocity": ObservationTerm(observations.object_velocity, params=object)},
+            "privileged_state": {**exact(state), "object_velocity": ObservationTerm(observations.object_velocity, params=object)},
         },
         events={
             "reset_object_position": Term(events.object_position_uniform, params={**start, **object}),

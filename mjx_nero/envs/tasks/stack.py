@@ -6,7 +6,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks.building import Tower
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -44,7 +44,6 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         },
         "actions": ObservationTerm(observations.last_action),
     }
-    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in state.items()}
     seen = {
         **_each(objects, "{}_velocity", observations.object_velocity),
         **_each(objects, "{}_orientation", observations.object_orientation),
@@ -63,7 +62,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
                 params={"objects": tuple(objects), "x": there.cube[0], "y": there.cube[1], "apart": apart},
             ),
         },
-        observations={"state": state, "privileged_state": {**exact, **seen}},
+        observations={"state": state, "privileged_state": {**exact(state), **seen}},
         rewards=tower.rewards(),
         success=tower.success(),
         metrics=tower.metrics(),
