@@ -12,13 +12,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from mjx_nero.control.follow_target import RmpCfg, RmpFollower
-from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.rmpflow import Target
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
 
 Corners = Float[Array, "n 3"]
-_GRIP_FILTER = 0.05  # as of ``pick_place``
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +195,7 @@ class Carry(Detour):
         way = jax.tree.map(lambda new, old: jnp.where(memory.there == self._closed, new, old), off, memory.way)
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)
-        grip = memory.grip + jnp.where(holds, _GRIP_FILTER, 0.0) * (slip - memory.grip)
+        grip = memory.grip + jnp.where(holds, GRIP_FILTER, 0.0) * (slip - memory.grip)
         # A hand that is to be turned as it is turns freely: nothing pulls it anywhere.
         turn = jnp.where(holds, view.ee_quat_w, jnp.asarray(self._down))
         way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), turn)

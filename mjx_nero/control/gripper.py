@@ -10,6 +10,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 Positions = Float[Array, " n"]
+GRIP_FILTER = 0.05  # of how far the object is off in the grip: the share of a new measurement, a control step
 
 
 class ParallelGripper:

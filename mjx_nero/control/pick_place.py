@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
-from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.rmpflow import Target
 from mjx_nero.mdp.towers import GOAL
@@ -18,7 +18,6 @@ from mjx_nero.types import UserError, View
 
 _FASTEST = 1.0  # [m/s]: a target that moves on faster has jumped
 # Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
-_GRIP_FILTER = 0.05
 PHASES = ("above pick", "down", "settle", "close", "up", "across", "down", "open", "up", "away")
 
 
@@ -143,7 +142,7 @@ class PickPlace:
         carried = (phase >= 4) & (phase <= 6)
         slip = _turned(view.ee_pos_w - seen[:3], -memory.target[3])
         slip = jnp.clip(slip, self._offset - 0.03, self._offset + 0.03)
-        grip = memory.grip + jnp.where(carried, _GRIP_FILTER, 0.0) * (slip - memory.grip)
+        grip = memory.grip + jnp.where(carried, GRIP_FILTER, 0.0) * (slip - memory.grip)
         s = (1 - jnp.cos(jnp.pi * memory.count / steps)) / 2
         target = self._target(memory, s, place, grip, view.root_pos_w)
         stays = (phase == 2) | (phase == 3) | (phase == 7) | self.is_done(memory)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.bounds import Positive
-from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim.robot import RobotCfg
@@ -22,7 +22,6 @@ _SMOOTH = 0.15  # [s] the arm's set-point comes to rest in about this time
 _FASTEST = 10.0  # [rad/s2] what it is accelerated by at most: drives that are asked for more fall behind, and swing
 _UNREACHABLE = 100.0  # counts as so many radians to move
 # Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
-_GRIP_FILTER = 0.05
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
@@ -126,7 +125,7 @@ class PickUp:
         # From the set-point, while the arm hardly moves: what it is off is made up for as well.
         off, slow = memory.pos - seen, jnp.max(jnp.abs(memory.qd)) < _SLOW
         grip = jnp.where(phase == CLOSE, off, memory.grip)
-        grip += jnp.where((phase == CARRY) & slow, _GRIP_FILTER, 0.0) * (off - grip)
+        grip += jnp.where((phase == CARRY) & slow, GRIP_FILTER, 0.0) * (off - grip)
 
         over = memory.pick + self._up
         wanted = jnp.select([phase == CARRY, (phase == DOWN) | (phase == CLOSE)], [view.goal_pos_w + grip, memory.pick], over)
