@@ -5,7 +5,6 @@ the run has to end by itself, within a minute, in one line without a traceback, 
 At the end it must have come to what a run comes to that nothing disturbs.
 """
 
-import argparse
 import os
 import pathlib
 import random
@@ -14,7 +13,7 @@ import sys
 import tempfile
 import time
 
-from kill_many import PER, ROOT, arrays, command, newest
+from kill_many import PER, ROOT, arrays, command, flags, newest
 
 from mjx_nero.learn import checkpoint, checkpoints
 
@@ -37,14 +36,9 @@ def fill(folder: pathlib.Path, left: int) -> pathlib.Path:
 
 def main() -> None:
     """Fills, and says what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = flags(__doc__)
     parser.add_argument("--folder", type=pathlib.Path, required=True, help="a small file system")
     parser.add_argument("--moments", type=int, default=20)
-    parser.add_argument("--env", default="nero_reach")
-    parser.add_argument("--impl", default="native")
-    parser.add_argument("--kinematic", action="store_true", help="physics without MuJoCo, which starts in seconds")
-    parser.add_argument("--every", type=int, default=4 * PER, help="env steps between checkpoints")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=float, default=6.0, help="seconds of training before the disk is full, at most")
     args = parser.parse_args()
     chance, run, good = random.Random(args.seed), args.folder / "run", 0

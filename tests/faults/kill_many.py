@@ -30,6 +30,17 @@ KINEMATIC = "import mjx_nero; from kinematic import Kinematic; mjx_nero.Manipula
 MAIN = "from mjx_nero import cli; from mjx_nero.tools.train import main; cli.run(main)"
 
 
+def flags(says: str | None) -> argparse.ArgumentParser:
+    """What every run that is spoilt can be told."""
+    parser = argparse.ArgumentParser(description=says, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="nero_reach")
+    parser.add_argument("--impl", default="native")
+    parser.add_argument("--kinematic", action="store_true", help="physics without MuJoCo, which starts in seconds")
+    parser.add_argument("--every", type=int, default=4 * PER, help="env steps between checkpoints")
+    parser.add_argument("--seed", type=int, default=0)
+    return parser
+
+
 def command(args: argparse.Namespace, out: pathlib.Path, steps: int) -> list[str]:
     """The one command of a run."""
     size = ["--num-timesteps", str(steps), "--checkpoint-every", str(args.every), "--eval-every", str(20 * args.every)]
@@ -71,13 +82,8 @@ def cut(run: pathlib.Path, chance: random.Random) -> None:
 
 def main() -> None:
     """Kills, and counts what was lost."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = flags(__doc__)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--env", default="nero_reach")
-    parser.add_argument("--impl", default="native")
-    parser.add_argument("--kinematic", action="store_true", help="physics without MuJoCo, which starts in seconds")
-    parser.add_argument("--every", type=int, default=4 * PER, help="env steps between checkpoints")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=float, default=8.0, help="seconds of training before a kill, at most")
     args = parser.parse_args()
     chance, folder = random.Random(args.seed), pathlib.Path(tempfile.mkdtemp())
