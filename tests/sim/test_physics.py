@@ -1,5 +1,7 @@
 """The physics of the scene, on MJX and in MuJoCo's C library."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -294,6 +296,26 @@ def test_backend_is_made_when_first_stepped():
     env.reset(jax.random.PRNGKey(0))
     assert "physics" not in vars(env)
     assert isinstance(env.physics, JaxPhysics) and env.physics is env.physics
+
+
+def test_warp_physics_is_made_without_a_change_of_device(env, monkeypatch):
+    """Warp's device is the process's: another thread may be loading kernels, which a change would send to the wrong one."""
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+
+    def refuse(device):
+        raise AssertionError(f"changed to {device}")
+
+    monkeypatch.setattr(warp, "ScopedDevice", refuse)
+    mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
+
+
+def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
+    """A run of four devices on two machines: two are here."""
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+    made = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
+    made.memory()  # makes what it counts, before devices are not what they are
+    monkeypatch.setattr(warp, "get_cuda_devices", lambda: [types.SimpleNamespace(free_memory=free) for free in (5e9, 3e9, 1e9)])
+    assert made.memory(2).free == 3e9 and made.memory(4).free == 1e9 and made.memory().outside > 1000
 
 
 @pytest.mark.gpu

@@ -6,7 +6,9 @@ come the same few. What else the engine keeps is recomputed from them, so the fu
 """
 
 import dataclasses
+import functools
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,6 +26,10 @@ from mjx_nero.types import Sim
 # MuJoCo Warp's OverflowType bits that mean lost contacts or constraint rows; the others report unconverged solver iterations.
 _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 
+# Warp's current device is the process's and not a thread's: whoever changes it keeps others from making anything meanwhile, as
+# kernels that find their arrays on another device than they were loaded for end the process.
+_WARP = threading.Lock()
+
 
 class WarpPhysics:
     """See ``physics.Physics``. Buffers are made at the first step on a device with a batch size, and kept."""
@@ -35,8 +41,6 @@ class WarpPhysics:
         self._touch = touch.reader(model)
         self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
-        # Now, and not when somebody asks: the current device is the process's, not a thread's, and ``prepare`` may run in one.
-        self._bytes = self._bytes_per_env()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """One control step; any leading axes are environments."""
@@ -107,10 +111,11 @@ class WarpPhysics:
         """MuJoCo Warp's data."""
         import warp as wp
 
-        free = [wp.get_cuda_device(i).free_memory for i in range(num_devices)] if wp.is_cuda_available() else [float("inf")]
-        return Footprint(outside=self._bytes, free=min(free))
+        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes' are theirs to ask
+        return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
 
-    def _bytes_per_env(self) -> int:
+    @functools.cached_property
+    def _bytes(self) -> int:
         """Size of MuJoCo Warp's data of one environment."""
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
@@ -120,18 +125,17 @@ class WarpPhysics:
                 return value.capacity
             return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
 
-        cfg = self._cfg
-        with wp.ScopedDevice("cpu"):
-            sizes = {"naconmax": cfg.contacts_per_env, "njmax": cfg.constraints_per_env}
-            fields = 4 * sum(math.prod(shape) for shape in self._fields.values())
-            return size(mujoco_warp.make_data(self.model, 1, **sizes)) + fields
+        cfg, fields = self._cfg, 4 * sum(math.prod(shape) for shape in self._fields.values())
+        with _WARP, wp.ScopedDevice("cpu"):
+            one = mujoco_warp.make_data(self.model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env)
+        return size(one) + fields
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics``."""
         import warp as wp
 
         for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
-            with wp.ScopedDevice(device):
+            with _WARP, wp.ScopedDevice(device):
                 self._get(num_envs)
                 wp.synchronize_device(device)
 
