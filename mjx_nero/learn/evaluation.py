@@ -15,6 +15,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import policy, rollout
+from mjx_nero.mdp import metrics
 from mjx_nero.sim.physics import warp_available
 
 AGENTS = ("policy", "zero", "random")
@@ -118,6 +119,7 @@ def play(cfg: EvalCfg) -> Played:
     env_cfg = config.override(env_cfg, cfg.env_fields)
     name = _controller_name(cfg, env_cfg)
     env_cfg = for_controllers(env_cfg) if name else env_cfg
+    env_cfg = dataclasses.replace(env_cfg, metrics={**metrics.calmness(len(env_cfg.robot.arm.joints)), **env_cfg.metrics})
     env = ManipulationEnv(env_cfg, impl=_impl(cfg.backend, cfg.impl), num_envs=cfg.episodes)
     if cfg.control_fields and not name:
         raise UserError("--control.* needs --controller")

@@ -5,9 +5,10 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero.bounds import Positive
+from mjx_nero.bounds import Count, Positive
 from mjx_nero.mdp.rewards import Heights, held
 from mjx_nero.mdp.success import touched
+from mjx_nero.mdp.terms import MetricTerm
 from mjx_nero.types import Key, View
 
 
@@ -59,3 +60,45 @@ class Touched:
         """Now, or before."""
         memory = memory | touched(view)
         return memory, memory
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TargetChange:
+    """How far the targets of the arm's drives move in a control step: root mean square since the start [rad or m].
+
+    Attributes:
+        joints: of the arm, which come first.
+    """
+
+    joints: Count
+
+    def init(self, key: Key, view: View) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """The targets at the start, and no change."""
+        return self._read(view), jnp.zeros(())
+
+    def step(self, memory: tuple, view: View) -> tuple[tuple, Float[Array, ""]]:
+        """One step more."""
+        (last, total), now = memory, self._read(view)
+        total = total + jnp.mean(jnp.square(now - last))
+        return (now, total), jnp.sqrt(total / view.step)
+
+    def _read(self, view: View) -> Float[Array, " n"]:
+        return view.ctrl[: self.joints]
+
+
+class JointAcceleration(TargetChange):
+    """How much the speeds of the arm's joints change: root mean square since the start, of control steps [rad/s^2 or m/s^2]."""
+
+    def step(self, memory: tuple, view: View) -> tuple[tuple, Float[Array, ""]]:
+        """One step more."""
+        memory, change = super().step(memory, view)
+        return memory, change * view.step / view.time
+
+    def _read(self, view: View) -> Float[Array, " n"]:
+        return view.joint_vel[: self.joints]
+
+
+def calmness(joints: int) -> dict[str, MetricTerm]:
+    """What says how calm a policy is, of an arm of so many joints."""
+    params = {"joints": joints}
+    return {"target_change": MetricTerm(TargetChange, params=params), "joint_acc": MetricTerm(JointAcceleration, params=params)}

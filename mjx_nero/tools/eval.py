@@ -134,6 +134,8 @@ def table(result: dict[str, Any]) -> console.Table:
         view.add("dropped", f"{result['dropped_rate']:.1%}")
     if "touched_mean" in result:
         view.add("touched", f"{result['touched_mean']:.1%}")
+    calm = figure("target_change_mean", 1000, 1), figure("joint_acc_mean", 1, 1)
+    view.add("a control step", f"targets move {calm[0]} mrad, joints gain {calm[1]} rad/s²")
     view.add("return", figure("return_mean"))
     for name, value in result["return_by_term"].items():
         view.add(f"  {name}", "-" if value is None else f"{value:.3f}")

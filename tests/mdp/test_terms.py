@@ -235,6 +235,22 @@ def test_a_touch_is_never_forgotten(object, near, far):
     assert not off.step(off.init(KEY, beside()), beside(**at))[1]
 
 
+def test_calmness_is_a_root_mean_square_of_the_arm_alone():
+    """Two joints of an arm and a finger; steps of 0.02 s. Targets move by 3 and 4 mrad, then not at all."""
+    targets = [[0.0, 0.0, 9.0], [0.003, -0.004, 5.0], [0.003, -0.004, 7.0]]
+    speeds = [[0.0, 0.0, 0.0], [0.02, 0.0, 1.0], [0.02, 0.04, 2.0]]
+    seen = [view(ctrl=ctrl, joint_vel=speed, step=i) for i, (ctrl, speed) in enumerate(zip(targets, speeds, strict=True))]
+    terms = metrics.calmness(2)
+    values = {}
+    for name, term in terms.items():
+        memory = term.made.init(KEY, seen[0])
+        for now in seen[1:]:
+            memory, values[name] = term.made.step(memory, now)
+    # (9 + 16) / 2 mrad^2 in one of two steps; (1 + 4) / 2 (rad/s^2)^2 in both together
+    assert float(values["target_change"]) == pytest.approx(2.5e-3)
+    assert float(values["joint_acc"]) == pytest.approx((2.5 / 2) ** 0.5)
+
+
 def test_distances_of_success():
     assert float(success.object_distance(view())) == pytest.approx(0.1, abs=1e-6)
     assert float(success.ee_distance(view(ee_pos_w=[1.03, 2.04, 3.42]))) == pytest.approx(0.13, abs=1e-6)
