@@ -5,7 +5,6 @@ the run has to end by itself, within a minute, in one line without a traceback, 
 At the end it must have come to what a run comes to that nothing disturbs.
 """
 
-import os
 import pathlib
 import random
 import subprocess
@@ -13,7 +12,7 @@ import sys
 import tempfile
 import time
 
-from kill_many import PER, ROOT, arrays, command, flags, newest
+from kill_many import arrays, chunk, command, flags, newest, surroundings
 
 from mjx_nero.learn import checkpoint, checkpoints
 
@@ -42,7 +41,7 @@ def main() -> None:
     parser.add_argument("--longest", type=float, default=6.0, help="seconds of training before the disk is full, at most")
     args = parser.parse_args()
     chance, run, good = random.Random(args.seed), args.folder / "run", 0
-    argv, env = command(args, run, 40_000_000), {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    argv, env = command(args, run, 40_000_000), surroundings()
     for i in range(args.moments):
         before, left = newest(run), chance.choice([0, 100, 3_000, 10_000, 30_000])
         process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env)
@@ -71,7 +70,8 @@ def main() -> None:
         print(f"{told}{'' if fine else '  WRONG'}", flush=True)
         if not fine:
             print(text)
-    steps = (newest(run) // PER + 2) * PER
+    per = chunk(args)
+    steps = (newest(run) // per + 2) * per
     undisturbed = pathlib.Path(tempfile.mkdtemp()) / "run"
     for path in (run, undisturbed):
         subprocess.run(command(args, path, steps), check=True, capture_output=True, env=env)

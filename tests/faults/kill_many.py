@@ -22,8 +22,7 @@ from safetensors import safe_open
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 SIZES = ["--num-envs", "8", "--ppo.unroll_length", "4", "--ppo.num_minibatches", "2", "--ppo.num_epochs", "1", "--no-video"]
 SIZES += ["--ppo.network.actor", "(8,)", "--ppo.network.critic", "(8,)", "--env.episode_length_s", "0.2"]
-PER = 64  # env steps of a chunk, on a CPU: two iterations
-PER_GPU = 640
+PER, PER_GPU = 64, 640  # env steps of a chunk: two iterations on a CPU, twenty on a GPU
 
 
 # Physics that compiles at once, and whose programs JAX keeps: a start takes seconds, which leaves time for many kills.
@@ -40,6 +39,17 @@ def flags(says: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--every", type=int, default=4 * PER, help="env steps between checkpoints; on a GPU a chunk is 640")
     parser.add_argument("--seed", type=int, default=0)
     return parser
+
+
+def chunk(args: argparse.Namespace) -> int:
+    """Env steps of a chunk: the least between two checkpoints."""
+    return PER_GPU if args.impl == "warp" else PER
+
+
+def surroundings() -> dict[str, str]:
+    """Environment variables of a run that finds this package and the tests' modules, and whatever this process finds."""
+    path = [str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))}
 
 
 def command(args: argparse.Namespace, out: pathlib.Path, steps: int) -> list[str]:
@@ -87,11 +97,10 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--longest", type=float, default=8.0, help="seconds of training before a kill, at most")
     args = parser.parse_args()
-    per = PER_GPU if args.impl in ("warp", "auto") else PER
+    per = chunk(args)
     chance, folder = random.Random(args.seed), pathlib.Path(tempfile.mkdtemp())
     run, good, lost_most = folder / "run", 0, 0
-    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
-    argv, env = command(args, run, 4_000_000), {**os.environ, "PYTHONPATH": path}
+    argv, env = command(args, run, 4_000_000), surroundings()
     for i in range(args.kills):
         before, how = newest(run), chance.choice(["SIGKILL", "SIGTERM", "power cut"])
         process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env)

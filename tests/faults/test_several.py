@@ -1,7 +1,6 @@
 """Several runs at the same moment, each a process of its own."""
 
 import json
-import os
 import subprocess
 
 import kill_many
@@ -15,8 +14,7 @@ def test_seeds_of_the_same_second(tmp_path):
     """``for s in 0 1 2 3; do python train.py --seed $s & done``: as many good runs, each in a folder of its own."""
     argv = [kill_many.sys.executable, "-c", kill_many.KINEMATIC + kill_many.MAIN, "--env", "nero_lift", "--impl", "native"]
     argv += ["--num-timesteps", "640", *kill_many.SIZES]
-    env = {**os.environ, "PYTHONPATH": f"{kill_many.ROOT}:{kill_many.ROOT / 'tests'}"}
-    env["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / "cache")  # shared, and empty
+    env = kill_many.surroundings() | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}  # shared, and empty
     runs = [
         subprocess.Popen([*argv, "--seed", str(seed)], cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         for seed in range(SEEDS)
