@@ -37,7 +37,10 @@ class Batch:
             return where(done, (fresh.pipeline_state, fresh.obs, fresh.info["carry"]), start)
 
         start = (last.pipeline_state, last.obs, last.info["carry"])
-        sim, obs, carry = jax.lax.cond(done.any(), restart, lambda start: start, start)
+        if jax.default_backend() == "cpu":
+            sim, obs, carry = jax.lax.cond(done.any(), restart, lambda start: start, start)
+        else:  # a branch would keep the host waiting until the device knows ``done``, with the next step's work undone meanwhile
+            sim, obs, carry = restart(start)
         return last.replace(pipeline_state=sim, obs=obs, info={**last.info, "carry": carry}), last
 
 

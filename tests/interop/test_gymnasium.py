@@ -106,6 +106,25 @@ def test_one_that_ends_early_restarts_alone():
     assert np.abs(info["final_obs"][0] - obs[0]).max() > 0.1
 
 
+def test_on_a_gpu_a_step_has_no_branch_and_gives_the_same(reach, vector, monkeypatch):
+    """A branch would make the host wait for the device in the middle of a step."""
+
+    def play(env):
+        env.reset(seed=4)
+        return [jax.tree.map(np.asarray, env.step(jnp.full((N, 7), 0.2))) for _ in range(35)]  # over an autoreset
+
+    def branches(env):
+        return env._step.lower(env._state, env._key, jnp.zeros((N, 7))).as_text().count("stablehlo.case")
+
+    expected = play(vector)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    straight = VectorEnv(reach, N, arrays="jax")
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), play(straight), expected)
+    assert branches(straight) == 0
+    monkeypatch.undo()
+    assert branches(vector) == 1
+
+
 def test_a_seed_repeats_everything(vector):
     def play(seed):
         first, _ = vector.reset(seed=seed)
