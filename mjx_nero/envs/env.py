@@ -81,7 +81,7 @@ class ManipulationEnv(Env):
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
         self._actions = Chain(cfg.actions, self._drives())
-        self.home_action = self._actions.home
+        self.home_action, self.action_kinds = self._actions.home, self._actions.kinds
         self._randomization = Randomization(model, cfg.randomization)
         self._hold = Hold(round(cfg.success.hold_s / self.dt))
         self._resample_steps = round(cfg.command.resample_s / self.dt)

@@ -97,6 +97,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
     if chosen is None:
         raise UserError(f"{env} is for any robot: pass one (--robot, a folder that import-urdf made, or {', '.join(_ROBOTS)})")
     cfg = factory(chosen)
+    cfg = dataclasses.replace(cfg, sim=cfg.sim.finer(cfg.robot.max_step))
     if chosen.folder:  # imported: nobody has counted the contacts that its work makes
         cfg = dataclasses.replace(cfg, sim=contacts.sized(chosen, cfg.scene, cfg.sim))
     return config.override(cfg, overrides)

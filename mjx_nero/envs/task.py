@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_nero import bounds, config
-from mjx_nero.bounds import NonNegative, Positive
+from mjx_nero.bounds import NonNegative, Positive, Steps
 from mjx_nero.mdp import actions, success
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
@@ -23,6 +23,23 @@ def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
         **({"gripper": Term(actions.BinaryGripper)} if gripper else {}),
         "speed_limit": Term(actions.SpeedLimit),
     }
+
+
+def relative_actions(gripper: bool = True, late: Steps = (0, 1)) -> dict[str, Term]:
+    """One action an arm joint (at +-1 its target moves as fast as the drive), then one for the gripper, if it has one.
+
+    An episode's actions come late by as many control steps as it draws from ``late``, as those of a real arm do.
+    """
+    return {
+        "delay": Term(actions.Delay, params={"steps": late}),
+        "arm": Term(actions.RelativeJointPosition),
+        **({"gripper": Term(actions.BinaryGripper)} if gripper else {}),
+        "speed_limit": Term(actions.SpeedLimit),
+    }
+
+
+# Of the learner, for relative actions: noise of half the speed limit at most, and a policy that changes its mind for a reason.
+CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
 
 
 def drive_targets() -> dict[str, Term]:

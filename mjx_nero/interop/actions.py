@@ -10,6 +10,7 @@ from mjx_nero.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.mdp import actions as terms
 from mjx_nero.mdp.terms import Term
+from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.types import UserError
 
 
@@ -17,6 +18,7 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     """How the action becomes position targets of the drives: the task's action terms, in their order.
 
     Those with ``joints`` read entries of the action. ``joint_position``: ``offset + scale * action`` [rad, m], an entry a joint.
+    ``relative_joint_position``: likewise, targets move from where they are, at +-1 as fast as the drives.
     ``binary``: ``close`` for a negative entry, else ``open``, one for all the joints. The others change what is there:
     ``speed_limit`` (targets move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
     ``low_pass`` (time constant [s]) of the action.
@@ -30,9 +32,11 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
 def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
     robot, kind = env.cfg.robot, unwrapped(term.func)
     if kind is terms.JointPosition:
-        drives = robot.arm if term.params["group"] == "arm" else robot.gripper
+        drives = _drives(robot, term)
         of = {"joints": list(drives.joints), "scale": term.params["scale"], "offset": list(drives.home)}
         return [{"name": name, "type": "joint_position", **of}]
+    if kind is terms.RelativeJointPosition:
+        return [{"name": name, "type": "relative_joint_position", "joints": list(_drives(robot, term).joints)}]
     if kind is terms.DriveTargets:
         of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
         return [{"name": name, "type": "joint_position", **of}]
@@ -48,13 +52,18 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
     raise UserError(f"the action term {name} ({term.name}) is one that only this package knows")
 
 
+def _drives(robot: RobotCfg, term: Term) -> DriveCfg:
+    return robot.arm if term.params["group"] == "arm" else robot.gripper
+
+
 def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
     """The actions that take each joint to its limits; beyond them nothing more happens. A binary action is in +-1."""
     low: list[float] = []
     high: list[float] = []
     for part in (part for part in parts(env) if "joints" in part):
-        if part["type"] == "binary":
-            low, high = [*low, -1.0], [*high, 1.0]
+        if part["type"] != "joint_position":
+            n = 1 if part["type"] == "binary" else len(part["joints"])
+            low, high = [*low, *[-1.0] * n], [*high, *[1.0] * n]
             continue
         limits = np.array([env.physics_model.joint(name).range for name in part["joints"]]).T
         ends = np.sort((limits - part["offset"]) / part["scale"], axis=0)
@@ -62,21 +71,26 @@ def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low, np.float32), np.array(high, np.float32)
 
 
-def for_targets(env: ManipulationEnv, targets: jax.Array) -> jax.Array:
+def for_targets(env: ManipulationEnv, targets: jax.Array, ctrl: jax.Array) -> jax.Array:
     """The action that gives position targets of the drives: so a controller can act where a policy would.
 
     A gripper without an action of its own stays where it is; a binary one opens or closes, whichever is nearer.
 
     Args:
         targets: [..., joints], in the order of ``RobotCfg.joints`` [rad or m].
+        ctrl: the targets now in force, likewise.
     """
-    out = []
-    for part in (part for part in parts(env) if "joints" in part):
+    out, every = [], parts(env)
+    robot, late = env.cfg.robot, max((part["steps"][1] for part in every if part["type"] == "delay"), default=0)
+    step = env.dt * np.array(robot.arm.speed + robot.gripper.speed, np.float32)
+    for part in (part for part in every if "joints" in part):
         ids = np.array([env.cfg.robot.joints.index(name) for name in part["joints"]])
         want = targets[..., ids]
         if part["type"] == "binary":
             to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))
             out.append(jnp.where(to_close < to_open, -1.0, 1.0)[..., None])
+        elif part["type"] == "relative_joint_position":  # as slowly as actions are late: all of the way at once would swing
+            out.append(jnp.clip((want - ctrl[..., ids]) / step[ids] / (1 + late), -1.0, 1.0))
         else:
             out.append((want - jnp.array(part["offset"])) / part["scale"])
     return jnp.concatenate(out, axis=-1)

@@ -66,7 +66,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env = mjx_nero.make(env, num_envs=num_envs, **kwargs) if isinstance(env, str) else env
         self.num_envs, self.render_mode, self._group, self._num_rendered = num_envs, render_mode, group, num_rendered
         self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
-        self._out, self._device = _converter(arrays), jax.devices()[0]
+        self._out, self._device, self._packed = _converter(arrays), jax.devices()[0], arrays == "torch"
         self.single_observation_space, self.single_action_space = _spaces(self.env, group)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
@@ -86,7 +86,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self._state, self._key, out = self._step(self._state, self._key, _to_jax(actions, self._device))
-        return jax.tree.map(self._out, out)
+        *given, done, results = jax.tree.map(self._out, out)
+        results = dict(zip(_results(self._state), results, strict=True))
+        info = {"final_obs": given.pop(), "_final_obs": done, "final_info": results, "_final_info": done}
+        return *given, info
 
     def render(self) -> tuple[np.ndarray, ...]:
         """Frames of the first ``num_rendered`` environments, uint8 [height, width, 3].
@@ -111,9 +114,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         key, k_reset = jax.random.split(key)
         state, last = self._batch.step(state, action, k_reset)
         done, truncated = last.done > 0, last.info["truncation"] > 0
-        results = {name: last.metrics[name] for name in RESULTS if name in last.metrics}
-        info = {"final_obs": _group(last.obs, self._group), "_final_obs": done, "final_info": results, "_final_info": done}
-        return state, key, (_group(state.obs, self._group), last.reward, done & ~truncated, truncated, info)
+        results = [last.metrics[name] for name in _results(last)]
+        obs, final_obs = (_group(each.obs, self._group) for each in (state, last))
+        # Handing an array over to torch takes the host some 25 us; taking one apart there takes 2.
+        packed = jnp.stack(results) if self._packed else results
+        return state, key, (obs, last.reward, done & ~truncated, truncated, final_obs, done, packed)
 
 
 class Env(gymnasium.Env):
@@ -145,7 +150,7 @@ class Env(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("call reset before step")
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
         done, truncated = bool(state.done), bool(state.info["truncation"])
-        info = {name: float(state.metrics[name]) for name in RESULTS if done and name in state.metrics}
+        info = {name: float(state.metrics[name]) for name in _results(state) if done}
         obs = jax.tree.map(np.asarray, _group(state.obs, self._group))
         return obs, float(state.reward), done and not truncated, truncated, info
 
@@ -178,6 +183,10 @@ def _group(obs: Any, group: str | None) -> Any:
     return dict(obs) if group is None else obs[group]
 
 
+def _results(state: Any) -> list[str]:
+    return [name for name in RESULTS if name in state.metrics]
+
+
 def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:
     return jax.random.PRNGKey(int(rng.integers(2**31)) if seed is None else seed)
 
@@ -193,6 +202,8 @@ def _converter(arrays: str) -> Callable[[jax.Array], Any]:
 def _to_jax(action: Any, device: jax.Device) -> jax.Array:
     if hasattr(action, "detach"):  # a torch tensor
         action = jax.dlpack.from_dlpack(action.detach().contiguous())
+        if action.dtype == jnp.float32 and action.devices() == {device}:
+            return action
     return jax.device_put(jnp.asarray(action, jnp.float32), device)
 
 

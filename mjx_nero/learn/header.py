@@ -174,6 +174,7 @@ _FIELDS: dict[str, Callable[[Any], bool]] = {
     "observation_size": _groups(_sizes),
     "observations": _groups(_list(_word, 200)),
     "action_size": _whole(1, 1000),
+    "actions": _list(_word, 200),
     "env_steps": _whole(0, 1 << 60),
     "num_envs": _whole(1, 1 << 24),
     "tally": _tally,

@@ -116,6 +116,7 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
         "observation_size": jax.tree.map(list, env.observation_size, is_leaf=_is_shape),
         "observations": terms,
         "action_size": env.action_size,
+        "actions": env.action_kinds,
         "learner": by,
         **learnt,
     }
@@ -197,6 +198,12 @@ def load_for(
     if not same_terms:
         raise UserError(
             f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
+        )
+    given = policy.meta.get("actions", ["JointPosition"])
+    if ("RelativeJointPosition" in given) != ("RelativeJointPosition" in env.action_kinds):
+        raise UserError(
+            f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "
+            "pass the preset and the --env.actions that it was trained with, or train again"
         )
     return policy
 

@@ -49,7 +49,7 @@ Metrics = dict[str, Float[Array, ""]]
 Tree = TypeVar("Tree")
 
 _AXIS = "devices"
-_UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action_std", "learning_rate")
+_UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action_change", "action_std", "learning_rate")
 
 
 @struct.dataclass
@@ -78,6 +78,7 @@ class Batch:
     raw_action: jax.Array  # before the distribution's squashing, if it has one
     log_prob: jax.Array
     distribution: Any  # parameters of the distribution that acted
+    last_mean: jax.Array  # of the distribution a step before; at the start of an episode, of its own
     value: jax.Array  # as the critic gives it, in units of ``TrainState.returns``
     returns: jax.Array  # likewise
     advantages: jax.Array
@@ -272,7 +273,9 @@ class Learner:
             discount=cfg.discounting,
         )
         returns = running_statistics.normalize(returns, state.returns)
-        batch = Batch(obs, extras["raw_action"], extras["log_prob"], extras["distribution_params"], value, returns, advantages)
+        acted = extras["distribution_params"]
+        last_mean = _before(self.networks.parametric_action_distribution.create_dist(acted).loc, done)
+        batch = Batch(obs, extras["raw_action"], extras["log_prob"], acted, last_mean, value, returns, advantages)
         return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in totals.items()}
 
     def loss(
@@ -298,9 +301,11 @@ class Learner:
 
         entropy = jnp.mean(dist.entropy(logits, key))
         new, old = dist.create_dist(logits), dist.create_dist(batch.distribution)
+        change = jnp.mean(jnp.sum(jnp.square(new.loc - batch.last_mean), axis=-1))
         kl = jnp.mean(new.kl_divergence(old)) if hasattr(new, "kl_divergence") else jnp.zeros(())
-        total = policy_loss + value_loss - cfg.entropy_cost * entropy
+        total = policy_loss + value_loss - cfg.entropy_cost * entropy + cfg.change_cost * change
         metrics = {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy, "kl": kl}
+        metrics["action_change"] = change
         return total, {**metrics, "action_std": jnp.mean(new.scale)}
 
     def _update(self, state: TrainState, batch: Batch, key: Key) -> tuple[losses.PPONetworkParams, optax.OptState, Metrics]:
@@ -333,6 +338,12 @@ def _minibatches(cfg: PpoCfg) -> int:
     """How many minibatches an epoch has by ``minibatch_size``."""
     wanted = cfg.num_envs * cfg.unroll_length // cfg.minibatch_size
     return max(8, 1 << wanted.bit_length() - 1 if wanted else 0)
+
+
+def _before(mean: Float[Array, "time env na"], done: Float[Array, "time env"]) -> Float[Array, "time env na"]:
+    """The mean of a step before; where there is none, as an episode or the rollout starts, its own."""
+    starts = jnp.concatenate([jnp.ones_like(done[:1]), done[:-1]])
+    return jnp.where(starts[..., None] > 0, mean, jnp.concatenate([mean[:1], mean[:-1]]))
 
 
 def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any]:

@@ -70,6 +70,7 @@ class PpoCfg:
     normalize_returns: bool = True  # the critic learns them in units of their running deviation
     clip_value: NonNegative = 0.0  # bound on the change of a value estimate; 0: none
     entropy_cost: NonNegative = 0.01  # weight of the entropy in the loss: keeps the policy exploring
+    change_cost: NonNegative = 0.0  # weight of the squared change of the actions' means from step to step: keeps the policy calm
     min_std: NonNegative = 0.2  # least deviation of an action, so that exploration does not end before the goal is found; 0: none
     max_std: NonNegative = 1.0  # most, as noise costs nothing where targets saturate; 0: none
     value_loss: NonNegative = 1.0  # weight of the critic's loss

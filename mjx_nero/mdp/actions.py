@@ -94,6 +94,29 @@ class JointPosition(Plain):
 
 
 @dataclasses.dataclass(frozen=True)
+class RelativeJointPosition(Plain):
+    """One entry a joint: its target moves, at +-1 as fast as the drive. Isaac Lab's ``RelativeJointPositionAction``.
+
+    Absolute targets whose noise is wider than the speed limit teach a policy that only their signs count: without its noise it
+    throws targets from limit to limit, and a step of delay undoes it. Here noise is a share of the limit.
+    """
+
+    group: str = dataclasses.field(default="arm", kw_only=True)
+
+    @property
+    def home(self) -> np.ndarray:
+        """Zero."""
+        return np.zeros_like(self.groups[self.group].home)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of the group, from those in force."""
+        drives = self.groups[self.group]
+        return memory, act.to(
+            self.group, jnp.clip(act.ctrl[self.group] + drives.step * jnp.clip(own, -1, 1), drives.low, drives.high)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class DriveTargets(Plain):
     """One entry a drive: its position target itself [rad or m], within the joints' ranges. For controllers."""
 
@@ -198,6 +221,7 @@ class Chain:
 
     Attributes:
         home: the action that keeps the robot at home [na].
+        kinds: of the terms that read it.
 
     Raises:
         UserError: no term reads the action.
@@ -210,6 +234,7 @@ class Chain:
         if not sum(sizes):
             raise UserError(f"none of the actions {', '.join(terms) or '(there are none)'} reads the policy's output")
         self.home = np.concatenate([np.asarray(term.home, np.float32) for term in self.terms.values()])
+        self.kinds = [type(term).__name__ for term in self.terms.values() if len(term.home)]
 
     def init(self, key: Key, joint_pos: Float[Array, " nj"]) -> dict[str, Memory]:
         """What the terms remember at the start, by their dotted names in the task; those that remember nothing are left out."""

@@ -20,9 +20,6 @@ _MOST = {
     "hfield": dict.fromkeys(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), 50),
 }
 _CONVEX = 4
-# Steps of the solver's line search where things are gripped, MuJoCo's default. With fewer the solver may end, once in hundreds of
-# steps with two pads flat on a cube, with a force that throws it across the room.
-_LINE_SEARCH = 50
 _EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
 
 
@@ -107,8 +104,7 @@ def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
 
 
 def _of_size(sim: SimCfg, scene: SceneCfg, contacts: int, rows: int) -> SimCfg:
-    search = max(sim.ls_iterations, _LINE_SEARCH if scene.objects else 0)
-    return dataclasses.replace(sim, contacts_per_env=max(contacts, 1), constraints_per_env=max(rows, 1), ls_iterations=search)
+    return dataclasses.replace(sim, contacts_per_env=max(contacts, 1), constraints_per_env=max(rows, 1))
 
 
 def _body(model: mujoco.MjModel, geom: int) -> str:

@@ -72,6 +72,7 @@ class RobotCfg:
         down: orientation of ``ee_site`` when the gripper points straight down and its fingers open along y, wxyz.
         gravity_compensation: the drives carry the links' weight, as a robot's own controller does; False where the recipe that a
             robot comes from does not.
+        max_step: the longest physics step that the drives bear [s]; 0: any that a task has.
         workspace: box of the unturned frame in which ``ee_site`` gets everywhere, ranges of x, y and z [m]; what reach tasks
             command unless they say otherwise.
         floor: height of the floor that a robot beside the table stands on [m]; 0: it stands on the table.
@@ -95,6 +96,7 @@ class RobotCfg:
     base_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     down: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
     gravity_compensation: bool = False
+    max_step: NonNegative = 0.0
     workspace: Box | None = None
     floor: float = 0.0
     opening: float = 0.0

@@ -1,9 +1,11 @@
 """SO-ARM100: five joints, and a jaw that closes on a fixed one. A 3D-printed arm of hobby servos."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_nero.envs.task import Envs
+from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import lift, reach
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -25,22 +27,31 @@ def jaw_positions(gap: Float[Array, ""]) -> Float[Array, "1"]:
     return (_PARALLEL + jnp.arctan2(_REACH, rest) - jnp.arccos(_FACE / jnp.hypot(rest, _REACH)))[None]
 
 
-# Drives, mounting and home: the Isaac Lab recipe's, but for the jaw's effort: with the recipe's 2.5 N m it sinks into the cube by
-# 1.5 mm. 1.2 N m hold a cube with 16 N.
+_RECIPE = {  # of the arm's drives
+    "stiffness": (200.0, 170.0, 120.0, 80.0, 50.0),
+    "damping": (80.0, 65.0, 45.0, 30.0, 20.0),
+    "effort": (1.9,) * 5,
+}
+
+# Mounting and home: the Isaac Lab recipe's. Drives of the arm: the makers' (their MJCF, for the servos' P = 16), which hold a
+# joint to milliradians where the recipe's take half a second to follow, and tremble at steps above 5 ms; the speed is the
+# recipe's. The jaw's drive is the recipe's but for its effort: with 2.5 N m it sinks 1.5 mm into the cube. 1.2 N m hold a cube
+# with 16 N.
 ROBOT = SO_ARM100 = RobotCfg(
     name="so_arm100",
     base_link="base",
     base_quat=(0.7071068, 0.0, 0.0, 0.7071068),
     workspace=((0.15, 0.3), (-0.15, 0.15), (0.05, 0.3)),
+    max_step=0.005,
     opening=0.052,
     pad=(0.03, 0.012, 0.004),
     pick=((0.1, 0.3), (-0.2, 0.2), (0.02, 0.08)),
     hold=((0.1, 0.3), (-0.1, 0.1), (0.2, 0.35)),
     arm=DriveCfg(
         joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
-        stiffness=(200.0, 170.0, 120.0, 80.0, 50.0),
-        damping=(80.0, 65.0, 45.0, 30.0, 20.0),
-        effort=(1.9,) * 5,
+        stiffness=(998.22,) * 5,
+        damping=(2.731,) * 5,
+        effort=(2.94,) * 5,
         speed=(1.5,) * 5,
         home=(0.0, 1.57, -1.57, 1.0, -1.57),
     ),
@@ -71,7 +82,18 @@ REACH = reach.Setup(
     position=((0.1, 0.25), (-0.1, 0.1), (0.1, 0.3)),
 )
 
+
+def with_recipe(presets: Presets) -> Presets:
+    """Presets of which ``isaac`` has the recipe's drives."""
+
+    def isaac(robot: RobotCfg) -> EnvCfg:
+        arm = dataclasses.replace(robot.arm, **_RECIPE)
+        return presets["isaac"](dataclasses.replace(robot, max_step=0.0, arm=arm))
+
+    return {**presets, "isaac": isaac}
+
+
 ENVS: Envs = {
-    "so100_lift": (SO_ARM100, lift.presets(LIFT)),
-    "so100_reach": (SO_ARM100, reach.presets(REACH)),
+    "so100_lift": (SO_ARM100, with_recipe(lift.presets(LIFT))),
+    "so100_reach": (SO_ARM100, with_recipe(reach.presets(REACH))),
 }

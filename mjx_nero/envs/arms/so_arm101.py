@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from mjx_nero.envs.arms.so_arm100 import SCENE, SO_ARM100
+from mjx_nero.envs.arms.so_arm100 import SCENE, SO_ARM100, with_recipe
 from mjx_nero.envs.task import Envs
 from mjx_nero.envs.tasks import lift, reach
 
@@ -27,6 +27,6 @@ LIFT = lift.Setup(
 REACH = reach.Setup(scene=reach.scene(SCENE))
 
 ENVS: Envs = {
-    "so101_lift": (SO_ARM101, lift.presets(LIFT)),
-    "so101_reach": (SO_ARM101, reach.presets(REACH)),
+    "so101_lift": (SO_ARM101, with_recipe(lift.presets(LIFT))),
+    "so101_reach": (SO_ARM101, with_recipe(reach.presets(REACH))),
 }

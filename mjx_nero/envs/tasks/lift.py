@@ -4,7 +4,7 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import EnvCfg, Presets, joint_actions
+from mjx_nero.envs.task import CALM, EnvCfg, Presets, joint_actions, relative_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
@@ -114,6 +114,8 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     }
     return dataclasses.replace(
         recipe,
+        actions=relative_actions(),
+        training=CALM,
         observations={
             "state": state,
             "privileged_state": {

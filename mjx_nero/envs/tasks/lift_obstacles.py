@@ -6,7 +6,7 @@ import functools
 
 from mjx_nero.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, MetricTerm, RewardTerm, Term
@@ -51,6 +51,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         plain,
         sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, and a box that is leant on
         episode_length_s=12.0,
+        actions=joint_actions(scale=0.5),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
         training={"num_timesteps": 300_000_000},
         command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),

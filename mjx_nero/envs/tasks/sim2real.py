@@ -17,7 +17,7 @@ from mjx_nero.sim.robot import RobotCfg
 def randomized(cfg: EnvCfg) -> EnvCfg:
     """A task with drives, loads, objects, delays and sensors that differ from episode to episode."""
     late = {"delay": Term(actions.Delay, params={"steps": (0, 3), "hold": 0.9})}
-    first = {name: term for name, term in cfg.actions.items() if name != "speed_limit"}
+    first = {name: term for name, term in cfg.actions.items() if name not in ("delay", "speed_limit")}
     noise = {"noise": Term(actions.Noise, params={"amount": 0.002})}
     objects = list(cfg.scene.objects)
     pushed = {name: Term(pushes.Push, params={"object": name, "speed": 0.1, "interval": (1.0, 3.0)}) for name in objects}

@@ -81,7 +81,7 @@ def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollo
 
     def act(params, memory, state, key):
         targets, memory = steering.act(params, memory, state, key)
-        return actions.for_targets(env, targets), memory
+        return actions.for_targets(env, targets, state.pipeline_state.ctrl), memory
 
     return dataclasses.replace(steering, act=act)
 
@@ -90,7 +90,8 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
     """Takes the drives' position targets [joints] as its parameters."""
 
     def act(targets, memory, state, key):
-        return actions.for_targets(env, jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))), memory
+        wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
+        return actions.for_targets(env, wanted, state.pipeline_state.ctrl), memory
 
     return rollout.Agent(act, init=lambda state: ())
 
