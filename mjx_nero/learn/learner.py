@@ -89,11 +89,13 @@ class Kind:
         presets: its config by the environment's preset; ``default`` for the others. A frozen dataclass with at least ``num_envs``
             and ``num_timesteps``, 0: chosen for the machine.
         policy: what a policy file says -> a template of the policy's parameters, and how it acts.
+        fit: (config, number of devices that a run starts on) -> the config with what they decide, which the run keeps.
     """
 
     make: Callable[["Env", Any, int], Learner]
     presets: Mapping[str, Any]
     policy: Callable[[Mapping[str, Any]], tuple[Params, Act]]
+    fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
 
 
 # The package's own: the module that has its ``KIND``. The presets stand in one beside it, ``<module>_cfg``, without Brax.

@@ -14,6 +14,8 @@ policy's advantages are normalised, its deviations have bounds, and so have norm
 
 On several devices each has an equal share of the environments, and of every minibatch; everything else is on all of them. Sums
 and means go over all devices, so their number changes only which environments share a minibatch, and the noise of the actions.
+A run that starts on several has minibatches as many times larger (``ppo_cfg.fit``), as half an update does not take half as long,
+and keeps them on whatever it goes on later.
 """
 
 import dataclasses
@@ -43,6 +45,7 @@ from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.policy import from_meta, init_params, make_act, make_networks, shapes
 from mjx_nero.learn.ppo_cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo_cfg import PpoCfg as PpoCfg
+from mjx_nero.learn.ppo_cfg import fit
 from mjx_nero.types import Key
 
 Metrics = dict[str, Float[Array, ""]]
@@ -97,12 +100,13 @@ class Learner:
     """
 
     def __init__(self, env: Env, cfg: PpoCfg, num_devices: int = 1):
-        cfg = dataclasses.replace(cfg, num_minibatches=cfg.num_minibatches or _minibatches(cfg))
         here = jax.local_devices()
         if num_devices > len(here):
             raise UserError(f"num_devices is {num_devices}, but JAX finds {len(here)} here ({here[0].platform})")
         devices = machines.devices(num_devices)
         num_devices = len(devices)
+        cfg = fit(cfg, num_devices)  # as a run's config is already
+        cfg = dataclasses.replace(cfg, num_minibatches=cfg.num_minibatches or _minibatches(cfg))
         parts = num_devices * cfg.num_minibatches
         if not cfg.num_envs or cfg.num_envs % parts:
             factors = f"ppo.num_minibatches ({cfg.num_minibatches})"
@@ -355,4 +359,4 @@ def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any
     return {**policy, "params": {**layers, name: jax.tree.map(lambda x: jnp.clip(x, *bounds), layers[name])}}
 
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit)

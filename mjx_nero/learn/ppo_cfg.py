@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated
 
 from mjx_nero import config
-from mjx_nero.bounds import Bounds, Count, NonNegative, Positive, Share
+from mjx_nero.bounds import Bounds, NonNegative, Positive, Share
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
@@ -13,6 +13,7 @@ from mjx_nero.values import hints, read, short
 PRECISIONS = ("default", "bfloat16", "tensorfloat32", "float32", "high", "highest")
 Rate = Annotated[float, Bounds(0.0, 1.0, above=True)]
 
+MINIBATCH = 6144  # env steps of an update on one device: more leave too few updates, fewer a GPU idle
 ACTIVATIONS = ("elu", "swish", "relu", "tanh")
 
 
@@ -52,14 +53,14 @@ class NetworkCfg:
 
 @dataclasses.dataclass(frozen=True)
 class PpoCfg:
-    """Hyperparameters. ``num_envs`` and ``num_timesteps`` 0: chosen for the machine."""
+    """Hyperparameters. ``num_envs``, ``num_timesteps`` and ``minibatch_size`` 0: chosen for the machine."""
 
     num_envs: Annotated[int, Bounds(0, 1 << 24)] = 0  # on all devices together; 0: chosen for the machine
     num_timesteps: Annotated[int, Bounds(0, 10**15)] = 0  # env steps in all; 0: chosen for the machine
     unroll_length: Annotated[int, Bounds(1, 10_000)] = 24  # control steps of every environment an iteration
     num_epochs: Annotated[int, Bounds(1, 1_000)] = 2  # times that an iteration learns from its steps
     num_minibatches: Annotated[int, Bounds(0, 1 << 20)] = 0  # updates an epoch; 0: a power of two, at least 8, by minibatch_size
-    minibatch_size: Count = 6144  # env steps; larger ones leave too few updates, smaller ones a GPU idle
+    minibatch_size: Annotated[int, Bounds(0)] = 0  # env steps on all devices together; 0: 6,144 for each that the run starts on
     learning_rate: Rate = 3e-4  # at first
     desired_kl: NonNegative = 0.02  # adapts the learning rate; 0 keeps it fixed
     min_learning_rate: Rate = 1e-5  # the least that it is adapted to
@@ -87,6 +88,11 @@ class PpoCfg:
             raise UserError(f"ppo.matmul_precision takes one of {', '.join(PRECISIONS)}, got {short(self.matmul_precision)}")
         if self.min_learning_rate > self.max_learning_rate:
             raise UserError("ppo.min_learning_rate is above ppo.max_learning_rate: lower it")
+
+
+def fit(cfg: PpoCfg, num_devices: int) -> PpoCfg:
+    """Fills in what the number of devices decides. The result is kept with the run, which learns likewise on any number later."""
+    return dataclasses.replace(cfg, minibatch_size=cfg.minibatch_size or MINIBATCH * num_devices)
 
 
 PRESETS = {  # by the environment's preset

@@ -87,7 +87,11 @@ def learner_cfg(cfg: EnvCfg, preset: str, name: str = "ppo") -> Any:
 
 
 def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
-    """Fills in what the machine decides: number of environments, env steps, time limit. With a line that says so."""
+    """Fills in what the machine decides: number of environments, env steps, time limit, and whatever the learner fits to devices.
+
+    Returns:
+        the run, and a line that says so where there is no GPU.
+    """
     lifts, on_cpu = bool(run.env.scene.objects), jax.default_backend() == "cpu"
     tasks_own = run.env.training.get("num_timesteps", 0)
     # Few environments learn from fewer steps, which is what a CPU is short of.
@@ -98,6 +102,7 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
         num_envs=run.num_envs or (256 if on_cpu else 8192),
         num_timesteps=enough if short else run.num_timesteps,
     )
+    hyperparameters = learner.find(run.learner).fit(hyperparameters, run.num_devices * jax.process_count())
     run = dataclasses.replace(run, hyperparameters=hyperparameters)
     if not on_cpu:
         return run, ""

@@ -85,6 +85,8 @@ def test_two_processes_learn_what_one_does(tmp_path):
 
     ended(start(tmp_path, "--restore", "two", "--num-timesteps", "448"))  # goes on with one process
     assert checkpoints(tmp_path / "two")[0] == "000000000448.safetensors"
+    configs = [json.loads((tmp_path / name / "config.json").read_text()) for name in ("one", "two")]
+    assert [config["hyperparameters"]["minibatch_size"] for config in configs] == [12_288] * 2
 
 
 def checkpoints(run: pathlib.Path):

@@ -18,7 +18,7 @@ from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, device_memory
 from mjx_nero.learn.policy import NetworkCfg
-from mjx_nero.learn.ppo import Learner, PpoCfg, _bound_std
+from mjx_nero.learn.ppo import Learner, PpoCfg, _bound_std, fit
 
 SMALL = PpoCfg(
     num_envs=8,
@@ -294,6 +294,11 @@ def test_minibatches_are_of_one_size(learner, num_envs, minibatches):
     """6,144 env steps, 256 environments' 24; between two powers of two a larger one, but never fewer than eight."""
     assert Learner(learner.env, PpoCfg(num_envs=num_envs)).cfg.num_minibatches == minibatches
     assert Learner(learner.env, PpoCfg(num_envs=num_envs, num_minibatches=4)).cfg.num_minibatches == 4
+
+
+def test_a_minibatch_is_as_large_as_the_devices_are_many():
+    assert [fit(PpoCfg(), n).minibatch_size for n in (1, 2, 8)] == [6144, 12_288, 49_152]
+    assert fit(PpoCfg(minibatch_size=6144), 2).minibatch_size == 6144  # a run that began with it, or who asks for it
 
 
 def test_minibatches_must_divide_the_environments(learner):

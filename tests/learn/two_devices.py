@@ -12,8 +12,8 @@ from test_ppo import KEY, SMALL, differ, same
 
 from mjx_nero import ManipulationEnv, UserError, make
 from mjx_nero.envs import wrappers
-from mjx_nero.learn import checkpoint, compiled, training
-from mjx_nero.learn.ppo import Learner
+from mjx_nero.learn import checkpoint, compiled, resume, training
+from mjx_nero.learn.ppo import Learner, PpoCfg
 
 
 def scripted(learner):
@@ -143,6 +143,9 @@ def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
     monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
     sizes = {"num_envs": 16, "num_minibatches": 2, "unroll_length": 4, "network.actor": (8,), "network.critic": (8,)}
 
+    def stored():
+        return json.loads((tmp_path / "run" / "config.json").read_text())
+
     def train(iterations, **rest):
         run = training.resolve(
             "nero_lift", "default", None, {}, {**sizes, "num_timesteps": iterations * 16 * 4}, impl="native", **rest
@@ -151,10 +154,17 @@ def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
 
     summary = train(2, num_devices=2)
     assert (summary["num_devices"], summary["env_steps"], summary["stopped"]) == (2, 128, "finished")
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["num_devices"] == 2
+    assert (stored()["num_devices"], stored()["hyperparameters"]["minibatch_size"]) == (2, 12_288)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["num_devices"] == 2
-    summary = train(4, restore=tmp_path / "run")
+    asked = training.resolve("nero_lift", "default", None, {}, {"num_timesteps": 256})
+    summary = training.train(resume.same_run(tmp_path / "run", asked, {"num_devices", "num_timesteps"}, {}))
     assert (summary["num_devices"], summary["env_steps"]) == (1, 256)
+    assert (stored()["num_devices"], stored()["hyperparameters"]["minibatch_size"]) == (1, 12_288)
+
+
+def test_two_devices_make_as_many_updates_as_one_with_half_the_environments(env):
+    one, two = Learner(env, PpoCfg(num_envs=8192)), Learner(env, PpoCfg(num_envs=16_384), 2)
+    assert one.cfg.num_minibatches == two.cfg.num_minibatches == 32
 
 
 def test_sizes_must_fit_the_devices(env):
