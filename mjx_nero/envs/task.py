@@ -40,6 +40,13 @@ def relative_actions(gripper: bool = True, late: Steps = (0, 1)) -> dict[str, Te
 
 # Of the learner, for relative actions: noise of half the speed limit at most, and a policy that changes its mind for a reason.
 CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
+FOLLOWS = 0.02  # [s] that a drive lags behind its target, at most, for a hand to be driven by relative actions against things
+
+
+def follows(robot: RobotCfg) -> bool:
+    """Whether the arm's drives follow their targets at once. With slow ones a hand that leans on a table winds up relative
+    targets until no action has an effect, and learning may end there (docs/performance.md)."""
+    return max(robot.arm.lead) < FOLLOWS
 
 
 def drive_targets() -> dict[str, Term]:

@@ -44,13 +44,22 @@ def test_the_recipes_numbers():
     assert noise == {"joint_pos": 0.01, "joint_vel": 0.01, "pose_command": 0.0, "actions": 0.0}
     assert cfg.events["reset_robot_joints"].params == {"low": 0.5, "high": 1.5}
     assert env_cfg("nero_reach", "isaac").rewards["orientation_tracking"].weight == -0.1
+    assert cfg.robot.arm.stiffness == (200.0, 170.0, 120.0, 80.0, 50.0) and cfg.robot.arm.damping[0] == 80.0
     piper = env_cfg("piper_reach", "isaac")
     assert (piper.sim.decimation, piper.episode_length_s) == (1, 6.0)
     ranges = [piper.command.params[name] for name in ("x", "y", "z", "roll", "pitch", "yaw")]
     assert ranges == [(0.3, 0.4), (0.1, 0.15), (0.3, 0.3), (0, 0), (math.pi / 2, math.pi / 2), (0, 0)]
 
 
-def test_the_arm_alone_acts(env):
+def test_drives_that_tremble_get_shorter_steps_of_the_same_control():
+    cfg = env_cfg("so100_reach")
+    assert cfg.robot.arm.stiffness == (998.22,) * 5 and (cfg.sim.dt, cfg.sim.decimation) == (pytest.approx(1 / 240), 8)
+    sim = env_cfg("so100_lift").sim
+    assert (sim.dt, sim.decimation) == (0.005, 4)
+
+
+def test_the_arm_alone_acts():
+    env = make("nero_reach", impl="native", **{"actions.delay.params.steps": (0, 0)})
     assert env.action_size == 7
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     targets = env.targets(state, jnp.full(7, 100.0))

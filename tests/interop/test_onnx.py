@@ -90,8 +90,12 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
         ("actions", 39, 8),
     ]
     assert meta["observations"][1]["units"] == "rad/s, m/s"
-    arm, gripper, limit = meta["actions"]
-    assert (arm["scale"], arm["offset"]) == (0.5, [0, 0, 0, 2, 0, 0, 0])
+    late, arm, gripper, limit = meta["actions"]
+    assert late["steps"] == [0, 1] and arm == {
+        "name": "arm",
+        "type": "relative_joint_position",
+        "joints": [f"joint{i}" for i in range(1, 8)],
+    }
     assert (gripper["open"], gripper["close"]) == ([0.05, -0.05], [0.0, -0.001])
     assert limit == {"name": "speed_limit", "type": "speed_limit"} and meta["action_clip"] is None
     assert (meta["control_dt"], meta["robot"], meta["env"]) == (0.02, "nero", "nero_lift")

@@ -315,6 +315,12 @@ def test_an_arm_goes_to_home_and_the_scaled_action_within_its_ranges():
     np.testing.assert_array_equal(out[:, :2], np.float32([[0.75, 1.0], [2.5, -1.5]]))
 
 
+def test_relative_targets_move_from_where_they_are_as_fast_as_the_drives():
+    out = play({"arm": Term(actions.RelativeJointPosition)}, [[0.5, -9.0], [0.5, -1.0], [0.0, 0.0]])
+    np.testing.assert_allclose(out[:, :2], [[0.265, 1.97], [0.28, 1.94], [0.28, 1.94]], atol=1e-6)
+    assert actions.Chain({"arm": Term(actions.RelativeJointPosition)}, GROUPS).kinds == ["RelativeJointPosition"]
+
+
 def test_a_gripper_closes_for_negative_actions_within_its_ranges():
     out = play({**ARM, **GRIPPER}, [[0.0, 0.0, a] for a in (-1e-6, -5.0, 0.0, 3.0)])
     np.testing.assert_array_equal(out[:, 2:], np.float32([[0.0, -0.001]] * 2 + [[0.05, -0.05]] * 2))

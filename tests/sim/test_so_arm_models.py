@@ -121,6 +121,7 @@ def test_joints(arm, model):
     check.joints_are(model, arm.ranges)
     assert list(arm.ranges) == list(arm.robot.joints)
     assert (model.dof_armature == [0.028] * 5 + [0.3]).all()
+    assert (model.dof_damping == [0.6] * 5 + [0]).all() and (model.dof_frictionloss == [0.052] * 5 + [0]).all()
     low, high = model.jnt_range.T
     assert (low <= arm.robot.home).all() and (arm.robot.home <= high).all()
 
