@@ -54,14 +54,16 @@ def poses_agree(model: mujoco.MjModel, robot: str, base: str, sites: Collection[
             assert angle < 1e-6, (name, angle)
 
 
-def joints_are(model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """These joints in this order, limited, without damping or friction; and no drives, keyframes, lights or cameras."""
+def joints_are(
+    model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]], damping: float | list = 0.0, friction: float | list = 0.0
+) -> None:
+    """These joints in this order, limited, with so much damping and friction; and no drives, keyframes, lights or cameras."""
     assert [model.joint(i).name for i in range(model.njnt)] == list(ranges)
     assert model.jnt_limited.all()
     for name, limits in ranges.items():
         assert tuple(model.joint(name).range) == limits
     assert (model.dof_armature > 0).all()
-    assert not model.dof_damping.any() and not model.dof_frictionloss.any()
+    assert (model.dof_damping == damping).all() and (model.dof_frictionloss == friction).all()
     assert model.nu == 0 and model.nkey == 0 and model.nlight == 0 and model.ncam == 0
 
 

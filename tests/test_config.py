@@ -5,12 +5,13 @@ import json
 
 import pytest
 
-from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, list_robots, make
+from mjx_nero import UserError, bounds, config, control, env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.task import EnvCfg
+from mjx_nero.envs.task import CALM, EnvCfg
 from mjx_nero.learn.policy import NetworkCfg
 from mjx_nero.learn.ppo import PRESETS
+from mjx_nero.mdp import actions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -381,10 +382,11 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, and for the recipes' presets, whose runners differ."""
+    """But for how long it takes, for relative actions, and for the recipes' presets, whose runners differ."""
     for env in registry.list_envs():
-        robot = registry.robot_of(env) or "nero"
-        assert set(registry.env_cfg(env, registry.list_presets(env)[0], robot).training) <= {"num_timesteps"}, env
+        cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
+        relative = any(bounds.unwrapped(term.func) is actions.RelativeJointPosition for term in cfg.actions.values())
+        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == (CALM if relative else {}), env
     assert registry.env_cfg("nero_reach", "isaac").training["num_epochs"] == 8
 
 

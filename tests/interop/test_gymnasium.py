@@ -57,11 +57,12 @@ def test_make_vec_takes_the_compiled_batch():
     assert env.observation_space.contains(obs)
 
 
-def test_actions_end_where_the_joints_do(reach, vector):
-    """Home plus half a radian an action: joint 4 is at home at 2.0 and goes from -1.01 to 2.14."""
-    box = vector.single_action_space
-    assert box.low[3] == pytest.approx((-1.01 - 2.0) / 0.5) and box.high[3] == pytest.approx((2.14 - 2.0) / 0.5)
+def test_actions_end_where_the_joints_do(vector):
+    """Home plus half a radian an action: joint 4 is at home at 2.0 and goes from -1.01 to 2.14. Relative ones: +-1."""
     lift = Env("nero_lift", impl="native")
+    box = lift.action_space
+    assert box.low[3] == pytest.approx((-1.01 - 2.0) / 0.5) and box.high[3] == pytest.approx((2.14 - 2.0) / 0.5)
+    assert (vector.single_action_space.low == -1).all() and (vector.single_action_space.high == 1).all()
     assert (lift.action_space.low[-1], lift.action_space.high[-1]) == (-1, 1)  # the gripper
     drives = Env("nero_pick_place", impl="native")
     assert drives.action_space.high[3] == pytest.approx(2.14)  # targets themselves
@@ -123,6 +124,17 @@ def test_on_a_gpu_a_step_has_no_branch_and_gives_the_same(reach, vector, monkeyp
     assert branches(straight) == 0
     monkeypatch.undo()
     assert branches(vector) == 1
+
+
+def test_results_may_travel_in_one_array(reach, vector):
+    """As they do to torch."""
+    packed = VectorEnv(reach, N, arrays="jax")
+    packed._packed = True
+    for env in (packed, vector):
+        env.reset(seed=3)
+    infos = [env.step(jnp.full((N, 7), 0.1))[4]["final_info"] for env in (packed, vector)]
+    assert list(infos[0]) == list(infos[1]) == ["success", "final_distance", "dropped", "nan"]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), *infos)
 
 
 def test_a_seed_repeats_everything(vector):

@@ -90,15 +90,17 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
         ("actions", 39, 8),
     ]
     assert meta["observations"][1]["units"] == "rad/s, m/s"
-    late, arm, gripper, limit = meta["actions"]
-    assert late["steps"] == [0, 1] and arm == {
-        "name": "arm",
-        "type": "relative_joint_position",
-        "joints": [f"joint{i}" for i in range(1, 8)],
-    }
+    arm, gripper, limit = meta["actions"]
+    assert (arm["scale"], arm["offset"]) == (0.5, [0, 0, 0, 2, 0, 0, 0])
     assert (gripper["open"], gripper["close"]) == ([0.05, -0.05], [0.0, -0.001])
     assert limit == {"name": "speed_limit", "type": "speed_limit"} and meta["action_clip"] is None
     assert (meta["control_dt"], meta["robot"], meta["env"]) == (0.02, "nero", "nero_lift")
+
+
+def test_relative_actions_and_delays_are_told():
+    late, arm, _ = meaning.parts(mjx_nero.make("nero_reach", impl="native"))
+    assert late == {"name": "delay", "type": "delay", "steps": [0, 1]}
+    assert arm == {"name": "arm", "type": "relative_joint_position", "joints": [f"joint{i}" for i in range(1, 8)]}
 
 
 def test_histories_and_filters_are_told():
@@ -118,7 +120,8 @@ def test_histories_and_filters_are_told():
 @pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
     """The page's program, word for word, without this package: its joint targets are the environment's."""
-    env = mjx_nero.make(env_name, impl="native", corruption=False)
+    punctual = {"actions.delay.params.steps": (0, 0)} if env_name == "so100_reach" else {}
+    env = mjx_nero.make(env_name, impl="native", corruption=False, **punctual)
     trained = policy.load_for(env, env_name, None)
     reset, step, targets = jax.jit(env.reset), jax.jit(env.step), jax.jit(env.targets)
     named = jax.jit(lambda state: env.named_observations(state)["state"])

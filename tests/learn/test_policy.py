@@ -131,6 +131,22 @@ def test_policy_of_another_preset(path):
         policy.load_for(recipe, "nero_lift", path)
 
 
+def test_policy_of_other_actions(env, trained, tmp_path):
+    """Of before 0.5.0, which had absolute ones and did not say so; and the other way round."""
+    relative = make("nero_lift", "sim2real", impl="native")
+    _, params, meta = trained
+    old = {name: value for name, value in meta.items() if name != "actions"}
+    checkpoint.save(tmp_path / "old.safetensors", params, old)
+    assert policy.load_for(env, "nero_lift", tmp_path / "old.safetensors").meta["env"] == "nero_lift"
+    with pytest.raises(
+        UserError, match=r"was trained on other actions \(JointPosition; here RelativeJointPosition, BinaryGripper\)"
+    ):
+        policy.load_for(relative, "nero_lift", tmp_path / "old.safetensors")
+    checkpoint.save(tmp_path / "new.safetensors", params, policy.describe(relative, "nero_lift", "sim2real", "ppo", old))
+    with pytest.raises(UserError, match=r"\(RelativeJointPosition, BinaryGripper; here JointPosition, BinaryGripper\)"):
+        policy.load_for(env, "nero_lift", tmp_path / "new.safetensors")
+
+
 def test_policy_of_another_robot_of_the_same_name(trained, path):
     """Its arm has other limits to its drives' forces."""
     other = make("nero_lift", impl="native", **{"robot.arm.effort": (1.0,) * 7})

@@ -18,7 +18,7 @@ from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, device_memory
 from mjx_nero.learn.policy import NetworkCfg
-from mjx_nero.learn.ppo import Learner, PpoCfg, _bound_std, fit
+from mjx_nero.learn.ppo import Learner, PpoCfg, _before, _bound_std, fit
 
 SMALL = PpoCfg(
     num_envs=8,
@@ -240,6 +240,24 @@ def test_deviations_have_bounds():
         assert float(bound["Dense_0"]["bias"]) == 7
     squashed = {"params": {"hidden_0": {"bias": jnp.array([9.0])}}}  # its deviation is the network's own
     assert _bound_std(squashed, 0.2, 1.0) is squashed
+
+
+def test_means_are_compared_with_those_of_a_step_before():
+    """Of the same episode: the second environment's ends after the first step."""
+    mean, done = jnp.arange(6.0).reshape(3, 2, 1), jnp.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0]])
+    np.testing.assert_array_equal(_before(mean, done)[..., 0], [[0, 1], [0, 3], [2, 3]])
+
+
+def test_changes_of_mind_cost(learner, eventful, rolled):
+    """The squared change of all actions' means, averaged over steps and environments."""
+    _, batch, _ = rolled
+    costly = Learner(learner.env, dataclasses.replace(learner.cfg, change_cost=0.5))
+    args = eventful.params, eventful.normalizer, batch, jax.random.PRNGKey(0)
+    (plain, told), (cost, _) = learner.loss(*args), costly.loss(*args)
+    means = np.asarray(batch.distribution[0])
+    change = np.mean(np.sum(np.square(means - np.asarray(batch.last_mean)), -1))
+    assert change > 0 and float(told["action_change"]) == pytest.approx(change, rel=1e-4)
+    assert float(cost - plain) == pytest.approx(0.5 * change, rel=1e-3)
 
 
 def test_an_update_keeps_the_deviations_within_their_bounds(learner, eventful, rolled):
