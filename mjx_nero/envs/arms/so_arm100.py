@@ -1,6 +1,7 @@
 """SO-ARM100: five joints, and a jaw that closes on a fixed one. A 3D-printed arm of hobby servos."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -27,7 +28,7 @@ def jaw_positions(gap: Float[Array, ""]) -> Float[Array, "1"]:
     return (_PARALLEL + jnp.arctan2(_REACH, rest) - jnp.arccos(_FACE / jnp.hypot(rest, _REACH)))[None]
 
 
-_RECIPE = {  # of the arm's drives
+_RECIPE: dict[str, Any] = {  # of the arm's drives
     "stiffness": (200.0, 170.0, 120.0, 80.0, 50.0),
     "damping": (80.0, 65.0, 45.0, 30.0, 20.0),
     "effort": (1.9,) * 5,
