@@ -95,6 +95,11 @@ def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
             raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run (its {name} is {shown})")
 
 
+def relative(meta: Mapping[str, Any]) -> bool:
+    """Whether a policy acts by relative actions. Files of before 0.5.0 do not say, and theirs are none."""
+    return "RelativeJointPosition" in meta.get("actions", ())
+
+
 def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
     """Type, shape, first byte and the one after the last."""
     kind, shape, (first, last) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]

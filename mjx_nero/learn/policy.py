@@ -199,8 +199,8 @@ def load_for(
         raise UserError(
             f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
         )
-    given = policy.meta.get("actions", ["JointPosition"])
-    if ("RelativeJointPosition" in given) != ("RelativeJointPosition" in env.action_kinds):
+    if header.relative(policy.meta) != header.relative({"actions": env.action_kinds}):
+        given = policy.meta.get("actions", ["JointPosition"])
         raise UserError(
             f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "
             "pass the preset and the --env.actions that it was trained with, or train again"

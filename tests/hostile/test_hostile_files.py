@@ -240,8 +240,7 @@ def unsummed(head: dict) -> None:
     head["__metadata__"].pop("crc32", None)
 
 
-NETWORKS = "--ppo.network.actor (64,64) --ppo.network.critic (64,64)"  # as the policy's that ships
-RESTORE = f"train --env nero_reach --num-envs 8 --num-timesteps 1000 --no-video --out run {NETWORKS} --restore".split()
+RESTORE = "train --env nero_reach --num-envs 8 --num-timesteps 1000 --no-video --out run --restore".split()
 REFUSED |= {
     f"restore: {name}": lambda folder, options=options: [*RESTORE, bad.policy(folder, **options)[-1]]
     for name, options in {
