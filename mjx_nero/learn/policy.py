@@ -203,7 +203,7 @@ def load_for(
         given = policy.meta.get("actions", ["JointPosition"])
         raise UserError(
             f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "
-            "pass the preset and the --env.actions that it was trained with, or train again"
+            "pass the --preset that it was trained with, or train again"
         )
     return policy
 
