@@ -84,7 +84,7 @@ def for_targets(env: ManipulationEnv, targets: jax.Array, ctrl: jax.Array) -> ja
     robot, late = env.cfg.robot, max((part["steps"][1] for part in every if part["type"] == "delay"), default=0)
     step = env.dt * np.array(robot.arm.speed + robot.gripper.speed, np.float32)
     for part in (part for part in every if "joints" in part):
-        ids = np.array([env.cfg.robot.joints.index(name) for name in part["joints"]])
+        ids = np.array([robot.joints.index(name) for name in part["joints"]])
         want = targets[..., ids]
         if part["type"] == "binary":
             to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))

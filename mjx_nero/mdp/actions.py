@@ -76,16 +76,22 @@ class Plain:
 
 
 @dataclasses.dataclass(frozen=True)
-class JointPosition(Plain):
-    """One entry a joint: ``home + scale * action`` [rad], within the joints' ranges. Isaac Lab's ``JointPositionAction``."""
+class Joints(Plain):
+    """What terms have in common that read an entry for each joint of a group, zero at home."""
 
-    scale: float = dataclasses.field(kw_only=True)
     group: str = dataclasses.field(default="arm", kw_only=True)
 
     @property
     def home(self) -> np.ndarray:
         """Zero."""
         return np.zeros_like(self.groups[self.group].home)
+
+
+@dataclasses.dataclass(frozen=True)
+class JointPosition(Joints):
+    """One entry a joint: ``home + scale * action`` [rad], within the joints' ranges. Isaac Lab's ``JointPositionAction``."""
+
+    scale: float = dataclasses.field(kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the group."""
@@ -94,26 +100,18 @@ class JointPosition(Plain):
 
 
 @dataclasses.dataclass(frozen=True)
-class RelativeJointPosition(Plain):
+class RelativeJointPosition(Joints):
     """One entry a joint: its target moves, at +-1 as fast as the drive. Isaac Lab's ``RelativeJointPositionAction``.
 
     Absolute targets whose noise is wider than the speed limit teach a policy that only their signs count: without its noise it
     throws targets from limit to limit, and a step of delay undoes it. Here noise is a share of the limit.
     """
 
-    group: str = dataclasses.field(default="arm", kw_only=True)
-
-    @property
-    def home(self) -> np.ndarray:
-        """Zero."""
-        return np.zeros_like(self.groups[self.group].home)
-
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the group, from those in force."""
         drives = self.groups[self.group]
-        return memory, act.to(
-            self.group, jnp.clip(act.ctrl[self.group] + drives.step * jnp.clip(own, -1, 1), drives.low, drives.high)
-        )
+        targets = act.ctrl[self.group] + drives.step * jnp.clip(own, -1, 1)
+        return memory, act.to(self.group, jnp.clip(targets, drives.low, drives.high))
 
 
 @dataclasses.dataclass(frozen=True)

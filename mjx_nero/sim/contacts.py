@@ -76,7 +76,7 @@ def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
     model = scene.build(robot, objects, sim, visuals=False)
     contacts = sum(pair.contacts for pair in contact_pairs(model))
     rows = sum(constraint_rows(model).values())
-    return _of_size(sim, objects, contacts, rows)
+    return _of_size(sim, contacts, rows)
 
 
 def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
@@ -100,10 +100,10 @@ def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
         return sum(getattr(pair, count) for pair in at_table) + sum(each) + sum(others)
 
     rows = most("rows") + sum(least.values()) - least["contacts"]
-    return _of_size(sim, objects, most("contacts"), rows)
+    return _of_size(sim, most("contacts"), rows)
 
 
-def _of_size(sim: SimCfg, scene: SceneCfg, contacts: int, rows: int) -> SimCfg:
+def _of_size(sim: SimCfg, contacts: int, rows: int) -> SimCfg:
     return dataclasses.replace(sim, contacts_per_env=max(contacts, 1), constraints_per_env=max(rows, 1))
 
 
