@@ -382,11 +382,11 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, for relative actions, and for the recipes' presets, whose runners differ."""
+    """But for how long it takes, for velocities, and for the recipes' presets, whose runners differ."""
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
-        relative = any(bounds.unwrapped(term.func) is actions.RelativeJointPosition for term in cfg.actions.values())
-        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == (CALM if relative else {}), env
+        moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
+        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == (CALM if moves else {}), env
     assert registry.env_cfg("nero_reach", "isaac").training["num_epochs"] == 8
 
 

@@ -174,7 +174,7 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert "Ctrl-C saves and says how to go on" in (site / "index.html").read_text()
     reference = (site / "generated" / "commands.html").read_text()
     assert all(f'id="{name}"' in reference for name in COMMANDS) and "--num-timesteps" in reference
-    assert "actions.arm.params.scale" in (site / "generated" / "config.html").read_text()
+    assert "actions.arm.params.ahead" in (site / "generated" / "config.html").read_text()
     assert "object_ee_distance" in (site / "python.html").read_text()
     assert "cell_type" not in (site / "generated" / "01_nero_lift.html").read_text()
 

@@ -91,9 +91,9 @@ class ManipulationEnv(Env):
         for name, cfg in (("arm", self.cfg.robot.arm), ("gripper", self.cfg.robot.gripper)):
             own, at = slice(at, at + len(cfg.joints)), at + len(cfg.joints)
             open, close = (getattr(cfg, end, cfg.home) for end in ("open", "close"))
-            home, speed, open, close = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close))
+            home, speed, open, close, lag = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close, cfg.lead))
             low, high = self._range[:, own]
-            groups[name] = Drives(home, low, high, speed * self.dt, open, close)
+            groups[name] = Drives(home, low, high, speed, open, close, lag, self.dt)
         return groups
 
     @functools.cached_property

@@ -25,28 +25,21 @@ def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
     }
 
 
-def relative_actions(gripper: bool = True, late: Steps = (0, 1)) -> dict[str, Term]:
-    """One action an arm joint (at +-1 its target moves as fast as the drive), then one for the gripper, if it has one.
+def velocity_actions(gripper: bool = True, late: Steps = (0, 1)) -> dict[str, Term]:
+    """One action an arm joint (its velocity, at +-1 the drive's), then one for the gripper, if it has one.
 
     An episode's actions come late by as many control steps as it draws from ``late``, as those of a real arm do.
     """
+    hand = {"gripper": Term(actions.BinaryGripper), "speed_limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
     return {
         "delay": Term(actions.Delay, params={"steps": late}),
-        "arm": Term(actions.RelativeJointPosition),
-        **({"gripper": Term(actions.BinaryGripper)} if gripper else {}),
-        "speed_limit": Term(actions.SpeedLimit),
+        "arm": Term(actions.JointVelocity),
+        **(hand if gripper else {}),
     }
 
 
-# Of the learner, for relative actions: noise of half the speed limit at most, and a policy that changes its mind for a reason.
+# Of the learner, for velocities: noise of half the speed at most, and a policy that changes its mind for a reason.
 CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
-FOLLOWS = 0.02  # [s] that a drive lags behind its target, at most, for a hand to be driven by relative actions against things
-
-
-def follows(robot: RobotCfg) -> bool:
-    """Whether the arm's drives follow their targets at once. With slow ones a hand that leans on a table winds up relative
-    targets until no action has an effect, and learning may end there (docs/performance.md)."""
-    return max(robot.arm.lead) < FOLLOWS
 
 
 def drive_targets() -> dict[str, Term]:

@@ -18,10 +18,11 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     """How the action becomes position targets of the drives: the task's action terms, in their order.
 
     Those with ``joints`` read entries of the action. ``joint_position``: ``offset + scale * action`` [rad, m], an entry a joint.
-    ``relative_joint_position``: likewise, targets move from where they are, at +-1 as fast as the drives.
+    ``joint_velocity``: likewise, of set-points, as ``mdp.actions.JointVelocity`` has it: shares of the drives' speeds, smoothed
+    with the time constant ``time`` [s], at most ``ahead`` [s] of full speed before the joints; targets lead by ``lag`` [s].
     ``binary``: ``close`` for a negative entry, else ``open``, one for all the joints. The others change what is there:
-    ``speed_limit`` (targets move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
-    ``low_pass`` (time constant [s]) of the action.
+    ``speed_limit`` (targets ``of`` some joints move at most as fast as the drives), ``delay`` (in control steps, the least and
+    the most) and ``low_pass`` (time constant [s]) of the action.
 
     Raises:
         UserError: a term that only this package knows.
@@ -35,8 +36,9 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
         drives = _drives(robot, term)
         of = {"joints": list(drives.joints), "scale": term.params["scale"], "offset": list(drives.home)}
         return [{"name": name, "type": "joint_position", **of}]
-    if kind is terms.RelativeJointPosition:
-        return [{"name": name, "type": "relative_joint_position", "joints": list(_drives(robot, term).joints)}]
+    if kind is terms.JointVelocity:
+        drives, given = _drives(robot, term), {key: term.params[key] for key in ("time", "ahead")}
+        return [{"name": name, "type": "joint_velocity", "joints": list(drives.joints), **given, "lag": list(drives.lead)}]
     if kind is terms.DriveTargets:
         of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
         return [{"name": name, "type": "joint_position", **of}]
@@ -44,7 +46,8 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
         of = {"joints": list(robot.gripper.joints), "open": list(robot.gripper.open), "close": list(robot.gripper.close)}
         return [{"name": name, "type": "binary", **of}] if robot.gripper.joints else []
     if kind is terms.SpeedLimit:
-        return [{"name": name, "type": "speed_limit"}]
+        limited = _drives(robot, term).joints if term.params["group"] else robot.joints
+        return [{"name": name, "type": "speed_limit", "of": list(limited)}]
     if kind is terms.Delay:
         return [{"name": name, "type": "delay", "steps": list(term.params["steps"])}]
     if kind is terms.LowPass:
@@ -71,26 +74,27 @@ def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low, np.float32), np.array(high, np.float32)
 
 
-def for_targets(env: ManipulationEnv, targets: jax.Array, ctrl: jax.Array) -> jax.Array:
+def for_targets(env: ManipulationEnv, targets: jax.Array, joint_pos: jax.Array) -> jax.Array:
     """The action that gives position targets of the drives: so a controller can act where a policy would.
 
     A gripper without an action of its own stays where it is; a binary one opens or closes, whichever is nearer.
 
     Args:
         targets: [..., joints], in the order of ``RobotCfg.joints`` [rad or m].
-        ctrl: the targets now in force, likewise.
+        joint_pos: where the joints are, likewise.
     """
     out, every = [], parts(env)
     robot, late = env.cfg.robot, max((part["steps"][1] for part in every if part["type"] == "delay"), default=0)
-    step = env.dt * np.array(robot.arm.speed + robot.gripper.speed, np.float32)
+    speed = np.array(robot.arm.speed + robot.gripper.speed, np.float32)
     for part in (part for part in every if "joints" in part):
         ids = np.array([robot.joints.index(name) for name in part["joints"]])
         want = targets[..., ids]
         if part["type"] == "binary":
             to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))
             out.append(jnp.where(to_close < to_open, -1.0, 1.0)[..., None])
-        elif part["type"] == "relative_joint_position":  # as slowly as actions are late: all of the way at once would swing
-            out.append(jnp.clip((want - ctrl[..., ids]) / step[ids] / (1 + late), -1.0, 1.0))
+        elif part["type"] == "joint_velocity":  # as slowly as velocities follow: faster would swing
+            slow = 2 * (part["time"] + late * env.dt)
+            out.append(jnp.clip((want - joint_pos[..., ids]) / (slow * speed[ids]), -1.0, 1.0))
         else:
             out.append((want - jnp.array(part["offset"])) / part["scale"])
     return jnp.concatenate(out, axis=-1)

@@ -26,7 +26,7 @@ BACKENDS = ("auto", "mjx", "mujoco")
 def agent(cfg: "EvalCfg", env: ManipulationEnv) -> tuple[rollout.Act, Any]:
     """An agent's act function and its parameters: ``policy`` is deterministic, ``random`` uniform in +-1, ``zero`` stays home."""
     if cfg.agent in (None, "policy"):
-        trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, cfg.any_robot)
+        trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, cfg.any_robot, cfg.preset)
         return lambda params, obs, key: trained.act(obs), None
 
     # Where actions are drive targets, staying home means home's; random ones go as far about it as a policy's would.
@@ -106,7 +106,7 @@ def _controller_name(cfg: EvalCfg, env_cfg: EnvCfg) -> str | None:
     usual = next(iter(env_cfg.controllers), None)
     if cfg.controller:
         return (usual or EXPERT) if cfg.controller == EXPERT else cfg.controller
-    return None if cfg.agent or cfg.policy or policy.shipped(cfg.env_name).exists() else usual
+    return None if cfg.agent or cfg.policy or policy.shipped(cfg.env_name, cfg.preset).exists() else usual
 
 
 def play(cfg: EvalCfg) -> Played:

@@ -95,9 +95,9 @@ def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
             raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run (its {name} is {shown})")
 
 
-def relative(meta: Mapping[str, Any]) -> bool:
-    """Whether a policy acts by relative actions. Files of before 0.5.0 do not say, and theirs are none."""
-    return "RelativeJointPosition" in meta.get("actions", ())
+def acts_by(meta: Mapping[str, Any]) -> str:
+    """What a policy's actions are, of the arm. Files of before 0.5.0 do not say: they are positions."""
+    return next(iter(meta.get("actions", ())), "JointPosition")
 
 
 def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:

@@ -161,21 +161,27 @@ def load(path: pathlib.Path | str) -> Policy:
 
 
 def load_for(
-    env: ManipulationEnv, env_name: str, path: pathlib.Path | str | None, robot: str | None = None, any_robot: bool = False
+    env: ManipulationEnv,
+    env_name: str,
+    path: pathlib.Path | str | None,
+    robot: str | None = None,
+    any_robot: bool = False,
+    preset: str = "default",
 ) -> Policy:
     """Reads the policy at ``path`` (default: the one that ships for ``env_name``) and checks that it fits ``env``.
 
     Args:
+        preset: of the policy that ships, where it has one of its own.
         robot: what the user named for another than the environment's own, for the messages.
         any_robot: play it even if it was trained for another model of the robot.
 
     Raises:
         UserError: missing, damaged, or trained on another environment, robot or other observations.
     """
-    if path is None and not shipped(env_name).is_file():
+    if path is None and not shipped(env_name, preset).is_file():
         command = f"python train.py --env {env_name}" + (f" --robot {robot}" if robot else "")
         raise UserError(f"no policy ships for {env_name}: train one ({command}) and pass --policy PATH")
-    path = pathlib.Path(path or shipped(env_name))
+    path = pathlib.Path(path or shipped(env_name, preset))
     policy = load(path)
     if policy.meta["env"] != env_name:
         raise UserError(f"{path} is a policy of {policy.meta['env']}, not of {env_name}: pass --env {policy.meta['env']}")
@@ -184,7 +190,8 @@ def load_for(
         raise UserError(
             f"{path} is a policy for {policy.meta['robot']}, not for {name}: pass the --robot that it was trained with"
         )
-    if not any_robot and _other_model(policy.meta, path, env.cfg.robot):
+    here = fingerprint(env.cfg.robot)
+    if not any_robot and policy.meta.get("fingerprint", here) != here:
         raise UserError(
             f"{path} is a policy for another model of {name} (other links, masses, joints or drives): pass the --robot that "
             "it was trained with, train one for this robot, or pass --any-robot to play it all the same"
@@ -199,7 +206,7 @@ def load_for(
         raise UserError(
             f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
         )
-    if header.relative(policy.meta) != header.relative({"actions": env.action_kinds}):
+    if header.acts_by(policy.meta) != header.acts_by({"actions": env.action_kinds}):
         given = policy.meta.get("actions", ["JointPosition"])
         raise UserError(
             f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "
@@ -208,13 +215,7 @@ def load_for(
     return policy
 
 
-def _other_model(meta: Mapping[str, Any], path: pathlib.Path, robot: RobotCfg) -> bool:
-    """True if a policy is known to be for another model of ``robot``."""
-    if "fingerprint" in meta:
-        return meta["fingerprint"] != fingerprint(robot)
-    return path.parent == ASSETS / "policies" and bool(robot.folder)  # those that ship are for the package's own robots
-
-
-def shipped(env_name: str) -> pathlib.Path:
-    """Where the package's own policy for an environment lies."""
-    return ASSETS / "policies" / f"{env_name}.safetensors"
+def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
+    """Where the package's own policy for an environment lies: the preset's, or where it has none the default's."""
+    own = ASSETS / "policies" / f"{env_name}_{preset}.safetensors"
+    return own if own.is_file() else ASSETS / "policies" / f"{env_name}.safetensors"

@@ -23,14 +23,27 @@ Memory = Any
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """A group of drives, arrays along its joints [rad or m]; ``step`` is how far targets move in a control step."""
+    """A group of drives, arrays along its joints [rad or m].
+
+    Attributes:
+        speed: of targets, at most [rad/s or m/s].
+        lag: of a joint behind a target that moves [s].
+        dt: control step [s].
+    """
 
     home: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    step: np.ndarray
+    speed: np.ndarray
     open: np.ndarray
     close: np.ndarray
+    lag: np.ndarray
+    dt: float
+
+    @property
+    def step(self) -> np.ndarray:
+        """How far targets move in a control step, at most."""
+        return self.speed * np.float32(self.dt)
 
 
 Groups = Mapping[str, Drives]  # ``arm`` and ``gripper``
@@ -100,18 +113,34 @@ class JointPosition(Joints):
 
 
 @dataclasses.dataclass(frozen=True)
-class RelativeJointPosition(Joints):
-    """One entry a joint: its target moves, at +-1 as fast as the drive. Isaac Lab's ``RelativeJointPositionAction``.
+class JointVelocity(Joints):
+    """One entry a joint: how fast its set-point moves, at +-1 as fast as the drive; targets lead it by the drives' lag.
 
     Absolute targets whose noise is wider than the speed limit teach a policy that only their signs count: without its noise it
-    throws targets from limit to limit, and a step of delay undoes it. Here noise is a share of the limit.
+    throws targets from limit to limit, and a step of delay undoes it. Here noise is a share of the limit, and smooth.
+
+    Attributes:
+        time: time constant with which velocities follow the action [s].
+        ahead: a set-point is never farther from its joint than it moves in this time at full speed [s]: a hand that leans on a
+            table would wind it up until no action has an effect.
     """
 
+    time: Positive = dataclasses.field(default=0.15, kw_only=True)
+    ahead: Positive = dataclasses.field(default=0.1, kw_only=True)
+
+    def init(self, key: Key, act: Act) -> Memory:
+        """The set-point [rad or m] and its rate [share of the speed]: at the joints, at rest."""
+        return act.joint_pos[self.group], jnp.zeros_like(act.joint_pos[self.group])
+
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the group, from those in force."""
-        drives = self.groups[self.group]
-        targets = act.ctrl[self.group] + drives.step * jnp.clip(own, -1, 1)
-        return memory, act.to(self.group, jnp.clip(targets, drives.low, drives.high))
+        """Targets of the group, ahead of its set-point."""
+        (point, rate), drives, joint_pos = memory, self.groups[self.group], act.joint_pos[self.group]
+        rate = rate + (1.0 - np.exp(-drives.dt / self.time)) * (jnp.clip(own, -1.0, 1.0) - rate)
+        most = drives.speed * self.ahead
+        point = jnp.clip(point + drives.step * rate, joint_pos - most, joint_pos + most)
+        point = jnp.clip(point, drives.low, drives.high)
+        targets = jnp.clip(point + drives.lag * drives.speed * rate, drives.low, drives.high)
+        return (point, rate), act.to(self.group, targets)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,12 +179,16 @@ class BinaryGripper(Plain):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedLimit(Plain):
-    """Targets move at most as fast as the drives."""
+    """Targets move at most as fast as the drives: those of a group, or of all of them (empty)."""
+
+    group: str = dataclasses.field(default="", kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of all groups, nearer to those in force."""
-        targets = {g: rate_limit(t, act.ctrl[g], step=jnp.asarray(self.groups[g].step)) for g, t in act.targets.items()}
-        return memory, dataclasses.replace(act, targets=targets)
+        """Targets nearer to those in force."""
+        for group in (self.group,) if self.group else self.groups:
+            step = jnp.asarray(self.groups[group].step)
+            act = act.to(group, rate_limit(act.targets[group], act.ctrl[group], step=step))
+        return memory, act
 
 
 @dataclasses.dataclass(frozen=True)

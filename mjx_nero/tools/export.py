@@ -31,7 +31,7 @@ def main(argv: Sequence[str]) -> None:
     onnx_package = need("onnx", "onnx")
     files.check_writable(args.out)
     cli.setup_jax()
-    path = policy.shipped(args.policy) if args.policy in _shipped() else pathlib.Path(args.policy)
+    path = _shipped().get(args.policy) or pathlib.Path(args.policy)
     meta = policy.load(path).meta
     env = ManipulationEnv(config.override(registry.env_cfg(meta["env"], meta["preset"], args.robot), dotted["env"]))
     trained = policy.load_for(env, meta["env"], path)
@@ -49,5 +49,8 @@ def main(argv: Sequence[str]) -> None:
     )
 
 
-def _shipped() -> list[str]:
-    return [name for name in registry.list_envs() if policy.shipped(name).is_file()]
+def _shipped() -> dict[str, pathlib.Path]:
+    """By environment, or environment and preset, joined by an underscore."""
+    names = registry.list_envs()
+    paths = [policy.shipped(name, preset) for name in names for preset in registry.list_presets(name)]
+    return {path.stem: path for path in paths if path.is_file()}

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import files
+from mjx_nero.sim import grasp
 from mjx_nero.sim.gains import critical_damping
 from mjx_nero.sim.robot_file import COLUMNS, MAX_NUMBER
 from mjx_nero.types import UserError
@@ -23,6 +24,7 @@ DT = 1 / 60  # [s] longest physics step of the tasks
 SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
 FORCE = 60.0  # [N] most that a finger gives
+PRESS = 250.0  # [N/kg] and most for the mass of what the gripper can lift: pads sink into it by a millimetre then
 PLACEHOLDER = 1.0  # [N m, N] exporters write it where nobody gave an effort
 FINGER = 0.3  # [kg] rotor inertia of a sliding finger, or at the end of a turning one (why: assets/nero/nero.xml)
 Rows = dict[str, dict[str, float]]
@@ -94,11 +96,13 @@ def rows(
     Effort and speed are the URDF's limits, the latter at most ``SPEED``; an effort of 1 that all joints have, or that hardly
     moves its joint, is none. An arm's drive has the natural frequency ``FREQUENCY`` with the most inertia that the joint moves,
     more if the joint's own damping would make it creep or its friction stop it more than ``STUCK`` away, less if it would reach
-    its full effort within ``STRETCH``; a finger's gives its full effort (at most ``FORCE`` at its end) at ``SQUEEZE``. Damping is
-    what the joint lacks to critical, at the package's longest physics step too.
+    its full effort within ``STRETCH``; a finger's gives its full effort (at most ``FORCE`` at its end, and ``PRESS`` for each
+    kilogram of the cube that it can lift) at ``SQUEEZE``. Damping is what the joint lacks to critical, at the package's longest
+    physics step too.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
+    force = min(FORCE, PRESS * grasp.DENSITY * grasp.edge(hand.gap, hand.pad) ** 3) if hand.gap > 0 else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
     followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic]
     for joint in driven:
@@ -108,7 +112,7 @@ def rows(
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
         effort, speed = joint.effort and min(joint.effort, MAX_NUMBER), min(joint.velocity or 1.5, SPEED)
         if finger:
-            effort = min(FORCE / 3 * lever if unsaid or not effort else effort, FORCE * lever)
+            effort = min(FORCE / 3 * lever if unsaid or not effort else effort, force * lever)
             stiffness = effort * lever / SQUEEZE if joint.type != "prismatic" else effort / SQUEEZE
             if joint.effort and joint.effort > effort:
                 notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")

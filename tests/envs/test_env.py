@@ -9,6 +9,7 @@ from brax.envs.base import Env
 
 from mjx_nero import make
 from mjx_nero.envs import wrappers
+from mjx_nero.envs.task import joint_actions
 from mjx_nero.sim import kinematics
 
 STEPS = 250  # of an episode
@@ -126,23 +127,28 @@ def test_step_keeps_what_wrappers_added(finish, start):
 # --- actions
 
 
-def test_targets_move_at_the_drives_speed(env, start):
-    targets = jax.jit(env.targets)
+@pytest.fixture(scope="module")
+def positions():
+    return make("nero_lift", impl="native", actions=joint_actions())
+
+
+def test_targets_move_at_the_drives_speed(positions, start):
+    targets = jax.jit(positions.targets)
     ctrl = targets(start, jnp.array([10.0, -10.0, 0.02, 0.0, 10.0, -10.0, -0.04, -1.0]))
     # 1.5 rad/s for 0.02 s; slower where the target is nearer (0.5 * action); fingers 1.5 m/s.
     want = np.array([0.03, -0.03, 0.01, 2.0, 0.03, -0.03, -0.02, 0.02, -0.02], np.float32)
     np.testing.assert_allclose(ctrl, want, atol=1e-7)
 
 
-def test_targets_stay_in_the_joint_ranges(env, start):
-    targets = jax.jit(env.targets)
+def test_targets_stay_in_the_joint_ranges(positions, start):
+    targets = jax.jit(positions.targets)
     for sign, edge in [(1.0, 1), (-1.0, 0)]:
         state = start
         for _ in range(200):
             ctrl = targets(state, jnp.full(8, 100.0 * sign))
             assert (jnp.abs(ctrl - state.pipeline_state.ctrl) <= 0.03 + 1e-6).all()
             state = state.replace(pipeline_state=state.pipeline_state.replace(ctrl=ctrl))
-        np.testing.assert_array_equal(ctrl[:7], np.float32(env.physics_model.jnt_range[:7, edge]))
+        np.testing.assert_array_equal(ctrl[:7], np.float32(positions.physics_model.jnt_range[:7, edge]))
 
 
 @pytest.mark.parametrize(
@@ -157,7 +163,7 @@ def test_gripper_closes_for_negative_actions(env, start, action, fingers):
 
 
 def test_clip_bounds_actions_before_use(start):
-    clipped = make("nero_lift", impl="native", action_clip=0.04)
+    clipped = make("nero_lift", impl="native", action_clip=0.04, actions=joint_actions())
     ctrl = clipped.targets(start, jnp.array([5.0, -5.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(ctrl[:3], [0.02, -0.02, 0.01], atol=1e-7)
     after = clipped.finish(start, jnp.full(8, 5.0), start.pipeline_state, jnp.zeros(()))

@@ -11,6 +11,7 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs import wrappers
+from mjx_nero.envs.task import joint_actions
 from mjx_nero.learn import checkpoint
 from mjx_nero.mdp import actions, events, observations, rewards
 from mjx_nero.mdp.terms import ObservationTerm, RewardTerm, Term
@@ -163,8 +164,8 @@ def test_a_group_stays_apart_through_reset_step_auto_reset_and_checkpoint(two, t
 
 
 def test_actions_come_late_and_the_policy_sees_its_own():
-    env = make("nero_lift", impl="native", actions={"delay": Term(actions.Delay, params={"steps": (3, 3)}), **CFG.actions})
-    prompt = make("nero_lift", impl="native")
+    env = make("nero_lift", impl="native", actions={"delay": Term(actions.Delay, params={"steps": (3, 3)}), **joint_actions()})
+    prompt = make("nero_lift", impl="native", actions=joint_actions())
     late, now = (jax.jit(e.reset)(jax.random.PRNGKey(0)) for e in (env, prompt))
     np.testing.assert_array_equal(late.pipeline_state.qpos, now.pipeline_state.qpos)  # nothing else is drawn otherwise
     sent = [jax.random.normal(jax.random.PRNGKey(i), (8,)) for i in range(6)]

@@ -58,12 +58,12 @@ def test_make_vec_takes_the_compiled_batch():
 
 
 def test_actions_end_where_the_joints_do(vector):
-    """Home plus half a radian an action: joint 4 is at home at 2.0 and goes from -1.01 to 2.14. Relative ones: +-1."""
-    lift = Env("nero_lift", impl="native")
-    box = lift.action_space
+    """Home plus half a radian an action: joint 4 is at home at 2.0 and goes from -1.01 to 2.14. Velocities: +-1."""
+    place = Env("nero_place", impl="native")
+    box = place.action_space
     assert box.low[3] == pytest.approx((-1.01 - 2.0) / 0.5) and box.high[3] == pytest.approx((2.14 - 2.0) / 0.5)
     assert (vector.single_action_space.low == -1).all() and (vector.single_action_space.high == 1).all()
-    assert (lift.action_space.low[-1], lift.action_space.high[-1]) == (-1, 1)  # the gripper
+    assert (box.low[-1], box.high[-1]) == (-1, 1)  # the gripper
     drives = Env("nero_pick_place", impl="native")
     assert drives.action_space.high[3] == pytest.approx(2.14)  # targets themselves
 

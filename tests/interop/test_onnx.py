@@ -90,17 +90,27 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
         ("actions", 39, 8),
     ]
     assert meta["observations"][1]["units"] == "rad/s, m/s"
-    arm, gripper, limit = meta["actions"]
-    assert (arm["scale"], arm["offset"]) == (0.5, [0, 0, 0, 2, 0, 0, 0])
+    late, arm, gripper, limit = meta["actions"]
+    assert (late["steps"], arm["type"], arm["lag"][0]) == ([0, 1], "joint_velocity", 0.5)
     assert (gripper["open"], gripper["close"]) == ([0.05, -0.05], [0.0, -0.001])
-    assert limit == {"name": "speed_limit", "type": "speed_limit"} and meta["action_clip"] is None
+    assert limit == {"name": "speed_limit", "type": "speed_limit", "of": ["gripper_joint1", "gripper_joint2"]}
+    assert meta["action_clip"] is None
     assert (meta["control_dt"], meta["robot"], meta["env"]) == (0.02, "nero", "nero_lift")
 
 
-def test_relative_actions_and_delays_are_told():
-    late, arm, _ = meaning.parts(mjx_nero.make("nero_reach", impl="native"))
+def test_velocities_and_delays_are_told():
+    late, arm = meaning.parts(mjx_nero.make("nero_reach", impl="native"))
     assert late == {"name": "delay", "type": "delay", "steps": [0, 1]}
-    assert arm == {"name": "arm", "type": "relative_joint_position", "joints": [f"joint{i}" for i in range(1, 8)]}
+    assert arm.pop("lag") == pytest.approx([0.2, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1])  # damping over stiffness
+    joints = [f"joint{i}" for i in range(1, 8)]
+    assert arm == {"name": "arm", "type": "joint_velocity", "joints": joints, "time": 0.15, "ahead": 0.1}
+
+
+def test_positions_and_speed_limits_are_told():
+    env = mjx_nero.make("nero_push", impl="native")
+    arm, limit = meaning.parts(env)
+    assert (arm["scale"], arm["offset"]) == (0.5, [0, 0, 0, 2, 0, 0, 0])
+    assert limit == {"name": "speed_limit", "type": "speed_limit", "of": list(env.cfg.robot.joints)}
 
 
 def test_histories_and_filters_are_told():
@@ -117,23 +127,25 @@ def test_histories_and_filters_are_told():
         meaning.parts(mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=own), impl="native"))
 
 
-@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach"])
+@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
     """The page's program, word for word, without this package: its joint targets are the environment's."""
-    punctual = {"actions.delay.params.steps": (0, 0)} if env_name == "so100_reach" else {}
+    punctual = {} if env_name == "nero_push" else {"actions.delay.params.steps": (0, 0)}
     env = mjx_nero.make(env_name, impl="native", corruption=False, **punctual)
     trained = policy.load_for(env, env_name, None)
-    reset, step, targets = jax.jit(env.reset), jax.jit(env.step), jax.jit(env.targets)
+    reset, step, targets, view = (jax.jit(f) for f in (env.reset, env.step, env.targets, env.view))
     named = jax.jit(lambda state: env.named_observations(state)["state"])
     state, terms, want = reset(jax.random.PRNGKey(1)), [], []
-    start = np.asarray(state.pipeline_state.ctrl)  # a reach episode starts anywhere
+    positions = []  # a reach episode starts anywhere
     for _ in range(30):
         action = trained.act(state.obs)
         terms.append({name: np.asarray(value) for name, value in named(state).items()})
+        positions.append(np.asarray(view(state).joint_pos))
         want.append(np.asarray(targets(state, action)))
         state = step(state, action)
     assert np.ptp(np.stack(want), axis=0).max() > 0.05  # the arm moves
-    np.savez(tmp_path / "terms.npz", start=start, **{f"{i}/{k}": v for i, row in enumerate(terms) for k, v in row.items()})
+    named_terms = {f"{i}/{name}": value for i, row in enumerate(terms) for name, value in row.items()}
+    np.savez(tmp_path / "terms.npz", positions=positions, **named_terms)
 
     (program,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert call("mjx_nero", "export", env_name, "--out", "policy.onnx")[0] == 0
@@ -145,10 +157,9 @@ import numpy as np, runpy
 run = runpy.run_path(sys.argv[0])
 data = np.load("terms.npz")
 rows = [{{k.split("/", 1)[1]: data[k] for k in data if k.startswith(f"{{i}}/")}} for i in range({len(terms)})]
-last, out = data["start"], []
-for row in rows:
-    last = run["targets"](run["act"](row), last)
-    out.append(last)
+out, targets = [], run["Targets"](data["positions"][0])
+for row, position in zip(rows, data["positions"]):
+    out.append(targets(run["act"](row), position))
 np.save("targets.npy", out)
 """
     argv = f"import sys; sys.argv = ['run_policy.py', 'policy.onnx']\n{drive}"

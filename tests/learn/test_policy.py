@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, make
+from mjx_nero.envs.task import joint_actions
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.policy import NetworkCfg
 
@@ -132,17 +133,17 @@ def test_policy_of_another_preset(path):
 
 
 def test_policy_of_other_actions(env, trained, tmp_path):
-    """Of before 0.5.0, which had absolute ones and did not say so; and the other way round."""
-    relative = make("nero_lift", "sim2real", impl="native")
+    """Of before 0.5.0, which had positions and did not say so; and the other way round."""
+    positions = make("nero_lift", impl="native", actions=joint_actions())
     _, params, meta = trained
     old = {name: value for name, value in meta.items() if name != "actions"}
     checkpoint.save(tmp_path / "old.safetensors", params, old)
-    assert policy.load_for(env, "nero_lift", tmp_path / "old.safetensors").meta["env"] == "nero_lift"
-    with pytest.raises(UserError, match=r"was trained on other actions \(JointPosition; here RelativeJointPosition, BinaryG"):
-        policy.load_for(relative, "nero_lift", tmp_path / "old.safetensors")
-    checkpoint.save(tmp_path / "new.safetensors", params, policy.describe(relative, "nero_lift", "sim2real", "ppo", old))
-    with pytest.raises(UserError, match=r"\(RelativeJointPosition, BinaryGripper; here JointPosition, BinaryGripper\)"):
-        policy.load_for(env, "nero_lift", tmp_path / "new.safetensors")
+    assert policy.load_for(positions, "nero_lift", tmp_path / "old.safetensors").meta["env"] == "nero_lift"
+    with pytest.raises(UserError, match=r"was trained on other actions \(JointPosition; here JointVelocity, BinaryGripper\)"):
+        policy.load_for(env, "nero_lift", tmp_path / "old.safetensors")
+    checkpoint.save(tmp_path / "new.safetensors", params, policy.describe(env, "nero_lift", "default", "ppo", old))
+    with pytest.raises(UserError, match=r"\(JointVelocity, BinaryGripper; here JointPosition, BinaryGripper\)"):
+        policy.load_for(positions, "nero_lift", tmp_path / "new.safetensors")
 
 
 def test_policy_of_another_robot_of_the_same_name(trained, path):
@@ -151,16 +152,6 @@ def test_policy_of_another_robot_of_the_same_name(trained, path):
     with pytest.raises(UserError, match=r"is a policy for another model of nero .*: pass the --robot that it was trained with"):
         policy.load_for(other, "nero_lift", path)
     assert policy.load_for(other, "nero_lift", path, any_robot=True).meta["robot"] == "nero"
-
-
-def test_shipped_policies_are_for_the_packages_own_robots(env):
-    """They have no fingerprint; an imported robot may have the name of one of the package's."""
-    assert "fingerprint" not in policy.load(policy.shipped("nero_lift")).meta
-    imported = dataclasses.replace(env.cfg.robot, folder=str(env.cfg.robot.xml.parent))
-    model = make("nero_lift", impl="native")
-    model.cfg = dataclasses.replace(env.cfg, robot=imported)
-    with pytest.raises(UserError, match="is a policy for another model of nero"):
-        policy.load_for(model, "nero_lift", None)
 
 
 def test_fingerprint_knows_models_apart():

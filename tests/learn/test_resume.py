@@ -27,7 +27,7 @@ WORDS = [
     ({"fingerprint": "b2"}, "is a checkpoint for another model of nero: pass the --robot"),
     ({"num_envs": 32}, "does not fit: it holds 32 environments, this run has 64: pass --num-envs 32"),
     ({"learner": "search"}, "was made by the learner search: pass --learner"),
-    ({"preset": "sim2real", "actions": ["RelativeJointPosition"]}, r"\(preset sim2real\) on other observations or actions"),
+    ({"preset": "sim2real", "actions": ["JointVelocity"]}, r"\(preset sim2real\) on other observations or actions"),
     ({"preset": "isaac", "action_size": 7}, r"was trained in nero_lift \(preset isaac\) on other observations or actions"),
     ({"network": {"actor": [16, 8]}}, r"its networks are others: pass --ppo.network.actor '16,8'$"),
 ]

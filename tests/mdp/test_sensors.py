@@ -87,8 +87,8 @@ def test_pushes_come_in_their_interval_and_not_between():
 def test_command_noise_stays_within_its_amount_and_the_joints_ranges():
     high = np.array([1.0, 0.2], np.float32)
     zero = np.zeros(2, np.float32)
-    arm = actions.Drives(zero, -high, high, high, zero, zero)
-    none = actions.Drives(*(np.zeros(0, np.float32),) * 6)
+    arm = actions.Drives(zero, -high, high, high, zero, zero, zero, dt=0.02)
+    none = actions.Drives(*(np.zeros(0, np.float32),) * 7, dt=0.02)
     noise = actions.Noise({"arm": arm, "gripper": none}, amount=0.1)
     act = actions.Act(jnp.zeros(2), {}, {}, {"arm": jnp.array([0.0, 0.2]), "gripper": jnp.zeros(0)})
     off = np.stack([noise.step(noise.init(key, act), jnp.zeros(0), act)[1].targets["arm"] for key in KEYS[:100]])

@@ -284,10 +284,10 @@ def test_circle_of_no_radius_or_no_frequency_stays():
         np.testing.assert_allclose(at, [0.5, 0.2, 0.4], atol=1e-7)
 
 
-def drives(home, low, high, step=0.03, open=(0.0,), close=(0.0,)) -> actions.Drives:
+def drives(home, low, high, speed=1.5, open=(0.0,), close=(0.0,), lag=0.1) -> actions.Drives:
     n = len(home)
-    arrays = (home, [low] * n, [high] * n, [step] * n, open, close)
-    return actions.Drives(*(np.array(x, np.float32) for x in arrays))
+    arrays = (home, [low] * n, [high] * n, [speed] * n, open, close, [lag] * n)
+    return actions.Drives(*(np.array(x, np.float32) for x in arrays), dt=0.02)
 
 
 GROUPS = {
@@ -315,10 +315,36 @@ def test_an_arm_goes_to_home_and_the_scaled_action_within_its_ranges():
     np.testing.assert_array_equal(out[:, :2], np.float32([[0.75, 1.0], [2.5, -1.5]]))
 
 
-def test_relative_targets_move_from_where_they_are_as_fast_as_the_drives():
-    out = play({"arm": Term(actions.RelativeJointPosition)}, [[0.5, -9.0], [0.5, -1.0], [0.0, 0.0]])
-    np.testing.assert_allclose(out[:, :2], [[0.265, 1.97], [0.28, 1.94], [0.28, 1.94]], atol=1e-6)
-    assert actions.Chain({"arm": Term(actions.RelativeJointPosition)}, GROUPS).kinds == ["RelativeJointPosition"]
+HALF = 0.02 / np.log(2)  # [s]: a velocity gets half of the way to the action in a step of 0.02 s
+
+
+def test_velocities_follow_the_action_and_targets_lead_the_set_point_by_the_lag():
+    """Rates of 1/4 and -1/2, then 3/8 and -3/4, of 0.03 rad a step; targets 5 such steps ahead."""
+    chain = {"arm": Term(actions.JointVelocity, params={"time": HALF, "ahead": 1.0})}
+    out = play(chain, [[0.5, -9.0], [0.5, -1.0], [0.0, 0.0]])[:, :2]
+    rates = np.array([[0.25, -0.5], [0.375, -0.75], [0.1875, -0.375]])
+    np.testing.assert_allclose(out, [0.25, 2.0] + 0.03 * (np.cumsum(rates, axis=0) + 5 * rates), atol=1e-6)
+    assert actions.Chain(chain, GROUPS).kinds == ["JointVelocity"]
+
+
+def test_a_set_point_waits_for_a_joint_that_does_not_move():
+    """At 0.04 s of full speed, 0.06 rad: however long the action asks for more, the next one takes it back at once."""
+    chain = {"arm": Term(actions.JointVelocity, params={"time": HALF, "ahead": 0.04})}
+    out = play(chain, [[1.0, 0.0]] * 20 + [[-1.0, 0.0]] * 2)[:, 0]
+    np.testing.assert_allclose(out[19], 0.25 + 0.06 + 0.15, atol=1e-5)
+    np.testing.assert_allclose(out[20:], [0.25 + 0.06, 0.25 + 0.06 - 0.015 - 0.075], atol=1e-5)
+
+
+def test_set_points_and_their_targets_stay_within_the_joints_ranges():
+    chain = {"arm": Term(actions.JointVelocity, params={"time": HALF})}
+    out = play(chain, [[0.0, 1.0]] * 20, joints=(0.25, 2.45, 0.05, -0.05))[:, 1]
+    assert out.max() == np.float32(2.5)
+
+
+def test_a_speed_limit_of_one_group_leaves_the_others():
+    chain = {**ARM, **GRIPPER, "limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
+    out = play(chain, [[0.1, -2.0, -1.0]])
+    np.testing.assert_allclose(out, [[0.3, 1.0, 0.02, -0.02]], atol=1e-6)
 
 
 def test_a_gripper_closes_for_negative_actions_within_its_ranges():

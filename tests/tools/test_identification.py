@@ -154,12 +154,14 @@ def test_identified_drives_take_the_place_of_a_robots_own(tmp_path):
     arm = dataclasses.replace(registry.robot("nero").arm, stiffness=(150.0,) * 7, damping=(20.0,) * 7)
     path = tmp_path / "drives.yaml"
     path.write_text(yaml.safe_dump(content(arm)))
-    cfg = identified.applied(registry.env_cfg("nero_lift", identified=str(path)))
+    cfg = identified.applied(registry.env_cfg("nero_lift", "isaac", identified=str(path)))
     assert cfg.robot.arm.stiffness == (150.0,) * 7 and cfg.robot.arm.damping == (20.0,) * 7
     first = next(iter(cfg.randomization.values()))
     assert first.func is randomization.drives and first.params["stiffness"][0] == pytest.approx((135.0, 165.0))
     # 30 to 32 ms at 20 ms a control step: one or two.
     assert next(iter(cfg.actions.values())).func is actions.Delay and cfg.actions["delay"].params["steps"] == (1, 2)
+    both = identified.applied(registry.env_cfg("nero_lift", identified=str(path)))  # whose own are none or one
+    assert both.actions["delay"].params["steps"] == (0, 2)
     wide = identified.applied(registry.env_cfg("nero_lift", "sim2real", identified=str(path)))
     assert wide.actions["delay"].params["steps"] == (0, 3) and list(wide.randomization)[:2] == ["identified", "link_mass"]
 

@@ -77,10 +77,9 @@ def test_sliders_drive_the_joints(reach):
     by_hand = session(reach, agents.SLIDERS, params=jnp.array(reach.cfg.robot.home))
     want = np.array(reach.cfg.robot.home) + [0.3, -0.2, 0.1, -0.2, 0.2, -0.1, 0.3, 0, 0]
     by_hand.params = jnp.array(want, jnp.float32)
-    for _ in range(30):
+    for _ in range(120):
         by_hand.step()
-    ctrl = np.asarray(by_hand._state.pipeline_state.ctrl[0])
-    np.testing.assert_allclose(ctrl[:7], want[:7], atol=1e-5)  # the drives' targets are the sliders'
+    np.testing.assert_allclose(by_hand.frame.qpos[0, :7], want[:7], atol=5e-3)
 
 
 def test_a_cube_can_be_put_elsewhere():

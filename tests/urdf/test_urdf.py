@@ -309,6 +309,16 @@ def test_mimic_becomes_an_equality(tmp_path):
     assert robot.down in ((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
+def test_fingers_press_no_harder_than_their_cube_bears(tmp_path):
+    """250 N a kilogram, where the file allows 500 N; a cube of 30 to 40 mm weighs 27 to 64 g."""
+    slide = {"type": "prismatic", "xyz": "0 0 0.2", "limit": 'lower="0" upper="0.04" effort="500" velocity="0.2"'}
+    fingers = (make.joint("f1", "l3", "left", axis="0 1 0", **slide), make.joint("f2", "l3", "right", axis="0 -1 0", **slide))
+    _, report = imported(tmp_path, hand(tmp_path, *fingers))
+    mass = grasp.cube_for(report.robot).mass
+    assert report.robot.gripper.effort == pytest.approx((250 * mass,) * 2, rel=0.01) and 5 < 250 * mass < 17
+    assert any(note.startswith("repaired: effort 500 is more than fingers take") for note in report.notes.of("joint", "f1"))
+
+
 def test_mimic_of_a_mimic(tmp_path):
     chain = '<mimic joint="f2" multiplier="2" offset="0.1"/>', '<mimic joint="f1" multiplier="-0.5" offset="0.2"/>'
     turn = {"axis": "1 0 0", "xyz": "0 0 0.2"}

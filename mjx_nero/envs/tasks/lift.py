@@ -4,7 +4,7 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, follows, joint_actions, relative_actions
+from mjx_nero.envs.task import CALM, EnvCfg, Presets, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
@@ -112,8 +112,9 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         "target_object_position": ObservationTerm(observations.command),
         "actions": ObservationTerm(observations.last_action),
     }
-    cfg = dataclasses.replace(
+    return dataclasses.replace(
         recipe,
+        actions=velocity_actions(),
         observations={
             "state": state,
             "privileged_state": {
@@ -133,18 +134,13 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
         curriculum={},
+        training=CALM,
     )
-    return calm(cfg) if follows(robot) else cfg
-
-
-def calm(cfg: EnvCfg) -> EnvCfg:
-    """With relative actions, of which some are late."""
-    return dataclasses.replace(cfg, actions=relative_actions(), training=CALM)
 
 
 def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
     """The default with all that differs between a simulated arm and a real one: see ``sim2real``."""
-    return sim2reals.randomized(calm(default(robot, setup)))
+    return sim2reals.randomized(default(robot, setup))
 
 
 def presets(setup: Setup) -> Presets:

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, SuccessCfg, joint_actions, relative_actions
+from mjx_nero.envs.task import CALM, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
@@ -119,7 +119,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         fine["pose_tracking"] = RewardTerm(rewards.ee_goal_pose, weight=0.4, params={"std": 0.1, "angle_std": 0.2})
     return dataclasses.replace(
         recipe,
-        actions=relative_actions(gripper=False),
+        actions=velocity_actions(gripper=False),
         observations={"state": state},
         rewards={**recipe.rewards, **fine},
         training=CALM,

@@ -17,30 +17,30 @@ from mjx_nero.mdp import actions, sensors
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.fields import Randomization
 from mjx_nero.sim.physics import make_physics
-from mjx_nero.tools.robustness.sweeps import LONGEST, Point, preset
+from mjx_nero.tools.robustness.sweeps import LONGEST, Point, varied
 
 
 class Bench:
     """An environment whose drawn fields, delay and offset are given at the start of each episode.
 
     Args:
-        cfg: the task that the policy was trained on.
+        cfg: the task that the policy was trained on, of that preset.
         path: the policy; None: the one that ships.
         episodes: of a setting.
     """
 
-    def __init__(self, env_name: str, cfg: EnvCfg, path: pathlib.Path | None, episodes: int, impl: str, seed: int):
+    def __init__(self, env_name: str, preset: str, cfg: EnvCfg, path: pathlib.Path | None, episodes: int, impl: str, seed: int):
         self._episodes, self._seed, self._objects = episodes, seed, list(cfg.scene.objects)
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
         seen = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._objects}
-        wanted = preset(cfg).randomization
+        wanted = varied(cfg).randomization
         cfg = dataclasses.replace(cfg, corruption=False, actions={**late, **cfg.actions}, sensors={**cfg.sensors, **seen})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
         # All fields that some setting draws, so that one program plays them all.
         names = Randomization(self.env.physics_model, wanted).names
         self._nominal = {name: jnp.asarray(getattr(self.env.physics_model, name), jnp.float32) for name in names}
         self.env.physics = make_physics(self.env.physics_model, cfg.sim, self.env.impl, names)
-        trained = policy.load_for(self.env, env_name, path)
+        trained = policy.load_for(self.env, env_name, path, preset=preset)
         self._run = rollout.runner(self.env, lambda params, obs, key: trained.act(obs), episodes, start=self._start)
 
     def success(self, point: Point) -> dict[str, Any]:

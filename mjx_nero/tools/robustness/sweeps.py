@@ -44,14 +44,14 @@ _OFFSETS = (0.0, 0.005, 0.01, 0.02)
 LONGEST = max(_DELAYS)
 
 
-def preset(cfg: EnvCfg) -> EnvCfg:
+def varied(cfg: EnvCfg) -> EnvCfg:
     """The task with all that the preset ``sim2real`` varies."""
     return sim2real.randomized(cfg)
 
 
 def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Point]]]:
     """Parameter -> (value, setting), of those that a task has; and all at once, over widths of the preset's ranges."""
-    terms, things = preset(cfg).randomization, list(cfg.scene.objects)
+    terms, things = varied(cfg).randomization, list(cfg.scene.objects)
     out: dict[str, list[tuple[float, Point]]] = {}
     for name, (term, parameter, values) in _FIELDS.items():
         if (term := term.format(object=(things or [""])[0])) in terms:

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.envs.base import State
 from flax import struct
 
 from mjx_nero import control
@@ -27,10 +28,10 @@ class _Trained:
     params: object
 
 
-def known(env: ManipulationEnv, env_name: str, files: list[pathlib.Path]) -> dict[str, Make]:
+def known(env: ManipulationEnv, env_name: str, files: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
     """Name -> how to make it: policy files and the policy that ships, controllers, sliders, and who knows nothing."""
     found: dict[str, Make] = {}
-    shipped = policy.shipped(env_name)
+    shipped = policy.shipped(env_name, preset)
     for path in [*files, *([shipped] if shipped.is_file() else [])]:
         name = f"policy {path.stem}" if path == shipped else f"policy {path}"
         found[name] = lambda path=path: of_policy(load(env, env_name, path))  # type: ignore[misc]
@@ -81,7 +82,7 @@ def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollo
 
     def act(params, memory, state, key):
         targets, memory = steering.act(params, memory, state, key)
-        return actions.for_targets(env, targets, state.pipeline_state.ctrl), memory
+        return actions.for_targets(env, targets, _joint_pos(env, state)), memory
 
     return dataclasses.replace(steering, act=act)
 
@@ -91,9 +92,14 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
     def act(targets, memory, state, key):
         wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
-        return actions.for_targets(env, wanted, state.pipeline_state.ctrl), memory
+        return actions.for_targets(env, wanted, _joint_pos(env, state)), memory
 
     return rollout.Agent(act, init=lambda state: ())
+
+
+def _joint_pos(env: ManipulationEnv, state: State) -> jax.Array:
+    """Of each environment [n, joints]."""
+    return jax.vmap(lambda each: env.view(each).joint_pos)(state)
 
 
 def _always(draw: Callable) -> rollout.Agent:

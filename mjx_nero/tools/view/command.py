@@ -150,11 +150,12 @@ def open_view(
 
     described = _described(run) if run else {}
     env_name = env_name or described.get("env_name", "nero_lift")
-    cfg = registry.env_cfg(env_name, preset or described.get("preset", "default"), robot)
+    preset = preset or described.get("preset", "default")
+    cfg = registry.env_cfg(env_name, preset, robot)
     env = ManipulationEnv(
         config.override(dataclasses.replace(cfg, corruption=False), overrides or {}), impl="native", num_envs=num_envs
     )
-    makers = agents.known(env, env_name, list(policies))
+    makers = agents.known(env, env_name, list(policies), preset)
     chosen = _chosen(agent, list(makers), env_name)
     home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
