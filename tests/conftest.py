@@ -44,19 +44,16 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import __main__, cli  # noqa: E402
-from mjx_nero.envs import wrappers  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 jax.config.update("jax_default_matmul_precision", "highest")
-
-# Every test that steps a batch steps one of this size: the step is compiled once for all of them.
-NUM_ENVS = 8
 
 
 def pytest_collection_modifyitems(items):
@@ -73,24 +70,6 @@ def env() -> mjx_nero.ManipulationEnv:
     return mjx_nero.make("nero_lift", impl="native")
 
 
-class Batch:
-    """``NUM_ENVS`` auto-resetting environments with jitted ``reset`` and ``step``; ``traces`` counts compilations of the step."""
-
-    def __init__(self, env: mjx_nero.ManipulationEnv):
-        self.env = env
-        self.train_env = wrappers.for_training(env)
-        self.traces = 0
-        self.reset = jax.jit(lambda seed: self.train_env.reset(jax.random.split(jax.random.PRNGKey(seed), NUM_ENVS)))
-        self._jitted = jax.jit(self._step)
-
-    def _step(self, state, action):
-        self.traces += 1
-        return self.train_env.step(state, action)
-
-    def step(self, state, action):
-        return self._jitted(state, jnp.asarray(action, jnp.float32))
-
-
 @pytest.fixture(scope="session")
 def batch(env) -> Batch:
     return Batch(env)
@@ -98,7 +77,7 @@ def batch(env) -> Batch:
 
 @pytest.fixture(scope="session")
 def mjx_step(env):
-    """The physics of ``env`` on MJX-JAX, ``NUM_ENVS`` at once: (sim, ctrl) -> sim. It takes half a minute to compile."""
+    """The physics of ``env`` on MJX-JAX, a batch at once: (sim, ctrl) -> sim. It takes half a minute to compile."""
     step = JaxPhysics(env.physics_model, env.cfg.sim).step
     return jax.jit(jax.vmap(lambda sim, ctrl: step(sim, ctrl)[0]))
 

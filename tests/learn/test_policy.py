@@ -154,6 +154,14 @@ def test_policy_of_another_robot_of_the_same_name(trained, path):
     assert policy.load_for(other, "nero_lift", path, any_robot=True).meta["robot"] == "nero"
 
 
+def test_a_preset_may_ship_a_policy_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(policy, "ASSETS", tmp_path)
+    (tmp_path / "policies").mkdir()
+    (tmp_path / "policies" / "nero_lift_sim2real.safetensors").touch()
+    stems = {preset: policy.shipped("nero_lift", preset).stem for preset in ("default", "isaac", "sim2real")}
+    assert stems == {"default": "nero_lift", "isaac": "nero_lift", "sim2real": "nero_lift_sim2real"}
+
+
 def test_fingerprint_knows_models_apart():
     robots = [make(f"{name}_reach", impl="native").cfg.robot for name in ("nero", "piper")]
     nero = policy.fingerprint(robots[0])

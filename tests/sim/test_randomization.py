@@ -192,12 +192,12 @@ def test_what_cannot_be_drawn_is_refused_when_the_environment_is_made(term, mess
 
 @pytest.fixture(scope="module")
 def gripped():
-    """Eight states of the shipped policy after two seconds: most cubes are in the air, in the grip. And the targets then."""
+    """Eight states of the shipped policy after three seconds: most cubes are in the air, in the grip. And the targets then."""
     env = make("nero_lift", impl="native", corruption=False)
     trained = policy.load_for(env, "nero_lift", None)
     step = jax.jit(jax.vmap(env.step))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 8))
-    for _ in range(99):
+    for _ in range(149):
         state = step(state, trained.act(state.obs))
     sim = state.pipeline_state
     assert (sim.qpos[:, 11] > 0.05).sum() >= 4

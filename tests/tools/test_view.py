@@ -77,7 +77,7 @@ def test_sliders_drive_the_joints(reach):
     by_hand = session(reach, agents.SLIDERS, params=jnp.array(reach.cfg.robot.home))
     want = np.array(reach.cfg.robot.home) + [0.3, -0.2, 0.1, -0.2, 0.2, -0.1, 0.3, 0, 0]
     by_hand.params = jnp.array(want, jnp.float32)
-    for _ in range(120):
+    for _ in range(90):
         by_hand.step()
     np.testing.assert_allclose(by_hand.frame.qpos[0, :7], want[:7], atol=5e-3)
 

@@ -1,5 +1,6 @@
 """MJX-JAX: the physics as a JAX program, for any accelerator. With ``mujoco_warp`` the only caller of MJX."""
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 
@@ -14,14 +15,20 @@ from mjx_nero.sim.physics import Footprint, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
+# Steps of MJX's line search, at most. With 50, which MuJoCo's C library needs, a cube in the grip slipped by 2 mm in one of eight
+# places, with 20 in none (tests/sim/test_grasp.py).
+LINE_SEARCH = 20
+
 
 class JaxPhysics:
     """See ``physics.Physics``."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation = model, cfg.decimation
+        own = copy.copy(model)
+        own.opt.ls_iterations = min(model.opt.ls_iterations, LINE_SEARCH)
         with possible("MJX-JAX"):
-            self._mx = mjx.put_model(model, impl="jax")
+            self._mx = mjx.put_model(own, impl="jax")
             self._template = mjx.make_data(self._mx)
         self._qpos_ids = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._dof_ids = model.jnt_dofadr[model.actuator_trnid[:, 0]]
