@@ -129,9 +129,7 @@ class SimCfg:
     dt: Positive = 0.01  # physics step [s]
     decimation: Count = 2  # physics steps a control step
     iterations: Count = 10  # of the constraint solver, at most
-    ls_iterations: Count = (
-        50  # of its line search, at most; cut at 20, as MJX-JAX does, MuJoCo's C library throws a cube now and then
-    )
+    ls_iterations: Count = 50  # of its line search, at most (MJX-JAX 20); cut at 20, MuJoCo's C library throws a cube at times
     impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
     elliptic: bool = True  # friction cones; else pyramids
     contacts_per_env: Count = 24  # Warp: contact slots, times the number of environments

@@ -4,7 +4,8 @@ import pytest
 
 from mjx_nero import UserError, __main__
 from mjx_nero.envs.registry import env_cfg
-from mjx_nero.tools.robustness.sweeps import ALL, sweeps
+from mjx_nero.tools.robustness import measure
+from mjx_nero.tools.robustness.sweeps import ALL, Point, sweeps
 
 
 def test_a_lift_has_its_object_and_a_reach_only_its_arm():
@@ -34,3 +35,10 @@ def test_all_at_once_widens_the_presets_ranges():
 def test_an_unknown_parameter_is_one_line():
     with pytest.raises(UserError, match="no parameter has gravty in its name"):
         __main__.main(["robustness", "--env", "nero_lift", "--only", "gravty"])
+
+
+def test_actions_are_as_late_as_asked_for_whatever_the_task_draws():
+    """Five control steps undo what a policy learnt that knows none or one."""
+    bench = measure.Bench("nero_reach", "default", env_cfg("nero_reach"), None, 32, "native", 1)
+    rates = {late: bench.success(Point(delay=(late, late)))["success_rate"] for late in (0, 5)}
+    assert rates[0] > 0.9 and rates[5] < rates[0] - 0.3

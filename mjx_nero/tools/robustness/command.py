@@ -54,8 +54,11 @@ def measure(args: Any, cfg: Any, names: Sequence[str]) -> dict[str, Any]:
     """Success over the parameters ``names``: plain JSON."""
     from mjx_nero.tools.robustness.measure import Bench
 
+    def bench_of(cfg: Any) -> Bench:
+        return Bench(args.env, args.preset, cfg, args.policy, args.episodes, args.impl, args.seed)
+
     curves: dict[str, list[dict[str, Any]]] = {}
-    bench = Bench(args.env, args.preset, cfg, args.policy, args.episodes, args.impl, args.seed)
+    bench = bench_of(cfg)
     for name, points in sweeps.sweeps(cfg).items():
         if name in names:
             curves[name] = [{"value": value, **bench.success(point)} for value, point in points]
@@ -65,10 +68,7 @@ def measure(args: Any, cfg: Any, names: Sequence[str]) -> dict[str, Any]:
         for factor, decimation in ((0.5, 2 * cfg.sim.decimation), (2.0, cfg.sim.decimation // 2)):
             if decimation:
                 other = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, dt=factor * cfg.sim.dt, decimation=decimation))
-                played = Bench(args.env, args.preset, other, args.policy, args.episodes, args.impl, args.seed).success(
-                    sweeps.Point()
-                )
-                curves[STEP].append({"value": factor, **played})
+                curves[STEP].append({"value": factor, **bench_of(other).success(sweeps.Point())})
         _progress(STEP, curves[STEP])
     return {
         "env": args.env,

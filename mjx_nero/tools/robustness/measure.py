@@ -31,10 +31,11 @@ class Bench:
 
     def __init__(self, env_name: str, preset: str, cfg: EnvCfg, path: pathlib.Path | None, episodes: int, impl: str, seed: int):
         self._episodes, self._seed, self._objects = episodes, seed, list(cfg.scene.objects)
+        own = {name: term for name, term in cfg.actions.items() if name != "delay"}  # the task's own delay gives way
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
         seen = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._objects}
         wanted = varied(cfg).randomization
-        cfg = dataclasses.replace(cfg, corruption=False, actions={**late, **cfg.actions}, sensors={**cfg.sensors, **seen})
+        cfg = dataclasses.replace(cfg, corruption=False, actions={**late, **own}, sensors={**cfg.sensors, **seen})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
         # All fields that some setting draws, so that one program plays them all.
         names = Randomization(self.env.physics_model, wanted).names
