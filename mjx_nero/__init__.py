@@ -63,6 +63,9 @@ def _prepare() -> None:
             for flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
                 if flag not in os.environ.get("XLA_FLAGS", ""):
                     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{flag}=false".strip()
+    # With a single processor XLA has a single thread, and a program that calls the C library back waits for itself, now and then.
+    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+        os.environ.setdefault("NPROC", "2")
     # MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
     if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
         for gl, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8"), ("osmesa", "libOSMesa.so.6")):

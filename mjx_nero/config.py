@@ -98,6 +98,8 @@ def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
 def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> Any:
     head, *rest = path
     children = _children(node)
+    if children and ".".join(path) in children:  # an entry of ``training`` is itself a dotted name
+        head, rest = ".".join(path), []
     if children is None or head not in children:
         valid = list(children or ())
         raise UserError(

@@ -3,9 +3,11 @@
 import dataclasses
 
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.sim.scene import ObjectCfg, cube
+from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
 from mjx_nero.types import UserError
 
 SHARE, MOST = 0.4, 0.6  # of the opening: an edge, and the longest that leaves room to miss the middle
@@ -33,6 +35,23 @@ def height(opening: float, pad: Pad) -> float:
 def lowest(pad: Pad) -> float:
     """Of the pads' middle above the table, so that they keep ``CLEAR`` of it [m]."""
     return pad[0] / 2 + CLEAR
+
+
+def beyond(robot: RobotCfg) -> float:
+    """How far beyond the grasp point, along the approach, the middle of the closed pads lies [m]; 0 where long ones reach back
+    over it. An object that is round has to be between their middles: over an edge it would roll."""
+    model = robot_model(robot)
+    data = mujoco.MjData(model)
+    for joint, at in zip(robot.gripper.joints, robot.gripper.close, strict=True):
+        data.joint(joint).qpos = at
+    mujoco.mj_kinematics(model, data)
+    site, down = data.site(robot.ee_site), np.zeros(4)
+    mujoco.mju_negQuat(down, np.array(robot.down))
+    approach = np.zeros(3)
+    mujoco.mju_rotVecQuat(approach, np.array([0.0, 0.0, -1.0]), down)
+    pads = [data.geom(i).xpos for i in range(model.ngeom) if "pad" in model.geom(i).name]
+    off = (np.mean(pads, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if pads else np.zeros(3)
+    return round(max(0.0, float(off @ approach)), 4)
 
 
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:

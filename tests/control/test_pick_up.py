@@ -11,6 +11,8 @@ from mjx_nero import UserError, control
 from mjx_nero.control import pick_up
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.envs.arms.nero import NERO
+from mjx_nero.sim import grasp
 from mjx_nero.types import ObjectView, View
 
 CFG = PickUpCfg(object="target", heading=(0, 2, 0), turns=(4, 2, 0), lowest=0.03)
@@ -76,6 +78,14 @@ def test_room_beside_others_by_hand(controller):
 def test_it_grasps_at_the_objects_middle_or_as_low_as_the_pads_allow(controller):
     np.testing.assert_allclose(controller._pick(seen(0), jnp.array(0.3)), [0.5, 0.1, 0.05], atol=1e-6)
     np.testing.assert_allclose(controller._pick(seen(0, height=0.01), jnp.array(0.3)), [0.5, 0.1, 0.03], atol=1e-6)
+    longer = PickUp(COBOTTA_PRO_900, 0.02, dataclasses.replace(CFG, beyond=0.004))
+    np.testing.assert_allclose(longer._pick(seen(0, height=0.01), jnp.array(0.3)), [0.5, 0.1, 0.034], atol=1e-6)
+
+
+def test_how_far_beyond_the_grasp_point_the_pads_are_by_hand():
+    """Nero's begin 135.8 mm from its flange, 10 mm long; the grasp point is at 125. The Cobotta's reach back over theirs."""
+    assert grasp.beyond(NERO) == pytest.approx(0.1358 - 0.005 - 0.125)
+    assert grasp.beyond(COBOTTA_PRO_900) == 0
 
 
 def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):

@@ -197,7 +197,7 @@ def test_without_targets_no_term_may_name_one():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cobotta_clutter"])  # Nero loses some: docs/results.md
+@pytest.mark.parametrize("name", ["cobotta_clutter", "nero_clutter"])
 def test_the_controller_lifts_what_it_is_told_to(name):
     expert = evaluation.play(evaluation.EvalCfg(name, controller="expert", episodes=32, impl="native")).result
     assert expert["success_rate"] >= 28 / 32 and expert["nan_count"] == 0

@@ -1,5 +1,8 @@
 """The physics of the scene, on MJX and in MuJoCo's C library."""
 
+import os
+import subprocess
+import sys
 import types
 
 import jax
@@ -159,6 +162,27 @@ def test_native_takes_any_batch(env):
         jax.tree.map(lambda a, b, name=name: np.testing.assert_array_equal(a, b, name), after, other)
     # One target for all of a batch.
     jax.tree.map(np.testing.assert_array_equal, jax.vmap(step, (0, None))(sim, ctrl[0]), step(sim, jnp.tile(ctrl[:1], (6, 1))))
+
+
+ONE_PROCESSOR = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from mjx_nero import env_cfg
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import rollout
+import jax
+
+env = ManipulationEnv(env_cfg("nero_lift", "sim2real"), impl="native", num_envs=64)
+play = rollout.runner(env, lambda params, obs, key: jax.random.uniform(key, (64, env.action_size), minval=-1), 64)
+print([len(play(None, seed).returns) for seed in range(8)])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux ties a process to one processor")
+def test_on_one_processor_physics_does_not_wait_for_itself():
+    found = subprocess.run([sys.executable, "-c", ONE_PROCESSOR], capture_output=True, text=True, timeout=400)
+    assert found.stdout == f"{[64] * 8}\n", found.stderr[-2000:]
 
 
 def test_native_is_a_function_of_the_state(env):

@@ -46,7 +46,8 @@ class Setup:
         robot: its hand opens as far as these ask for.
         there: where it can grasp, and where it can hold.
         pitch, jitter: of the objects' cells (``events.scatter``).
-        lowest: height of the grasp point above the table in a grasp, at least.
+        lowest: height of the pads' middle above the table in a grasp, at least.
+        beyond: the grasp point, so much further down, is the pads' middle.
         grasp_radius: how near to the grasp point the object counts as held.
     """
 
@@ -56,6 +57,7 @@ class Setup:
     pitch: float
     jitter: float
     lowest: float
+    beyond: float
     grasp_radius: float
 
 
@@ -103,6 +105,7 @@ def fitted(robot: RobotCfg) -> Setup:
         pitch=pitch,
         jitter=jitter,
         lowest=grasp.lowest(robot.pad),
+        beyond=grasp.beyond(robot),
         grasp_radius=regions.near(there),
     )
 
@@ -140,7 +143,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4)),
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5),
-        controllers={"pick_up": {"object": TARGET, **_fits(scene), "lowest": setup.lowest}},
+        controllers={"pick_up": {"object": TARGET, **_fits(scene), "lowest": setup.lowest, "beyond": setup.beyond}},
         targets=names,
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.there.hold, strict=True)), resample_s=ONCE),
         success=SuccessCfg(
