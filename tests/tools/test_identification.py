@@ -11,6 +11,7 @@ from mjx_nero.envs import identified, registry
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.tools.identification import Drives, Log, Plant, RecordCfg, identify, record
+from mjx_nero.tools.identification import fit as fitting
 from mjx_nero.tools.identification import log as logs
 from mjx_nero.tools.identification.excitation import RATE, sweeps
 from mjx_nero.tools.identification.plant import POSITIVE, in_force
@@ -95,6 +96,25 @@ def test_what_was_put_in_is_found_again(plant, tmp_path):
     found = identified.read(tmp_path / "fit.yaml")
     assert found.joints["elbow"].stiffness.value == pytest.approx(truth.stiffness[1], rel=0.05)
     assert found.delay.low <= found.delay.value <= found.delay.high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", [1, 2])
+def test_a_search_that_comes_to_rest_beside_the_best_begins_again(plant, monkeypatch, solve):
+    """Where the first (1) or the second (2) search over all of the log says five times the armature, the other one counts."""
+    log, truth = record(plant, RecordCfg(seconds=30.0, noise=1e-4, scatter=1.5, delay=0.06, seed=0))
+    begun, real = [], fitting._solve
+
+    def stuck(plant, log, part, x, enough):
+        begun.append(x)
+        found = real(plant, log, part, x, enough)
+        if len(begun) == solve + 1:
+            found.x, found.cost = np.where(np.isin(np.arange(len(x)), (4, 5)), 5 * found.x, found.x), 10 * found.cost
+        return found
+
+    monkeypatch.setattr(fitting, "_solve", stuck)
+    np.testing.assert_allclose(identify(plant, log).drives.armature, truth.armature, rtol=0.05)
+    np.testing.assert_array_equal(begun[2][4:6], plant.nominal.armature)
 
 
 def test_a_log_is_read_as_it_was_written(tmp_path):

@@ -60,6 +60,11 @@ def identify(plant: Plant, log: Log) -> Fit:
         part = (log.times >= log.times[0] + _SETTLED) & (log.times <= end)
         found = _solve(plant, log, part, x, enough)
         x = found.x
+    # Armatures show least: the search can come to rest where one is several times too large. So it begins there again, with the
+    # model's, and the better of both counts.
+    x = np.concatenate([x[: 2 * plant.n], plant.nominal.armature, x[3 * plant.n :]])
+    found = min(found, _solve(plant, log, part, x, enough), key=lambda solution: solution.cost)
+    x = found.x
     half = _half_widths(found.fun, found.jac, plant.n, int((part).sum()))
     low, high = x - half, x + half
     low[: 4 * plant.n] = np.maximum(low, _unit(plant) / _FACTOR)[: 4 * plant.n]
