@@ -163,7 +163,7 @@ def drift():
 
 
 def test_a_fake_backend_goes_through_reset_and_step(drift):
-    env = make("nero_lift", impl=drift)
+    env = make("nero_lift", preset="isaac", impl=drift)  # positions: half of an action is a target
     assert isinstance(env.physics, physics.Physics) and isinstance(env.physics, Drift) and env.backend == "drift"
     state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
     action = jnp.full((4, 8), 0.02)
