@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_nero import math
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
 from mjx_nero.types import UserError
@@ -45,10 +46,8 @@ def beyond(robot: RobotCfg) -> float:
     for joint, at in zip(robot.gripper.joints, robot.gripper.close, strict=True):
         data.joint(joint).qpos = at
     mujoco.mj_kinematics(model, data)
-    site, down = data.site(robot.ee_site), np.zeros(4)
-    mujoco.mju_negQuat(down, np.array(robot.down))
-    approach = np.zeros(3)
-    mujoco.mju_rotVecQuat(approach, np.array([0.0, 0.0, -1.0]), down)
+    site = data.site(robot.ee_site)
+    approach = math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 0.0, -1.0]))
     pads = [data.geom(i).xpos for i in range(model.ngeom) if "pad" in model.geom(i).name]
     off = (np.mean(pads, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if pads else np.zeros(3)
     return round(max(0.0, float(off @ approach)), 4)
