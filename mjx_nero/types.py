@@ -11,6 +11,7 @@ from mjx_nero.errors import UserError as UserError
 
 Key = jax.Array  # a JAX random key
 TARGET = "target"  # in ``View.objects``: the one of ``EnvCfg.targets`` that the episode commands
+LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
 
 
 @struct.dataclass

@@ -23,15 +23,16 @@ from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import terms
 from mjx_nero.mdp.actions import Chain, Drives
+from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import linkage, obstacles, scene, touch
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
-from mjx_nero.types import TARGET, Carry, Key, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, TARGET, Carry, Key, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
 # Folded into an episode's key: what draws apart changes no other draw.
-_FIELDS, _MEMORY, _SENSORS, _OBSTACLES = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC
+_FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E
 
 
 def _precise(method: Callable) -> Callable:
@@ -125,24 +126,26 @@ class ManipulationEnv(Env):
         return {"native": "mujoco", "jax": "mjx-jax", "warp": "mjx-warp"}.get(self.impl, self.impl)
 
     @_precise
-    def reset(self, rng: Key) -> State:
+    def reset(self, rng: Key, level: float | None = None) -> State:
         """A fresh episode: joints at home, objects and command sampled anew.
 
         Args:
             rng: random key of this environment.
+            level: what share of all that differs from episode to episode it has; None: all of it.
         """
         k_sample, k_obs = jax.random.split(rng)
-        sim, carry = self.sample(k_sample)
+        sim, carry = self.sample(k_sample, None if level is None else jnp.asarray(level, jnp.float32))
         obs, carry = self.observe(sim, carry, k_obs)
         names = [f"reward/{name}" for name in self.cfg.rewards]
         names += ["success", "distance", "final_distance", "dropped", "nan", "overflow", *self.cfg.metrics]
+        names += [LEVEL] if level is not None else []
         zero = jnp.zeros(())
         info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
         return State(sim, obs, zero, zero, dict.fromkeys(names, zero), info)
 
     @_precise
-    def sample(self, rng: Key) -> tuple[Sim, Carry]:
-        """The start of an episode, before it is observed."""
+    def sample(self, rng: Key, level: Float[Array, ""] | None = None) -> tuple[Sim, Carry]:
+        """The start of an episode, before it is observed. ``level``: see ``reset``."""
         k_fields, k_memory = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY))
         rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
         command, command_quat = self._sample_command(k_command)
@@ -155,7 +158,7 @@ class ManipulationEnv(Env):
         )
         for key, event in zip(k_events, self.cfg.events.values(), strict=True):
             start = event(key, start)
-        fields = self._randomization(k_fields)
+        fields = self._randomization(k_fields, level)
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
         sim = Sim(
             qpos=qpos,
@@ -172,7 +175,7 @@ class ManipulationEnv(Env):
             action=jnp.zeros(self.action_size),
             command=command,
             command_quat=command_quat,
-            memory={TARGET: start.target} if self.cfg.targets else {},
+            memory={**({TARGET: start.target} if self.cfg.targets else {}), **({} if level is None else {LEVEL: level})},
         )
         if self.cfg.obstacles:  # between what is already there: the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
@@ -254,6 +257,7 @@ class ManipulationEnv(Env):
         view = sensed = self._viewer(sim, carry, carry.action)
         for name, term in cfg.sensors.items():
             sensed = recall.through(f"sensors.{name}", term.made, sensed)
+        sensed = toward(carry.memory.get(LEVEL), view, sensed)
         seen = dict.fromkeys(cfg.sensed, sensed) if cfg.sensors else {}
         obs = terms.observe(cfg.observations, view, key, cfg.corruption, recall, cfg.apart, seen)
         return obs, dataclasses.replace(carry, memory=recall.memory)
@@ -274,20 +278,44 @@ class ManipulationEnv(Env):
         return self.finish(state, action, sim, overflow)
 
     @_precise
-    def step_and_reset(self, state: State, action: Float[Array, " na"]) -> State:
+    def following(self, state: State) -> tuple[Sim, Carry]:
+        """The start of the episode that comes after the one of ``state``, before it is observed."""
+        carry = state.info["carry"]
+        return self.sample(jax.random.fold_in(carry.rng, _FOLLOWING), carry.memory.get(LEVEL))
+
+    @_precise
+    def step_and_reset(self, state: State, action: Float[Array, " na"], start: tuple[Sim, Carry] | None = None) -> State:
         """``step``, and where that ends the episode the start of a new one, with fresh draws.
 
         Reward, done and metrics are the ended episode's; physics, observation and carry the new one's. To cache the first
         state instead would replay one object and goal position per environment for ever.
+
+        Args:
+            start: of the new episode, from ``following``; None: drawn now. Few episodes end in a step, but all of a batch draw
+                a start for it: a loop that draws them once in some steps, fewer than an episode has, is faster.
         """
         state, ctrl = self.act(state, action)
         sim, overflow = self.physics.step(state.pipeline_state, ctrl)
         state = self.advance(state, action, sim, overflow)
         rng, k_sample, k_obs = jax.random.split(state.info["carry"].rng, 3)
-        old = (state.pipeline_state, state.info["carry"].replace(rng=rng))
-        sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), self.sample(k_sample), old)
+        level, old = self._widened(state), (state.pipeline_state, state.info["carry"].replace(rng=rng))
+        sim, carry = start or self.sample(k_sample, level)
+        if level is not None:
+            carry = carry.replace(memory={**carry.memory, LEVEL: level})
+        sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), (sim, carry), old)
         obs, carry = self.observe(sim, carry, k_obs)
         return state.replace(pipeline_state=sim, obs=obs, info={**state.info, "carry": carry})
+
+    @property
+    def first_level(self) -> float | None:
+        """Of the first episodes in training: see ``EnvCfg.widening``."""
+        return None if self.cfg.widening is None else self.cfg.widening.made.start
+
+    def _widened(self, state: State) -> Float[Array, ""] | None:
+        level = state.info["carry"].memory.get(LEVEL)
+        if level is None or self.cfg.widening is None:
+            return level
+        return self.cfg.widening.made.step(level, state.metrics["success"])
 
     def act(self, state: State, action: Float[Array, " na"]) -> tuple[State, Float[Array, " nu"]]:
         """The drives' position targets for ``action`` [rad or m], and the state with what the action terms then remember.
@@ -311,7 +339,7 @@ class ManipulationEnv(Env):
         recall, view, qvel = terms.Recall(memory), self._viewer(sim, carry, carry.action), sim.qvel
         for name, term in self.cfg.pushes.items():
             dof = self._viewer.objects[term.params["object"]][1]
-            qvel = qvel.at[dof : dof + 3].add(recall(f"pushes.{name}", term, view))
+            qvel = qvel.at[dof : dof + 3].add(toward(memory.get(LEVEL), 0.0, recall(f"pushes.{name}", term, view)))
         return dataclasses.replace(sim, qvel=qvel), recall.memory
 
     def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
@@ -343,6 +371,8 @@ class ManipulationEnv(Env):
         met = recall("success.condition", cfg.success.condition, view)
         ends = {"success": truncated & recall.through("success.hold", self._hold, met), "dropped": terminated & ~bad}
         metrics = {f"reward/{name}": value for name, value in rewards.items()}
+        if LEVEL in carry.memory:
+            ends[LEVEL] = carry.memory[LEVEL]
         metrics |= self._metrics(view, recall, ends, done, bad) | {"nan": bad.astype(jnp.float32), "overflow": overflow}
 
         carry = self._resample(carry.replace(step=step, action=jnp.where(bad, carry.action, action), memory=recall.memory))

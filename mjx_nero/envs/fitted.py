@@ -27,6 +27,9 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
 
+OPEN = 2.0  # times a cube's edge
+
+
 def lift_setup(robot: RobotCfg) -> lift.Setup:
     """The cube anywhere in ``pick``, the goal anywhere in ``hold``."""
     there = regions.of(robot)
@@ -67,7 +70,10 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
 
 
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.Setup], EnvCfg]) -> EnvCfg:
-    return factory(robot, lift_setup(robot))
+    """With a hand that opens as far as the cube asks for: a jaw that has to turn by 85 degrees first hardly ever meets one by
+    chance, and all that is learnt begins with that."""
+    setup = lift_setup(robot)
+    return factory(grasp.opened(robot, OPEN * setup.scene.objects["cube"].size[0]), setup)
 
 
 def _pick_place(robot: RobotCfg) -> EnvCfg:

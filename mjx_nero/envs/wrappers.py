@@ -6,14 +6,19 @@ import mjx_nero.sim.quiet  # noqa: F401
 import jax
 from brax.envs.base import Env, State, Wrapper
 
-from mjx_nero.types import Key
+from mjx_nero.types import Carry, Key, Sim
+
+Start = tuple[Sim, Carry]
 
 
 class AutoReset(Wrapper):
-    """Starts a fresh episode in an environment that is done (``ManipulationEnv.step_and_reset``)."""
+    """Starts a fresh episode in an environment that is done (``ManipulationEnv.step_and_reset``), by the task's curriculum."""
 
-    def step(self, state: State, action: jax.Array) -> State:
-        return self.env.step_and_reset(state, action)
+    def reset(self, rng: Key) -> State:
+        return self.env.reset(rng, self.env.first_level)
+
+    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
+        return self.env.step_and_reset(state, action, start)
 
 
 class Vectorize(Wrapper):
@@ -22,8 +27,12 @@ class Vectorize(Wrapper):
     def reset(self, rng: Key) -> State:
         return jax.vmap(self.env.reset)(rng)
 
-    def step(self, state: State, action: jax.Array) -> State:
-        return jax.vmap(self.env.step)(state, action)
+    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
+        return jax.vmap(self.env.step)(state, action, start)
+
+    def following(self, state: State) -> Start:
+        """The start of each environment's next episode: see ``ManipulationEnv.step_and_reset``."""
+        return jax.vmap(self.env.following)(state)
 
 
 class BraxEpisode(Wrapper):
@@ -33,8 +42,8 @@ class BraxEpisode(Wrapper):
         state = self.env.reset(rng)
         return state.replace(info={**state.info, "episode_metrics": {}, "episode_done": state.done})
 
-    def step(self, state: State, action: jax.Array) -> State:
-        state = self.env.step(state, action)
+    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
+        state = self.env.step(state, action, start)
         return state.replace(info={**state.info, "episode_done": state.done})
 
 

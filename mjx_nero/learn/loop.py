@@ -14,6 +14,7 @@ from mjx_nero.learn.compiled import Compiled
 from mjx_nero.learn.logs import Logs
 from mjx_nero.learn.run_cfg import RunCfg
 from mjx_nero.learn.stopping import Stop
+from mjx_nero.types import LEVEL
 
 _ROWS = 2000  # of metrics in a run, evaluations apart
 
@@ -206,7 +207,7 @@ class Loop:
             "overflow_count": self.tally.overflow_count,
         }
         episodes = max(sums.get("episodes", 0.0), 1e-9)
-        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "grasped", "dropped", "final_distance") if n in sums}
+        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "grasped", "dropped", "final_distance", LEVEL) if n in sums}
         if "grasp_time" in sums:
             row["train/time_to_grasp"] = sums["grasp_time"] / max(sums["grasped"], 1e-9)
         row |= {name: value / per * length for name, value in sums.items() if name.startswith("reward/")}

@@ -246,6 +246,7 @@ class Learner:
         """
         cfg = self.cfg
         policy = self._make_policy((state.normalizer, state.params.policy))
+        following = self.env.following(state.env_state)
 
         def figures(env_state: State):
             return {**env_state.metrics, "reward": env_state.reward, "episodes": env_state.done}
@@ -254,7 +255,7 @@ class Learner:
             env_state, totals = carry
             with self._networks_precision():
                 action, extras = policy(env_state.obs, key)
-            after = self.env.step(env_state, action)
+            after = self.env.step(env_state, action, following)
             totals = jax.tree.map(jnp.add, totals, figures(after))  # by environment: a sum over them at every step costs more
             return (after, totals), (env_state.obs, extras, after.reward, after.done, after.info["truncation"])
 

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from mjx_nero.bounds import NonNegative, Positive, Share, Steps
 from mjx_nero.mdp import memory as memories
-from mjx_nero.types import Key, UserError
+from mjx_nero.mdp.curriculum import toward
+from mjx_nero.types import LEVEL, Key, UserError
 
 Memory = Any
 
@@ -57,6 +58,7 @@ class Act:
     joint_pos: dict[str, Float[Array, " n"]]
     ctrl: dict[str, Float[Array, " n"]]  # the targets now in force
     targets: dict[str, Float[Array, " n"]]  # what comes of the action: at first, home
+    level: Float[Array, ""] | None = None  # see ``types.LEVEL``
 
     def to(self, group: str, targets: Float[Array, " n"]) -> "Act":
         """With other targets of a group."""
@@ -205,7 +207,7 @@ class Delay(Plain):
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """An action late."""
         memory, action = memories.Delay(self.steps, self.hold).step(memory, act.action)
-        return memory, dataclasses.replace(act, action=action)
+        return memory, dataclasses.replace(act, action=toward(act.level, act.action, action))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +225,7 @@ class Noise(Plain):
         memory, k_noise = jax.random.split(memory)
         drives, targets = self.groups["arm"], act.targets["arm"]
         off = jax.random.uniform(k_noise, targets.shape, minval=-self.amount, maxval=self.amount)
-        return memory, act.to("arm", jnp.clip(targets + off, drives.low, drives.high))
+        return memory, act.to("arm", jnp.clip(targets + toward(act.level, 0.0, off), drives.low, drives.high))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,7 +279,7 @@ class Chain:
         self, memory: Mapping[str, Memory], action: Float[Array, " na"], joint_pos: Float[Array, " nj"], ctrl: Float[Array, " nu"]
     ) -> tuple[dict[str, Memory], Float[Array, " nu"]]:
         """The drives' targets for an action; of the episode's memory, what is the terms' changes."""
-        act, after = self._act(action, joint_pos, ctrl), dict(memory)
+        act, after = self._act(action, joint_pos, ctrl).replace(level=memory.get(LEVEL)), dict(memory)
         for i, (name, term) in enumerate(self.terms.items()):
             own = jnp.split(act.action, self._splits)[i]
             remembered, act = term.step(memory.get(f"actions.{name}", ()), own, act)

@@ -32,8 +32,10 @@ class Delay:
         """Takes a value in, gives an old one out."""
         rng, lag = memory.rng, memory.lag
         if self.hold < 1 and self.steps[0] < self.steps[1]:
-            rng, k_hold, k_lag = jax.random.split(rng, 3)
-            lag = jnp.where(jax.random.uniform(k_hold) < self.hold, lag, self._lag(k_lag))
+            rng, k_now = jax.random.split(rng)
+            kept, anew = jax.random.uniform(k_now, (2,))  # at once, as on a GPU each draw costs some kernels
+            span = self.steps[1] + 1 - self.steps[0]
+            lag = jnp.where(kept < self.hold, lag, self.steps[0] + (anew * span).astype(lag.dtype))
         line = jnp.concatenate([value[None], memory.past])
         return DelayMemory(rng, lag, line[:-1]), line[-1] if self.steps[0] == self.steps[1] else line[lag]
 

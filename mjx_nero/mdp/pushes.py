@@ -27,16 +27,15 @@ class Push:
     def init(self, key: Key, view: View) -> tuple[Key, Float[Array, ""]]:
         """When the first one comes."""
         key, k_wait = jax.random.split(key)
-        return key, self._wait(k_wait)
+        return key, self._wait(jax.random.uniform(k_wait))
 
     def step(self, memory: tuple[Key, Float[Array, ""]], view: View) -> tuple[tuple, Float[Array, "3"]]:
         """Zero between pushes."""
         key, due = memory
-        new, k_wait, k_speed = jax.random.split(key, 3)
-        now = view.time >= due
-        speed = jax.random.uniform(k_speed, (3,), minval=-self.speed, maxval=self.speed)
-        memory = jnp.where(now, new, key), jnp.where(now, view.time + self._wait(k_wait), due)
-        return memory, jnp.where(now, speed, 0.0)
+        key, k_now = jax.random.split(key)
+        drawn, now = jax.random.uniform(k_now, (4,)), view.time >= due
+        memory = key, jnp.where(now, view.time + self._wait(drawn[3]), due)
+        return memory, jnp.where(now, self.speed * (2.0 * drawn[:3] - 1.0), 0.0)
 
-    def _wait(self, key: Key) -> Float[Array, ""]:
-        return jax.random.uniform(key, (), minval=self.interval[0], maxval=self.interval[1])
+    def _wait(self, drawn: Float[Array, ""]) -> Float[Array, ""]:
+        return self.interval[0] + drawn * (self.interval[1] - self.interval[0])

@@ -45,7 +45,7 @@ class Model:
 def mass(key: Key, model: Model, *, bodies: tuple[str, ...], scale: PositiveRange) -> Drawn:
     """Multiplies masses, and inertias with them, by a uniform factor a body."""
     rows = model.rows("body", bodies)
-    factor = _uniform(key, len(rows), scale)
+    (factor,) = _uniform(key, len(rows), scale)
     inertia = model.fields["body_inertia"][rows] * factor[:, None]
     return {"body_mass": (rows, model.fields["body_mass"][rows] * factor), "body_inertia": (rows, inertia)}
 
@@ -64,10 +64,9 @@ def friction(
     Where two geoms meet, the one of higher priority counts, else the larger coefficient.
     """
     rows, values = model.rows("geom", geoms), model.fields["geom_friction"]
-    columns = [_uniform(jax.random.fold_in(key, 0), len(rows), slide)]
+    columns = list(_uniform(key, len(rows), slide, np.log(spin or (1.0, 1.0)), np.log(roll or (1.0, 1.0))))
     for column, bounds in ((1, spin), (2, roll)):
-        k_column = jax.random.fold_in(key, column)
-        columns.append(values[rows, column] if bounds is None else jnp.exp(_uniform(k_column, len(rows), np.log(bounds))))
+        columns[column] = values[rows, column] if bounds is None else jnp.exp(columns[column])
     return {"geom_friction": (rows, jnp.stack(columns, axis=1))}
 
 
@@ -81,17 +80,16 @@ def gains(
     effort: PositiveRange = (1.0, 1.0),
 ) -> Drawn:
     """Multiplies stiffness, damping and effort of position drives by uniform factors, for each drive its own."""
-    rows, (k_stiffness, k_damping) = model.rows("actuator", actuators), jax.random.split(key)
-    kp = _uniform(k_stiffness, len(rows), stiffness)
-    factors = jnp.stack([jnp.ones_like(kp), kp, _uniform(k_damping, len(rows), damping)], axis=1)
+    rows = model.rows("actuator", actuators)
+    kp, kd, force = _uniform(key, len(rows), stiffness, damping, effort)
+    factors = jnp.stack([jnp.ones_like(kp), kp, kd], axis=1)
     gain, bias = model.fields["actuator_gainprm"][rows], model.fields["actuator_biasprm"][rows]
     drawn = {
         "actuator_gainprm": (rows, gain.at[:, 0].multiply(kp)),
         "actuator_biasprm": (rows, bias.at[:, :3].multiply(factors)),
     }
     if effort != (1.0, 1.0):
-        factor = _uniform(jax.random.fold_in(key, 2), len(rows), effort)
-        drawn["actuator_forcerange"] = (rows, model.fields["actuator_forcerange"][rows] * factor[:, None])
+        drawn["actuator_forcerange"] = (rows, model.fields["actuator_forcerange"][rows] * force[:, None])
     return drawn
 
 
@@ -110,13 +108,13 @@ def joints(
         armature, damping: factors.
         friction: dry friction (MuJoCo's ``frictionloss``) as a share of the effort of the joint's drive; (0, 0): as it is.
     """
-    rows, (k_armature, k_damping) = model.rows("dof", joints), jax.random.split(key)
-    factors = (_uniform(k_armature, len(rows), armature), _uniform(k_damping, len(rows), damping))
+    rows = model.rows("dof", joints)
+    *factors, dry = _uniform(key, len(rows), armature, damping, friction)
     names = ("dof_armature", "dof_damping")
     drawn = {name: (rows, model.fields[name][rows] * factor) for name, factor in zip(names, factors, strict=True)}
     if friction != (0.0, 0.0):
         effort = model.fields["actuator_forcerange"][model.rows("actuator", joints), 1]
-        drawn["dof_frictionloss"] = (rows, effort * _uniform(jax.random.fold_in(key, 2), len(rows), friction))
+        drawn["dof_frictionloss"] = (rows, effort * dry)
     return drawn
 
 
@@ -131,7 +129,7 @@ def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) 
     """Multiplies an object's lengths by one uniform factor; its mass stays, its inertia follows."""
     sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # a can has one
     geoms, body = model.rows("geom", (object, *sides)), model.rows("body", (object,))
-    fields, (factor,) = model.fields, _uniform(key, 1, scale)
+    fields, ((factor,),) = model.fields, _uniform(key, 1, scale)
     return {
         "geom_size": (geoms, fields["geom_size"][geoms] * factor),
         "geom_rbound": (geoms, fields["geom_rbound"][geoms] * factor),
@@ -152,7 +150,7 @@ def color(key: Key, model: Model, *, geoms: tuple[str, ...]) -> Drawn:
 def gravity_compensation(key: Key, model: Model, *, bodies: tuple[str, ...], scale: NonNegativeRange) -> Drawn:
     """Multiplies the shares of the bodies' weights that the drives carry by uniform factors, for each body its own."""
     rows = model.rows("body", bodies)
-    return {"body_gravcomp": (rows, model.fields["body_gravcomp"][rows] * _uniform(key, len(rows), scale))}
+    return {"body_gravcomp": (rows, model.fields["body_gravcomp"][rows] * _uniform(key, len(rows), scale)[0])}
 
 
 def encoder_bias(key: Key, model: Model, *, actuators: tuple[str, ...], bias: NonNegative) -> Drawn:
@@ -183,20 +181,18 @@ def drives(
         friction: dry friction [N m or N].
     """
     actuators, dofs = model.rows("actuator", joints), model.rows("dof", joints)
-    draws = [
-        jax.random.uniform(jax.random.fold_in(key, i), (len(joints),), minval=np.array(part)[:, 0], maxval=np.array(part)[:, 1])
-        for i, part in enumerate((stiffness, damping, armature, friction))
-    ]
-    kp, kd = draws[:2]
+    kp, kd, inertia, dry = _uniform(key, len(joints), *(np.array(part).T for part in (stiffness, damping, armature, friction)))
     gain, bias = model.fields["actuator_gainprm"][actuators], model.fields["actuator_biasprm"][actuators]
     return {
         "actuator_gainprm": (actuators, gain.at[:, 0].set(kp)),
         "actuator_biasprm": (actuators, bias.at[:, 1].set(-kp).at[:, 2].set(-kd)),
         "dof_damping": (dofs, jnp.zeros_like(kd)),
-        "dof_armature": (dofs, draws[2]),
-        "dof_frictionloss": (dofs, draws[3]),
+        "dof_armature": (dofs, inertia),
+        "dof_frictionloss": (dofs, dry),
     }
 
 
-def _uniform(key: Key, n: int, bounds) -> Float[Array, " n"]:
-    return jax.random.uniform(key, (n,), minval=bounds[0], maxval=bounds[1])
+def _uniform(key: Key, n: int, *bounds) -> Float[Array, "parts n"]:
+    """``n`` numbers for each of the bounds: at once, as on a GPU each draw costs some kernels."""
+    low, high = (np.stack([np.broadcast_to(b[end], n) for b in bounds]).astype(np.float32) for end in (0, 1))
+    return jax.random.uniform(key, (len(bounds), n), minval=low, maxval=high)

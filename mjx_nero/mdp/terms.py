@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import bounds, config
 from mjx_nero.bounds import Count, NonNegative, Positive, Share, Steps
+from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History
-from mjx_nero.types import Key, UserError, View
+from mjx_nero.types import LEVEL, Key, UserError, View
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,11 +206,13 @@ def observe(
         seen: by group, the view that its terms get instead of ``view``.
     """
     out: dict[str, Any] = {}
+    level = recall.memory.get(LEVEL)
     for i, (name, group) in enumerate(groups.items()):
         values = by_name(group, (seen or {}).get(name, view), recall, name)
         for term in group:
             for line in group[term].lines:
-                values[term] = recall.through(f"observations.{name}.{term}.{type(line).__name__.lower()}", line, values[term])
+                seen_now = recall.through(f"observations.{name}.{term}.{type(line).__name__.lower()}", line, values[term])
+                values[term] = toward(level, values[term], seen_now) if isinstance(line, Delay) else seen_now
         k_group, noisy = jax.random.fold_in(key, i), corruption and any(term.noise for term in group.values())
         if name in apart:
             keys = jax.random.split(k_group, len(group)) if noisy else ()

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
+from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.randomization import Drawn, Model
 from mjx_nero.types import Key, UserError
 
@@ -68,12 +69,13 @@ class Randomization:
         self._derived = {name: np.array(getattr(model, name), np.float32) for name in _DERIVED} if trees else {}
         self.names = tuple(rows) + tuple(self._derived)
 
-    def __call__(self, key: Key) -> Fields:
-        """The fields of one world; empty without terms."""
+    def __call__(self, key: Key, level: Float[Array, ""] | None = None) -> Fields:
+        """The fields of one world; empty without terms. ``level``: see ``types.LEVEL``."""
         drawn: Fields = {}
-        for i, term in enumerate(self._terms.values()):
-            for field, (rows, values) in term(jax.random.fold_in(key, i), self._model(drawn)).items():
+        for k_term, term in zip(jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True):
+            for field, (rows, values) in term(k_term, self._model(drawn)).items():
                 drawn[field] = drawn.get(field, jnp.asarray(self._nominal[field])).at[rows].set(values)
+        drawn = {name: toward(level, jnp.asarray(self._nominal[name]), values) for name, values in drawn.items()}
         now: Fields = {**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}
         derived = {name: jnp.asarray(value) for name, value in self._derived.items()}
         for tree in self._trees:

@@ -1,12 +1,14 @@
 """The cube that a gripper can lift, and how high above the table it grasps it."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from mjx_nero import math
+from mjx_nero.sim import linkage
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
 from mjx_nero.types import UserError
@@ -38,29 +40,79 @@ def lowest(pad: Pad) -> float:
     return pad[0] / 2 + CLEAR
 
 
-def beyond(robot: RobotCfg) -> float:
-    """How far beyond the grasp point, along the approach, the middle of the closed pads lies [m]; 0 where long ones reach back
-    over it. An object that is round has to be between their middles: over an edge it would roll."""
-    model = robot_model(robot)
-    data = mujoco.MjData(model)
-    for joint, at in zip(robot.gripper.joints, robot.gripper.close, strict=True):
-        data.joint(joint).qpos = at
-    mujoco.mj_kinematics(model, data)
-    site = data.site(robot.ee_site)
+def beyond(robot: RobotCfg, gap: float) -> float:
+    """How far beyond the grasp point, along the approach, the middle of the pads lies when they are ``gap`` apart [m]; 0 where
+    long ones reach back over it. An object that is round has to be between their middles: over an edge it would roll."""
+    hand = _Hand(robot)
+    hand.move(hand.share(gap))
+    site = hand.data.site(robot.ee_site)
     approach = math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 0.0, -1.0]))
-    pads = [data.geom(i).xpos for i in range(model.ngeom) if "pad" in model.geom(i).name]
-    off = (np.mean(pads, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if pads else np.zeros(3)
+    centres = [hand.data.geom(i).xpos for i in hand.pads]
+    off = (np.mean(centres, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if centres else np.zeros(3)
     return round(max(0.0, float(off @ approach)), 4)
 
 
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:
-    """The robot with a hand that opens no further than to ``gap`` between its pads [m], and begins so; as it is where nobody has
-    said which positions that takes, or where it opens less."""
-    hand = robot.gripper
-    if hand.gap is None or hand.positions is None or float(hand.gap(jnp.array(hand.open))) <= gap:
+    """The robot with a hand that opens no further than to ``gap`` between its pads [m], and begins so; as it is where it opens
+    less, or has no two pads."""
+    fingers = robot.gripper
+    if fingers.gap is not None and fingers.positions is not None:
+        if float(fingers.gap(jnp.array(fingers.open))) <= gap:
+            return robot
+        positions = fingers.positions(jnp.array(gap))
+    elif (share := (hand := _Hand(robot)).share(gap)) < 1:
+        positions = hand.positions(share)
+    else:
         return robot
-    open = tuple(round(float(q), 5) for q in hand.positions(jnp.array(gap)))
-    return dataclasses.replace(robot, gripper=dataclasses.replace(hand, open=open, home=open))
+    open = tuple(round(float(q), 5) for q in positions)
+    return dataclasses.replace(robot, gripper=dataclasses.replace(fingers, open=open, home=open))
+
+
+def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
+    """The shapes that grip, by their names."""
+    geoms = model.geoms if isinstance(model, mujoco.MjSpec) else map(model.geom, range(model.ngeom))
+    return [geom.name for geom in geoms if "pad" in geom.name]
+
+
+class _Hand:
+    """A robot's fingers, moved from closed (0) to open (1).
+
+    Attributes:
+        pads: geoms that grip.
+    """
+
+    def __init__(self, robot: RobotCfg):
+        self._robot, model = robot.gripper, robot_model(robot)
+        self._couplings, self.data = linkage.couplings(model), mujoco.MjData(model)
+        self.model, self.pads = model, [model.geom(name).id for name in pads(model)]
+
+    def positions(self, share: float) -> np.ndarray:
+        """Of the gripper's joints."""
+        close, open = np.array(self._robot.close), np.array(self._robot.open)
+        return close + share * (open - close)
+
+    def move(self, share: float) -> None:
+        """Places all shapes in ``data``."""
+        for joint, at in zip(self._robot.joints, self.positions(share), strict=True):
+            self.data.joint(joint).qpos = at
+        for coupling in self._couplings:
+            self.data.qpos[coupling.follower] = coupling.position(self.data.qpos)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def share(self, gap: float) -> float:
+        """At which two pads are ``gap`` apart [m]; 1 where they never are as far."""
+        low, high = 0.0, 1.0
+        while high - low > 1e-5 and self._apart(1.0) > gap:
+            middle = (low + high) / 2
+            low, high = (low, middle) if self._apart(middle) > gap else (middle, high)
+        return high
+
+    def _apart(self, share: float) -> float:
+        """The least distance between two pads that are not of one body [m]."""
+        self.move(share)
+        bodies, far, ends = self.model.geom_bodyid, 1.0, np.zeros(6)
+        pairs = [(a, b) for a, b in itertools.combinations(self.pads, 2) if bodies[a] != bodies[b]]
+        return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in pairs), default=0.0)
 
 
 def cube_for(robot: RobotCfg) -> ObjectCfg:

@@ -84,8 +84,8 @@ def test_it_grasps_at_the_objects_middle_or_as_low_as_the_pads_allow(controller)
 
 def test_how_far_beyond_the_grasp_point_the_pads_are_by_hand():
     """Nero's begin 135.8 mm from its flange, 10 mm long; the grasp point is at 125. The Cobotta's reach back over theirs."""
-    assert grasp.beyond(NERO) == pytest.approx(0.1358 - 0.005 - 0.125)
-    assert grasp.beyond(COBOTTA_PRO_900) == 0
+    assert grasp.beyond(NERO, 0.04) == pytest.approx(0.1358 - 0.005 - 0.125)
+    assert grasp.beyond(COBOTTA_PRO_900, 0.06) == 0
 
 
 def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):

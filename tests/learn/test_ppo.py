@@ -80,10 +80,11 @@ def conventional(learner, eventful):
     policy = networks.make_inference_fn(learner.networks, compute_value=True)(
         (eventful.normalizer, eventful.params.policy, eventful.params.value)
     )
+    following = learner.env.following(eventful.env_state)
 
     def act(env_state, key):
         action, extras = policy(env_state.obs, key)
-        after = learner.env.step(env_state, action)
+        after = learner.env.step(env_state, action, following)
         return after, Transition(
             observation=env_state.obs,
             action=action,

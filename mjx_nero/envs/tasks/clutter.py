@@ -105,7 +105,7 @@ def fitted(robot: RobotCfg) -> Setup:
         pitch=pitch,
         jitter=jitter,
         lowest=grasp.lowest(robot.pad),
-        beyond=grasp.beyond(robot),
+        beyond=grasp.beyond(robot, edge),
         grasp_radius=regions.near(there),
     )
 

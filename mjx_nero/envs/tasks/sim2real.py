@@ -8,9 +8,9 @@ delays what a bus and a camera have at 50 control steps a second.
 import dataclasses
 
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.mdp import actions, pushes, randomization, sensors
+from mjx_nero.mdp import actions, curriculum, pushes, randomization, sensors
 from mjx_nero.mdp.terms import ObservationTerm, Term
-from mjx_nero.sim import robot_file
+from mjx_nero.sim import grasp, robot_file
 from mjx_nero.sim.robot import RobotCfg
 
 
@@ -32,6 +32,7 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
         },
         sensors={**cfg.sensors, "encoders": Term(sensors.Encoders), **_eyes(objects)},
         pushes={**cfg.pushes, **pushed},
+        widening=Term(curriculum.BySuccess),
     )
 
 
@@ -48,7 +49,7 @@ def _arm(robot: RobotCfg, grips: bool) -> dict[str, Term]:
     """Terms of links and drives, and of the pads where there is something to grip."""
     spec, joints = robot_file.model(robot), robot.arm.joints
     links = tuple(dict.fromkeys(spec.joint(name).parent.name for name in joints))
-    pads = tuple(geom.name for geom in spec.geoms if "pad" in geom.name)
+    pads = tuple(grasp.pads(spec))
     terms = {
         "link_mass": Term(randomization.mass, params={"bodies": links, "scale": (0.9, 1.1)}),
         "link_center": Term(randomization.center_of_mass, params={"bodies": links, "offset": 0.01}),
