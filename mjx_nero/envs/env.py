@@ -126,7 +126,7 @@ class ManipulationEnv(Env):
         return {"native": "mujoco", "jax": "mjx-jax", "warp": "mjx-warp"}.get(self.impl, self.impl)
 
     @_precise
-    def reset(self, rng: Key, level: float | None = None) -> State:
+    def reset(self, rng: Key, level: float | Float[Array, ""] | None = None) -> State:
         """A fresh episode: joints at home, objects and command sampled anew.
 
         Args:

@@ -28,6 +28,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 
 OPEN = 2.0  # times a cube's edge
+SLOW = 0.3  # [s] to close on it
 
 
 def lift_setup(robot: RobotCfg) -> lift.Setup:
@@ -70,10 +71,11 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
 
 
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.Setup], EnvCfg]) -> EnvCfg:
-    """With a hand that opens as far as the cube asks for: a jaw that has to turn by 85 degrees first hardly ever meets one by
-    chance, and all that is learnt begins with that."""
-    setup = lift_setup(robot)
-    return factory(grasp.opened(robot, OPEN * setup.scene.objects["cube"].size[0]), setup)
+    """With slow fingers open no further than a cube asks for: a jaw that turns by 85 degrees before it meets one hardly ever does
+    so by chance, and all that is learnt begins with that."""
+    setup, edge = lift_setup(robot), grasp.cube_for(robot).size[0]
+    slow = grasp.closing_time(robot, edge) > SLOW
+    return factory(grasp.opened(robot, OPEN * edge) if slow else robot, setup)
 
 
 def _pick_place(robot: RobotCfg) -> EnvCfg:

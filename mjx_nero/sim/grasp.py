@@ -68,6 +68,13 @@ def opened(robot: RobotCfg, gap: float) -> RobotCfg:
     return dataclasses.replace(robot, gripper=dataclasses.replace(fingers, open=open, home=open))
 
 
+def closing_time(robot: RobotCfg, gap: float) -> float:
+    """How long the fingers take from open to where their pads are ``gap`` apart [s]."""
+    hand = _Hand(robot)
+    way = np.abs(hand.positions(hand.share(gap)) - hand.positions(1.0))
+    return float(np.max(way / np.array(robot.gripper.speed), initial=0.0))
+
+
 def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
     """The shapes that grip, by their names."""
     geoms = model.geoms if isinstance(model, mujoco.MjSpec) else map(model.geom, range(model.ngeom))
