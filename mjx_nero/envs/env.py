@@ -301,7 +301,7 @@ class ManipulationEnv(Env):
         level, old = self._widened(state), (state.pipeline_state, state.info["carry"].replace(rng=rng))
         sim, carry = start or self.sample(k_sample, level)
         if level is not None:
-            carry = carry.replace(memory={**carry.memory, LEVEL: level})
+            carry = dataclasses.replace(carry, memory={**carry.memory, LEVEL: level})
         sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), (sim, carry), old)
         obs, carry = self.observe(sim, carry, k_obs)
         return state.replace(pipeline_state=sim, obs=obs, info={**state.info, "carry": carry})
@@ -339,7 +339,7 @@ class ManipulationEnv(Env):
         recall, view, qvel = terms.Recall(memory), self._viewer(sim, carry, carry.action), sim.qvel
         for name, term in self.cfg.pushes.items():
             dof = self._viewer.objects[term.params["object"]][1]
-            qvel = qvel.at[dof : dof + 3].add(toward(memory.get(LEVEL), 0.0, recall(f"pushes.{name}", term, view)))
+            qvel = qvel.at[dof : dof + 3].add(toward(memory.get(LEVEL), jnp.zeros(3), recall(f"pushes.{name}", term, view)))
         return dataclasses.replace(sim, qvel=qvel), recall.memory
 
     def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:

@@ -26,7 +26,6 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
-
 OPEN = 2.0  # times a cube's edge
 SLOW = 0.3  # [s] to close on it
 

@@ -225,7 +225,7 @@ class Noise(Plain):
         memory, k_noise = jax.random.split(memory)
         drives, targets = self.groups["arm"], act.targets["arm"]
         off = jax.random.uniform(k_noise, targets.shape, minval=-self.amount, maxval=self.amount)
-        return memory, act.to("arm", jnp.clip(targets + toward(act.level, 0.0, off), drives.low, drives.high))
+        return memory, act.to("arm", jnp.clip(toward(act.level, targets, targets + off), drives.low, drives.high))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,7 +279,7 @@ class Chain:
         self, memory: Mapping[str, Memory], action: Float[Array, " na"], joint_pos: Float[Array, " nj"], ctrl: Float[Array, " nu"]
     ) -> tuple[dict[str, Memory], Float[Array, " nu"]]:
         """The drives' targets for an action; of the episode's memory, what is the terms' changes."""
-        act, after = self._act(action, joint_pos, ctrl).replace(level=memory.get(LEVEL)), dict(memory)
+        act, after = dataclasses.replace(self._act(action, joint_pos, ctrl), level=memory.get(LEVEL)), dict(memory)
         for i, (name, term) in enumerate(self.terms.items()):
             own = jnp.split(act.action, self._splits)[i]
             remembered, act = term.step(memory.get(f"actions.{name}", ()), own, act)

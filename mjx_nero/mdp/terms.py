@@ -211,8 +211,8 @@ def observe(
         values = by_name(group, (seen or {}).get(name, view), recall, name)
         for term in group:
             for line in group[term].lines:
-                seen_now = recall.through(f"observations.{name}.{term}.{type(line).__name__.lower()}", line, values[term])
-                values[term] = toward(level, values[term], seen_now) if isinstance(line, Delay) else seen_now
+                passed = recall.through(f"observations.{name}.{term}.{type(line).__name__.lower()}", line, values[term])
+                values[term] = toward(level, values[term], passed) if isinstance(line, Delay) else passed
         k_group, noisy = jax.random.fold_in(key, i), corruption and any(term.noise for term in group.values())
         if name in apart:
             keys = jax.random.split(k_group, len(group)) if noisy else ()

@@ -72,7 +72,9 @@ class Randomization:
     def __call__(self, key: Key, level: Float[Array, ""] | None = None) -> Fields:
         """The fields of one world; empty without terms. ``level``: see ``types.LEVEL``."""
         drawn: Fields = {}
-        for k_term, term in zip(jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True):
+        for k_term, term in zip(
+            jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True
+        ):
             for field, (rows, values) in term(k_term, self._model(drawn)).items():
                 drawn[field] = drawn.get(field, jnp.asarray(self._nominal[field])).at[rows].set(values)
         drawn = {name: toward(level, jnp.asarray(self._nominal[name]), values) for name, values in drawn.items()}

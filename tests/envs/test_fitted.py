@@ -13,6 +13,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from mjx_nero import UserError, env_cfg, make
+from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.learn import evaluation
 from mjx_nero.sim import contacts, grasp, robot_file, scene
@@ -113,6 +114,27 @@ def test_edits_of_the_robots_file_count(hand):
     assert (start["x"], start["y"]) == ((1.3, 1.4), (-1.0, -0.9))
     assert env_cfg("lift", robot=beside).command == cfg.command  # of the robot
     assert env_cfg("pick_place", robot=beside).command.params["z"] == pytest.approx((0.015 - 0.1,) * 2)
+
+
+@pytest.mark.parametrize("gap", [0.02, 0.05, 0.08])
+def test_how_far_a_hand_opens_is_found_without_its_formula(gap):
+    """The RG6's linkage: its pads in the model are as far apart as its formula says."""
+    blind = dataclasses.replace(COBOTTA_PRO_900.gripper, gap=None, positions=None)
+    found = grasp.opened(dataclasses.replace(COBOTTA_PRO_900, gripper=blind), gap).gripper
+    np.testing.assert_allclose(found.open, grasp.opened(COBOTTA_PRO_900, gap).gripper.open, atol=2e-4)
+    assert found.home == found.open and found.close == blind.close
+
+
+def test_slow_fingers_begin_near_the_cube(hand):
+    """A cube of 4 cm in a hand that opens by 10 cm: a finger goes 3 cm to it. Slow ones begin 8 cm apart."""
+    robot = robot_file.read(hand)
+    slow = dataclasses.replace(robot, gripper=dataclasses.replace(robot.gripper, speed=(0.05,)))
+    assert grasp.closing_time(robot, 0.04) == pytest.approx(0.03 / robot.gripper.speed[0], abs=2e-3)
+    assert grasp.closing_time(slow, 0.04) == pytest.approx(0.6, abs=0.02)
+    assert env_cfg("lift", robot=robot).robot.gripper.open == robot.gripper.open
+    near = env_cfg("lift", robot=slow).robot.gripper
+    assert near.open == pytest.approx((0.04,), abs=5e-4) and near.home == near.open  # the other finger follows
+    assert grasp.opened(slow, 0.2).gripper == slow.gripper  # it does not open as far
 
 
 def test_buffers_of_an_imported_arm_hold_the_worst_case(hand):

@@ -13,6 +13,20 @@ def test_every_task_that_is_to_be_learnt_has_one_but_one():
     assert set(results.learnable()) - set(NAMES) == {"cobotta_stack"}
 
 
+REAL = [name for name in NAMES if policy.shipped(name, "sim2real") != policy.shipped(name)]
+
+
+def test_lifts_and_reaches_have_one_for_the_real_arm():
+    assert set(REAL) == {*(f"{arm}_lift" for arm in ("nero", "cobotta", "piper", "so101")), "nero_reach", "cobotta_reach"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_it_succeeds_where_everything_differs(name):
+    found = evaluation.play(evaluation.EvalCfg(name, preset="sim2real", agent="policy", episodes=64, backend="mujoco")).result
+    assert found["success_rate"] >= (0.7 if name.startswith("so101") else 0.85)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_it_succeeds(name):

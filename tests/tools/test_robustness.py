@@ -1,10 +1,12 @@
 """What is varied to see how far a policy gets."""
 
+import json
+
 import pytest
 
 from mjx_nero import UserError, __main__
 from mjx_nero.envs.registry import env_cfg
-from mjx_nero.tools.robustness import measure
+from mjx_nero.tools.robustness import command, measure
 from mjx_nero.tools.robustness.sweeps import ALL, Point, sweeps
 
 
@@ -42,3 +44,44 @@ def test_actions_are_as_late_as_asked_for_whatever_the_task_draws():
     bench = measure.Bench("nero_reach", "default", env_cfg("nero_reach"), None, 32, "native", 1)
     rates = {late: bench.success(Point(delay=(late, late)))["success_rate"] for late in (0, 5)}
     assert rates[0] > 0.9 and rates[5] < rates[0] - 0.3
+
+
+FIGURES = {
+    "env": "nero_lift",
+    "preset": "default",
+    "version": "0.5.0",
+    "curves": {"damping [factor]": [{"value": 0.5, "success_rate": 0.25, "success_rate_95": [0.1, 0.4], "diverged": 0}]},
+}
+
+
+def test_two_policies_are_in_one_picture(tmp_path):
+    path = tmp_path / "plain.json"
+    path.write_text(json.dumps(FIGURES))
+    plain = command.read(path)
+    assert plain["curves"]["damping [factor]"] == [{"value": 0.5, "success_rate": 0.25, "success_rate_95": (0.1, 0.4)}]
+    sizes = []
+    for name, results in (("one", [plain]), ("two", [plain, {**plain, "preset": "sim2real"}])):
+        command.save_plot(tmp_path / f"{name}.png", results)
+        sizes.append((tmp_path / f"{name}.png").stat().st_size)
+    assert sizes[1] > sizes[0] > 1000  # a legend and a second line
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "[]",
+        "{}",
+        "null",
+        json.dumps({**FIGURES, "curves": {"a": [{"value": "x"}]}}),
+        json.dumps({**FIGURES, "curves": {"a": [{"value": 1, "success_rate": 1, "success_rate_95": [1]}]}}),
+        "[" * 100_000,
+    ],
+)
+def test_what_holds_no_figures_is_one_line(tmp_path, content):
+    path = tmp_path / "other.json"
+    path.write_text(content)
+    with pytest.raises(UserError, match=r"other\.json holds no figures of robustness: make them by --json"):
+        command.read(path)
+    with pytest.raises(UserError, match="--beside is for the picture: pass --plot, too"):
+        __main__.main(["robustness", "--env", "nero_lift", "--beside", str(path)])

@@ -13,6 +13,8 @@ from mjx_nero.mdp.terms import ObservationTerm, Term
 from mjx_nero.sim import grasp, robot_file
 from mjx_nero.sim.robot import RobotCfg
 
+_STEPS = 200_000_000  # of a lift on a GPU: the widening takes some 50 M of them
+
 
 def randomized(cfg: EnvCfg) -> EnvCfg:
     """A task with drives, loads, objects, delays and sensors that differ from episode to episode."""
@@ -33,6 +35,7 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
         sensors={**cfg.sensors, "encoders": Term(sensors.Encoders), **_eyes(objects)},
         pushes={**cfg.pushes, **pushed},
         widening=Term(curriculum.BySuccess),
+        training={**cfg.training, "num_timesteps": _STEPS if objects else _STEPS // 2},
     )
 
 

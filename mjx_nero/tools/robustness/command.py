@@ -1,10 +1,13 @@
 """The command ``robustness``."""
 
 import dataclasses
+import json
 import math
 import pathlib
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 import mjx_nero
 from mjx_nero import cli, config, console, files
@@ -13,6 +16,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools.robustness import sweeps
 
 STEP = "physics step [factor]"
+_LARGEST = 1 << 20  # [bytes] of figures
 
 
 def main(argv: Sequence[str]) -> None:
@@ -29,9 +33,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="parameters with this in their name; again")
     parser.add_argument("--json", type=cli.path(".json"), help="write the figures as JSON")
     parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write the curves")
+    parser.add_argument("--beside", type=cli.path(".json"), help="figures of another policy (--json), for the same picture")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     for path in filter(None, (args.json, args.plot)):
         files.check_writable(path)
+    if args.beside and not args.plot:
+        raise UserError("--beside is for the picture: pass --plot, too")
+    other = read(args.beside) if args.beside else None
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     names = [name for name in (*sweeps.sweeps(cfg), STEP) if not args.only or any(text in name for text in args.only)]
     if not names:
@@ -46,7 +54,7 @@ def main(argv: Sequence[str]) -> None:
         files.write_json(args.json, result)
         console.wrote(screen, "figures", args.json)
     if args.plot:
-        save_plot(args.plot, result)
+        save_plot(args.plot, [result, *filter(None, (other,))])
         console.wrote(screen, "curves", args.plot)
 
 
@@ -98,25 +106,56 @@ def table(result: dict[str, Any]) -> console.Table:
     return view
 
 
-def save_plot(path: pathlib.Path, result: dict[str, Any]) -> None:
-    """A panel a parameter: success with its intervals."""
+def read(path: pathlib.Path) -> dict[str, Any]:
+    """Figures that ``--json`` wrote; a stranger may have made them.
+
+    Raises:
+        UserError: it holds none, or cannot be read.
+    """
+    content = files.read_bytes(path, _LARGEST)
+    try:
+        found = json.loads(content)
+        return {
+            **{name: str(found[name]) for name in ("env", "preset", "version")},
+            "curves": {
+                str(name): [
+                    {**{k: float(point[k]) for k in ("value", "success_rate")}, "success_rate_95": _interval(point)}
+                    for point in curve
+                ]
+                for name, curve in found["curves"].items()
+            },
+        }
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        raise UserError(f"{path} holds no figures of robustness: make them by --json") from None
+
+
+def _interval(point: Any) -> tuple[float, float]:
+    low, high = map(float, point["success_rate_95"])
+    return low, high
+
+
+def save_plot(path: pathlib.Path, results: Sequence[dict[str, Any]]) -> None:
+    """A panel a parameter of the first result: success with its intervals, and that of the others."""
     from matplotlib.figure import Figure
 
-    curves = result["curves"]
-    columns = min(4, len(curves))
-    rows = math.ceil(len(curves) / columns)
+    first, *_ = results
+    columns = min(4, len(first["curves"]))
+    rows = math.ceil(len(first["curves"]) / columns)
     figure = Figure(figsize=(3.2 * columns, 0.6 + 2.3 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for panel, (name, curve) in zip(panels, curves.items(), strict=False):
-        values, rates = [p["value"] for p in curve], [p["success_rate"] for p in curve]
-        low, high = zip(*(p["success_rate_95"] for p in curve), strict=True)
-        panel.plot(values, rates, marker="o", markersize=3, color="tab:blue")
-        panel.fill_between(values, low, high, color="tab:blue", alpha=0.2)
+    for panel, name in zip(panels, first["curves"], strict=False):
+        for color, result in zip(("tab:blue", "tab:orange"), results, strict=False):
+            curve = result["curves"].get(name, [])
+            values, rates = [p["value"] for p in curve], [p["success_rate"] for p in curve]
+            panel.plot(values, rates, marker="o", markersize=3, color=color, label=result["preset"])
+            panel.fill_between(values, *np.array([p["success_rate_95"] for p in curve]).reshape(-1, 2).T, color=color, alpha=0.2)
         panel.set_title(name, loc="left", fontsize=9)
         panel.set_ylim(-0.02, 1.02)
         panel.grid(alpha=0.3)
-    for panel in panels[len(curves) :]:
+    if len(results) > 1:
+        panels[0].legend(fontsize=8, loc="lower left")
+    for panel in panels[len(first["curves"]) :]:
         panel.set_axis_off()
-    figure.suptitle(f"success of {result['env']}, version {result['version']}", x=0.01, ha="left")
+    figure.suptitle(f"success of {first['env']}, version {first['version']}", x=0.01, ha="left")
     with files.whole(path) as part:
         figure.savefig(part, dpi=110)
