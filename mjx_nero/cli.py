@@ -105,6 +105,12 @@ class Parser(argparse.ArgumentParser):
             dotted[prefix][name] = value
         return args, dotted
 
+    def only(self, dotted: Mapping[str, Mapping[str, str]], learners: Sequence[str], learner: str) -> None:
+        """Refuses the fields of other learners than the one that is asked for."""
+        for name in learners:
+            if dotted[name] and name != learner:
+                self.error(f"--{name}.* is for --learner {name}, and this is {learner}")
+
     def given(self, argv: Sequence[str]) -> set[str]:
         """Names of the flags in ``argv``, as they are called in what ``parse`` gives; dotted ones apart."""
         missing = object()

@@ -13,9 +13,7 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learner.names()), _cfgs)
-    for name in learner.names():
-        if dotted[name] and name != args.learner:
-            parser.error(f"--{name}.* is for --learner {name}, and this is {args.learner}")
+    parser.only(dotted, learner.names(), args.learner)
     from mjx_nero.tools import train_run  # with Brax, which help does without
 
     train_run.start(args, dotted, parser.given(argv))

@@ -36,6 +36,9 @@ MISTAKES = [
     (["--plot", "rows.jpeg"], "--plot takes a name that ends in .png, got 'rows.jpeg'"),
     (["--plot", "ik.png", "--what", "ik"], "--plot draws physics, step, ppo, control, reset: name one of them in --what"),
     (["--faster"], "unknown argument '--faster'"),
+    (["--what", "learning", "--ppo.learning_rte", "1"], "learning_rte"),
+    (["--what", "ppo", "--ppo.max_learning_rate", "2"], "max_learning_rate"),
+    (["--env.sim.dtt", "0.1"], "sim.dtt"),
 ]
 
 
@@ -186,11 +189,14 @@ class Runs:
 def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     """Evaluations come every 20 steps; of three seeds one succeeds at the second, one at the first, one never."""
     runs = Runs([[0.0, 0.5, 0.95, 1.0, 1.0], [0.2, 1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.2, 0.9, 0.94]])
-    monkeypatch.setattr(compiled, "make_learner", lambda run: runs)
+    asked = []
+    monkeypatch.setattr(compiled, "make_learner", lambda run: asked.append(run) or runs)
     monkeypatch.setattr(compiled, "starter", lambda runs: lambda seed: runs.init(jax.random.PRNGKey(seed)))
     monkeypatch.setattr(compiled, "compile", Runs.compiled)
     argv = ["--what", "learning", "--num-envs", 8, "--impl", "native", "--seeds", 3, "--num-timesteps", 70, "--eval-every", 29]
-    code, out, _ = call("benchmark", *argv, "--json", "rows.json")
+    fields = ["--ppo.max_learning_rate", "5e-4", "--env.episode_length_s", "2"]
+    code, out, _ = call("benchmark", *argv, *fields, "--json", "rows.json")
+    assert asked[0].hyperparameters.max_learning_rate == 5e-4 and asked[0].env.episode_length_s == 2
     *seeds, summary = json.loads((tmp_path / "rows.json").read_text())["rows"]
     assert code == 0 and "2 of 3" in out and "median 40, worst never" in out
     found = [(r["seed"], r["reached"], r["env_steps"], r["success_rate"], r["nan_count"]) for r in seeds]

@@ -8,7 +8,7 @@ import pathlib
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mjx_nero import cli, config, console, files
@@ -17,6 +17,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import compiled, device_memory, evaluation, run_cfg
+from mjx_nero.learn import learner as learners
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
 from mjx_nero.tools.benchmark.program import Row
@@ -64,11 +65,14 @@ class _Job:
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    args, _ = _parser().parse(argv)
+    parser = _parser()
+    args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    parser.only(dotted, learners.names(), args.learner)
     whats = cli.choices(args.what, "what", tuple(WHATS))
     _check_files(args.json, args.plot, whats)
     cli.setup_jax()
-    jobs = _jobs(args, registry.env_cfg(args.env, args.preset, args.robot), whats)
+    cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
+    jobs = _jobs(args, cfg, dotted.get(args.learner, {}), whats)
     head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
     here = machine.machine()
     report = {"machine": here, "versions": machine.versions(), "command": command(argv), "complete": False}
@@ -127,20 +131,28 @@ def _parser() -> cli.Parser:
     return parser
 
 
-def _jobs(args: argparse.Namespace, cfg: EnvCfg, whats: list[str]) -> list[_Job]:
+def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
+    """What ``--help`` lists the fields of."""
+    cfg = registry.env_cfg(args.env, args.preset, args.robot)
+    return {"env": cfg, args.learner: run_cfg.learner_cfg(cfg, args.preset, args.learner)}
+
+
+def _jobs(args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str]) -> list[_Job]:
     """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here."""
+    make_run = functools.partial(_run, args, hyperparameters)
     jobs = []
     for impl in dict.fromkeys(resolve_impl(impl) for impl in cli.choices(args.impl, "impl", impls())):
         for what in whats:
             if what == "learning":
                 for n in args.num_envs or [0]:
-                    run = _run(args, cfg, impl, n)
+                    run = make_run(cfg, impl, n)
                     rows = functools.partial(learning.measure_learning, run, args.seeds, args.target)
                     compiled.make_learner(run)
                     jobs.append(_Job(what, impl, run.num_envs, rows))
             elif what not in ("ik", "render"):
                 task = for_controllers(cfg) if what == "control" else cfg
-                jobs += [_throughput(what, ManipulationEnv(task, impl, n), args) for n in args.num_envs or _sizes(_SIZES)]
+                sizes = args.num_envs or _sizes(_SIZES)
+                jobs += [_throughput(what, ManipulationEnv(task, impl, n), args, make_run) for n in sizes]
     if "render" in whats:
         env = ManipulationEnv(cfg)
         jobs.append(_Job("render", "", 0, lambda: [drawing.measure_render(env, min(20, args.steps), args.repeats)]))
@@ -149,11 +161,11 @@ def _jobs(args: argparse.Namespace, cfg: EnvCfg, whats: list[str]) -> list[_Job]
     return jobs
 
 
-def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _Job:
+def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace, make_run: Callable[..., run_cfg.RunCfg]) -> _Job:
     make: Callable[[], throughput.Program]
     about: Row = {}
     if what == "ppo":
-        run = _run(args, env.cfg, env.impl, env.num_envs)
+        run = make_run(env.cfg, env.impl, env.num_envs)
         learner = compiled.make_learner(run)
         iterations = max(1, args.steps * env.num_envs // learner.steps_per_iteration)
         make = functools.partial(throughput.training, learner, iterations)
@@ -168,9 +180,9 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace) -> _J
     return _Job(what, env.impl, env.num_envs, lambda: [throughput.measure(what, env, make, args.repeats) | about])
 
 
-def _run(args: argparse.Namespace, cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
+def _run(args: argparse.Namespace, asked: Mapping[str, str], cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
     sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
-    fields = {name: value for name, value in sizes.items() if value}
+    fields = {**asked, **{name: value for name, value in sizes.items() if value}}
     learner = config.override(run_cfg.learner_cfg(cfg, args.preset, args.learner), fields)
     how = {"impl": impl, "eval_every": args.eval_every, "num_devices": args.num_devices, "learner": args.learner}
     return run_cfg.fit_machine(run_cfg.RunCfg(args.env, args.preset, cfg, learner, **how))[0]
