@@ -61,6 +61,10 @@ class Cloud:
         driven = {j: np.full(len(q), self.q[j][1]) for j in self._hand.joints} | dict(zip(self.arm, q.T, strict=True))
         return {name: self._turn @ p for name, p in body_poses(self._parts, driven, len(q)).items()}
 
+    def grasp_point(self, q: Mapping[str, float]) -> Pose:
+        """Its pose [4, 4] with the arm's joints at ``q``, the gripper open."""
+        return self._sites(self.at(np.array([[q[j] for j in self.arm]])))[0]
+
     def _sites(self, poses: Mapping[str, Poses]) -> Poses:
         body = body_of(self._parts, self._hand.link)
         return poses[body.name] @ body.links[self._hand.link] @ self._hand.site

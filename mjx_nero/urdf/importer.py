@@ -79,7 +79,7 @@ def import_urdf(
     work = workspace.workspace(cloud, tree.name, notes)
     shapes = [(link, shape, bits > 0) for link, items in collisions.items() for _, shape, bits in items]
     at_home = rest.home(parts, looks.of, hand, cloud, start, home or {}, shapes, work, tree.name, notes)
-    down = workspace.down(cloud, hand, work[0])
+    down = workspace.down(cloud, hand, work[0], at_home)
     low = [(link, shape) for link, shape, meets in shapes if meets]
     pick, hold, down = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
     made = _Model(tree, parts, hand, collisions, at_home, notes)

@@ -18,6 +18,8 @@ CELLS = 12  # of the reach
 STARTS, DESCENTS = 8, 3  # of the inverse kinematics, for a point and for a cell
 TABLE = 0.05  # [m] the workspace stays above
 SIDES = ((0, 1), (1, 1), (1, -1), (0, -1))  # axis and sign
+DOWNWARD = 0.85  # cosine of the tilt of a hand that points down
+TURNED = 0.3  # its opening is nearer to y one way round than the other, if their cosine is more
 FRONT = 2.5  # times as many cells have to be on another side for the workspace to lie there
 Grid = Bool[np.ndarray, "a b c"]
 Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -174,10 +176,11 @@ def _reached(cloud: Cloud, goals: Points, down: bool, starts: int) -> Bool[np.nd
     return ~np.isnan(cloud.solve(goals, down, starts, one=True)[:, :, 0]).all(1)
 
 
-def down(cloud: Cloud, hand: Hand, box: Box | None) -> tuple[float, float, float, float]:
+def down(cloud: Cloud, hand: Hand, box: Box | None, home: Mapping[str, float]) -> tuple[float, float, float, float]:
     """Orientation (wxyz) of the grasp point with the approach straight down and the opening along y.
 
-    Two are, half a turn apart: the one that more random poses in the workspace are near to.
+    Two are, half a turn apart: the one that is nearer at home, as a hand has better to do than to turn by half a turn first; if
+    neither is, the one that more random poses in the workspace are near to.
     """
     approach, opening = hand.approach, hand.opening
     if abs(approach @ opening) > 1e-6:
@@ -192,9 +195,13 @@ def down(cloud: Cloud, hand: Hand, box: Box | None) -> tuple[float, float, float
     near = np.ones(len(points), bool)
     for k, (lower, upper) in enumerate(box or ()):
         near &= (points[:, k] > lower) & (points[:, k] < upper)
-    downward = near & ((sites @ approach)[:, 2] < -0.85)
+    downward = near & ((sites @ approach)[:, 2] < -DOWNWARD)
     along = (sites[downward] @ opening)[:, 1]
     votes = [(along > 0.7).sum(), (along < -0.7).sum()]
+    first = cloud.grasp_point(home)[:3, :3]
+    turned = (first @ opening)[1]
+    if (first @ approach)[2] < -DOWNWARD and abs(turned) > TURNED:
+        votes = [turned > 0, turned < 0]
     quats = []
     for turn in turns:
         quat = np.zeros(4)

@@ -149,6 +149,20 @@ def test_tool_points_along_its_own_axis(tmp_path):
     np.testing.assert_allclose(matrix.reshape(3, 3)[:, 0], [0, 0, -1], atol=1e-6)
 
 
+def test_a_hand_points_down_the_way_round_that_it_is_at_home(tmp_path):
+    """Half a turn of the wrist at home, and what is called pointing down is turned by as much."""
+    downs = []
+    for name, turn in (("one", 0.0), ("other", 2.9)):
+        folder = tmp_path / name
+        given = {"a1": 0.0, "a2": 0.4, "a3": 1.4, "a4": 0.0, "a5": 1.34, "a6": turn}  # the hand down
+        model, report = imported(folder, base(), *six(), *fingers(folder, "link6"), home=given)
+        hand, down = at_home(model, report).site(report.robot.ee_site).xmat.reshape(3, 3), np.zeros(9)
+        mujoco.mju_quat2Mat(down, np.array(report.robot.down))
+        assert (hand.T @ down.reshape(3, 3))[1, 1] > 0.9  # the axis along which the fingers open
+        downs.append(report.robot.down)
+    assert set(downs) == {(0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)}
+
+
 def test_home_is_amid_the_workspace_and_away_from_limits(tmp_path):
     """An elbow whose limit is at 0, where the arm would be stretched out as well."""
     model, report = imported(
