@@ -70,11 +70,19 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
 
 
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.Setup], EnvCfg]) -> EnvCfg:
+    setup = lift_setup(robot)
+    return factory(_ready(robot), setup)
+
+
+def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
+    return factory(_ready(robot))
+
+
+def _ready(robot: RobotCfg) -> RobotCfg:
     """With slow fingers open no further than a cube asks for: a jaw that turns by 85 degrees before it meets one hardly ever does
     so by chance, and all that is learnt begins with that."""
-    setup, edge = lift_setup(robot), grasp.cube_for(robot).size[0]
-    slow = grasp.closing_time(robot, edge) > SLOW
-    return factory(grasp.opened(robot, OPEN * edge) if slow else robot, setup)
+    edge = grasp.cube_for(robot).size[0]
+    return grasp.opened(robot, OPEN * edge) if grasp.closing_time(robot, edge) > SLOW else robot
 
 
 def _pick_place(robot: RobotCfg) -> EnvCfg:
@@ -112,4 +120,6 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
+    "place": (None, _presets(_tower, **place.presets())),
+    "stack": (None, _presets(_tower, **stack.presets())),
 }

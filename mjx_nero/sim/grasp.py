@@ -68,6 +68,25 @@ def opened(robot: RobotCfg, gap: float) -> RobotCfg:
     return dataclasses.replace(robot, gripper=dataclasses.replace(fingers, open=open, home=open))
 
 
+def shut(robot: RobotCfg, gap: float) -> RobotCfg:
+    """The robot with a hand that holds what is ``gap`` wide [m]: as it is, or one that closes as far as its joints go.
+
+    Raises:
+        UserError: its pads are too far apart even so.
+    """
+    hand, fingers = _Hand(robot), robot.gripper
+    if hand.apart(0.0) <= gap:
+        return robot
+    share = hand.least()
+    if (least := hand.apart(share)) > gap:
+        raise UserError(
+            f"the hand of {robot.name} closes to {least:.3g} m between its pads, and is to hold what is {gap:.3g} m wide"
+        )
+    return dataclasses.replace(
+        robot, gripper=dataclasses.replace(fingers, close=tuple(round(float(q), 5) for q in hand.positions(share)))
+    )
+
+
 def closing_time(robot: RobotCfg, gap: float) -> float:
     """How long the fingers take from open to where their pads are ``gap`` apart [s]."""
     hand = _Hand(robot)
@@ -82,7 +101,7 @@ def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
 
 
 class _Hand:
-    """A robot's fingers, moved from closed (0) to open (1).
+    """A robot's fingers, moved from closed (0) to open (1), or beyond.
 
     Attributes:
         pads: geoms that grip.
@@ -106,15 +125,23 @@ class _Hand:
             self.data.qpos[coupling.follower] = coupling.position(self.data.qpos)
         mujoco.mj_kinematics(self.model, self.data)
 
+    def least(self) -> float:
+        """The share at which the first of its joints is at its limit."""
+        close, way = self.positions(0.0), self.positions(1.0) - self.positions(0.0)
+        ranges = np.array([self.model.joint(name).range for name in self._robot.joints])
+        ends = np.where(way > 0, ranges[:, 0], ranges[:, 1])
+        moving = way != 0
+        return float(np.max((ends - close)[moving] / way[moving])) if moving.any() else 0.0
+
     def share(self, gap: float) -> float:
         """At which two pads are ``gap`` apart [m]; 1 where they never are as far."""
         low, high = 0.0, 1.0
-        while high - low > 1e-5 and self._apart(1.0) > gap:
+        while high - low > 1e-5 and self.apart(1.0) > gap:
             middle = (low + high) / 2
-            low, high = (low, middle) if self._apart(middle) > gap else (middle, high)
+            low, high = (low, middle) if self.apart(middle) > gap else (middle, high)
         return high
 
-    def _apart(self, share: float) -> float:
+    def apart(self, share: float) -> float:
         """The least distance between two pads that are not of one body [m]."""
         self.move(share)
         bodies, far, ends = self.model.geom_bodyid, 1.0, np.zeros(6)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
+from mjx_nero.envs.arms.so_arm100 import SO_ARM100
 from mjx_nero.learn import evaluation
 from mjx_nero.sim import contacts, grasp, robot_file, scene
 from mjx_nero.sim.robot import GripperCfg
@@ -48,9 +49,11 @@ def test_a_cube_that_fits_by_hand(opening, pad, edge, height):
 
 
 @pytest.mark.parametrize(("robot", "own"), OWN.items())
-def test_the_packages_arms_lift_where_their_own_task_does(robot, own):
+def test_the_packages_arms_lift_as_in_their_own_task(robot, own):
+    """The cube lies where the hand can point down, which is not all of the recipe's region for Piper and the SO-ARMs."""
     fitted, tuned = env_cfg("lift", robot=robot), env_cfg(f"{own}_lift")
-    assert fitted.events == tuned.events and fitted.command == tuned.command
+    assert fitted.command == tuned.command
+    assert (fitted.events == tuned.events) == (robot in ("nero", "cobotta_pro_900"))
     assert list(fitted.rewards) == list(tuned.rewards) and fitted.observations == tuned.observations
     size = fitted.scene.objects["cube"].size[0]
     assert 0.3 * fitted.robot.opening < size <= 0.6 * fitted.robot.opening
@@ -71,9 +74,10 @@ def test_an_imported_arm_has_its_regions_in_the_task(hand):
     assert table[0, 0] < x[0] - 0.1 and table[0, 1] > x[1] + 0.1 and table[1, 0] < y[0] - 0.1 and table[1, 1] > y[1] + 0.1
 
 
-def test_pick_is_reached_pointing_down_and_hold_somehow(hand):
+@pytest.mark.parametrize("name", ["hand", *OWN])
+def test_pick_is_reached_pointing_down_and_hold_somehow(name, hand):
     """At every corner, by scipy's own inverse kinematics on the compiled model, joints within limits."""
-    robot = robot_file.read(hand)
+    robot = robot_file.read(hand) if name == "hand" else env_cfg("reach", robot=name).robot
     model = scene.robot_model(robot)
     data, ids = mujoco.MjData(model), [model.joint(j).qposadr[0] for j in robot.arm.joints]
     bounds = np.array([model.joint(j).range for j in robot.arm.joints]).T
@@ -83,10 +87,12 @@ def test_pick_is_reached_pointing_down_and_hold_somehow(hand):
     def miss(q, goal, turns):
         data.qpos[ids] = q
         mujoco.mj_kinematics(model, data)
-        now = Rotation.from_matrix(data.site("ee").xmat.reshape(3, 3))
-        return np.concatenate([data.site("ee").xpos - goal, turns * 0.1 * (down * now.inv()).as_rotvec()])
+        now = Rotation.from_matrix(data.site(robot.ee_site).xmat.reshape(3, 3))
+        return np.concatenate(
+            [data.site(robot.ee_site).xpos - robot.base_pos - goal, turns * 0.1 * (down * now.inv()).as_rotvec()]
+        )
 
-    for box, turns in ((robot.pick, 1.0), (robot.hold, 0.0)):
+    for box, turns in ((robot.pick, 1.0), *([(robot.hold, 0.0)] if name == "hand" else [])):
         for goal in itertools.product(*box):
             starts = [np.array(robot.arm.home), *rng.uniform(*bounds, (15, len(ids)))]
             found = (optimize.least_squares(miss, s, bounds=bounds, args=(np.array(goal), turns)) for s in starts)
@@ -135,6 +141,27 @@ def test_slow_fingers_begin_near_the_cube(hand):
     near = env_cfg("lift", robot=slow).robot.gripper
     assert near.open == pytest.approx((0.04,), abs=5e-4) and near.home == near.open  # the other finger follows
     assert grasp.opened(slow, 0.2).gripper == slow.gripper  # it does not open as far
+
+
+def test_towers_begin_with_slow_fingers_near_the_cube(hand):
+    """Wide open, a slow jaw would still be closing as the hand lifts."""
+    robot = robot_file.read(hand)
+    slow = dataclasses.replace(robot, gripper=dataclasses.replace(robot.gripper, speed=(0.05,)))
+    for env in ("place", "stack"):
+        assert env_cfg(env, robot=robot).robot.gripper.open == robot.gripper.open
+        assert env_cfg(env, robot=slow).robot.gripper.open == env_cfg("lift", robot=slow).robot.gripper.open
+
+
+def test_hands_close_on_what_is_narrow_or_say_so():
+    """The SO-ARM's jaw closes to 17.5 mm where the recipe ends, and to 2 mm where its joint does; Nero's pads meet."""
+    assert grasp.shut(NERO, 0.01) is NERO and grasp.shut(SO_ARM100, 0.02) is SO_ARM100
+    jaw = grasp.shut(SO_ARM100, 0.01)
+    assert jaw.gripper.close == (-0.2,) and jaw.gripper.open == SO_ARM100.gripper.open
+    assert env_cfg("clutter", robot="so_arm100").robot.gripper.close == (-0.2,)
+    with pytest.raises(
+        UserError, match=r"^the hand of so_arm100 closes to 0\.00198 m between its pads, and is to hold what is 0\.001 m"
+    ):
+        grasp.shut(SO_ARM100, 0.001)
 
 
 def test_buffers_of_an_imported_arm_hold_the_worst_case(hand):

@@ -18,7 +18,7 @@ ROBOT = PIPER = RobotCfg(
     workspace=((0.3, 0.4), (-0.2, 0.2), (0.2, 0.4)),
     opening=NERO.opening,
     pad=NERO.pad,
-    pick=((0.3, 0.4), (-0.1, 0.2), (0.02, 0.1)),
+    pick=((0.19, 0.27), (-0.12, 0.12), (0.02, 0.12)),
     hold=NERO.hold,
     arm=DriveCfg(
         joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),

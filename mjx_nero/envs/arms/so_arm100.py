@@ -46,7 +46,7 @@ ROBOT = SO_ARM100 = RobotCfg(
     max_step=0.005,
     opening=0.052,
     pad=(0.03, 0.012, 0.004),
-    pick=((0.1, 0.3), (-0.2, 0.2), (0.02, 0.08)),
+    pick=((0.14, 0.23), (-0.12, 0.12), (0.02, 0.08)),
     hold=((0.1, 0.3), (-0.1, 0.1), (0.2, 0.35)),
     arm=DriveCfg(
         joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),

@@ -134,12 +134,13 @@ class Tower:
         if top + LIFTED > high:
             needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, and pick ends at {high:.3g} m"
             raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
+        # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
         leave = max(there.travel, top + max(self.edge, self.clearance + LIFTED))
         fields = {
             "tower": self.objects,
             "rise": self.edge,
             "events_dt": QUICK,
-            "end_effector_initial_height": round(min(high, leave), 4),
+            "end_effector_initial_height": round(leave, 4),
             "end_effector_offset": there.offset,
             "motion": "ik",
             "turn": self.angle < math.pi,

@@ -80,16 +80,23 @@ def extent(item: ObjectCfg) -> float:
     return first + (rest[0] / 2 if rest else 0.0)
 
 
+def across(item: ObjectCfg) -> float:
+    """How wide it is between the pads of a hand that fits it [m]."""
+    first, *rest = item.size
+    return min(first, *rest[:1]) if item.shape == "box" else 2 * first
+
+
 def fitted(robot: RobotCfg) -> Setup:
     """What follows from the robot's gripper, and from where it can grasp and hold.
 
     Raises:
-        UserError: as ``regions.of``.
+        UserError: as ``regions.of``, or the hand does not close on all of the objects.
     """
     there, (thickness, width) = regions.of(robot), (robot.pad[2], robot.pad[1])
     edge = grasp.cube_for(robot).size[0]
     unit = edge / SIZES[1]
     objects = {name: _object(unit, **shape) for name, shape in SHAPES.items()}
+    robot = grasp.shut(robot, SIZES[0] * min(map(across, objects.values())))
     robot = grasp.opened(robot, OPEN * edge)
     around = SIZES[1] * max(extent(item) for item in objects.values())
     hand = float(np.hypot(min(OPEN * edge, robot.opening) / 2 + thickness, width / 2)) + MARGIN
