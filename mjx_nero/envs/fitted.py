@@ -120,6 +120,5 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
-    "place": (None, _presets(_tower, **place.presets())),
-    "stack": (None, _presets(_tower, **stack.presets())),
+    **{name: (None, _presets(_tower, **FITTING[name])) for name in ("place", "stack")},
 }

@@ -126,12 +126,14 @@ class _Hand:
         mujoco.mj_kinematics(self.model, self.data)
 
     def least(self) -> float:
-        """The share at which the first of its joints is at its limit."""
+        """The share at which the first of its joints is at its limit; 0 where one has none."""
         close, way = self.positions(0.0), self.positions(1.0) - self.positions(0.0)
-        ranges = np.array([self.model.joint(name).range for name in self._robot.joints])
-        ends = np.where(way > 0, ranges[:, 0], ranges[:, 1])
+        joints = [self.model.joint(name).id for name in self._robot.joints]
+        ends = np.where(way > 0, *self.model.jnt_range[joints].T)
         moving = way != 0
-        return float(np.max((ends - close)[moving] / way[moving])) if moving.any() else 0.0
+        if not moving.any() or not self.model.jnt_limited[joints].all():
+            return 0.0
+        return float(np.max((ends - close)[moving] / way[moving]))
 
     def share(self, gap: float) -> float:
         """At which two pads are ``gap`` apart [m]; 1 where they never are as far."""
