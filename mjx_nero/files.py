@@ -181,11 +181,16 @@ def check_writable(path: pathlib.Path) -> None:
         raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")
 
 
+class FolderRemoved(UserError):
+    """A folder went away while a file was written into it."""
+
+
 @contextlib.contextmanager
 def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Where to write a file that then appears whole or not at all, even if the power fails. Makes its folder.
 
     Raises:
+        FolderRemoved: somebody removed its folder meanwhile: it may be written again.
         UserError: it cannot be written.
     """
     part = path.with_name(f".{path.stem}{PART}{path.suffix}")
@@ -198,7 +203,8 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     except (OSError, ValueError) as error:  # ValueError: a kind of file that a library does not know
         if isinstance(error, UserError):
             raise
-        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
+        kind = FolderRemoved if isinstance(error, FileNotFoundError) else UserError
+        raise kind(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,27 @@ def test_failed_write_keeps_the_old_file(path, monkeypatch):
         checkpoint.save(path, {"x": jnp.zeros(3)}, {})
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(("removals", "written"), [(1, True), (3, True), (100, False)])
+def test_a_folder_that_is_removed_meanwhile(tmp_path, monkeypatch, removals, written):
+    """It is made anew, and the file written again; not for ever."""
+    replace, path, seen = os.replace, tmp_path / "run" / "file.safetensors", []
+
+    def removed(source, to):
+        seen.append(source)
+        if len(seen) <= removals:
+            shutil.rmtree(path.parent)
+        replace(source, to)
+
+    monkeypatch.setattr(os, "replace", removed)
+    if written:
+        checkpoint.save(path, TREE, META)
+        assert len(seen) == removals + 1 and checkpoint.load_meta(path)["numbers"] == META["numbers"]
+    else:
+        with pytest.raises(UserError, match=r"^cannot write .*file\.safetensors: No such file or directory$"):
+            checkpoint.save(path, TREE, META)
+        assert not path.exists()
 
 
 def test_unwritable_folder(tmp_path):
