@@ -162,11 +162,8 @@ def standing(view: View, *, tower: tuple[str, ...], rise: float, within: Within)
     return _sum(level.stands for level in _levels(view, tower, rise, within))
 
 
-def _away(view: View, tower: tuple[str, ...], top: str, clearance: float) -> Scalar:
-    """From ``top`` and all below it, as ``built`` wants it: who leaves the top one downwards holds the next one."""
-    names = [name for name in tower[: tower.index(top) + 1] if name != GOAL]
-    nearest = jnp.min(jnp.stack([jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) for name in names]))
-    return jnp.minimum(nearest / clearance, 1.0)
+def _away(view: View, name: str, clearance: float) -> Scalar:
+    return jnp.minimum(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / clearance, 1.0)
 
 
 def opened(
@@ -179,7 +176,7 @@ def opened(
     close: tuple[float, ...],
     clearance: Positive,
 ) -> Scalar:
-    """How far the fingers are opened while the object stands, from 0 to 1; or how far they are away (see ``left``), if that is
+    """How far the fingers are opened while the object stands, from 0 to 1; or how far they are from it (see ``left``), if that is
     more: they may have work elsewhere.
 
     Args:
@@ -188,12 +185,12 @@ def opened(
     fingers, opens, closes = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(close)
     share = jnp.clip(jnp.mean((fingers - closes) / (opens - closes)), 0.0, 1.0)
     levels = _levels(view, tower, rise, within)
-    return _sum(level.stands * jnp.maximum(share, _away(view, tower, level.object, clearance)) for level in levels)
+    return _sum(level.stands * jnp.maximum(share, _away(view, level.object, clearance)) for level in levels)
 
 
 def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
-    """How far the grasp point is from an object that stands, and those below, as a share of ``clearance`` [m], at most 1."""
-    return _sum(level.stands * _away(view, tower, level.object, clearance) for level in _levels(view, tower, rise, within))
+    """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1."""
+    return _sum(level.stands * _away(view, level.object, clearance) for level in _levels(view, tower, rise, within))
 
 
 def completed(

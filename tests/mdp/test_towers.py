@@ -109,10 +109,6 @@ IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON), 1.0),
-        # Down to the blue cube is not away from them; the third one's has all three to leave.
-        (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.03)), 0.2),
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.03), fingers=(0.0, 0.0)), 0.2),
-        (towers.left, {**THREE, "clearance": 0.05}, view(ON, top=TOP, hand=(0.4, 0.1, 0.12)), 1.0 + 0.4),
         (towers.left, {**STACK, "clearance": 0.05}, view(LYING), 0.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(ON), 1.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(LYING), 0.0),
