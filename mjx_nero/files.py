@@ -14,6 +14,7 @@ from lxml import etree
 
 from mjx_nero.errors import UserError
 
+TRIES = 5  # of a file whose folder is removed as it is written
 PART = ".part"  # in the name of a file that is not whole yet
 MAX_TAGS = 400_000  # of an XML file
 MAX_YAML = 200_000  # bytes
@@ -181,7 +182,7 @@ def check_writable(path: pathlib.Path) -> None:
         raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")
 
 
-class FolderRemoved(UserError):
+class _FolderRemoved(UserError):
     """A folder went away while a file was written into it."""
 
 
@@ -190,7 +191,6 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Where to write a file that then appears whole or not at all, even if the power fails. Makes its folder.
 
     Raises:
-        FolderRemoved: somebody removed its folder meanwhile: it may be written again.
         UserError: it cannot be written.
     """
     part = path.with_name(f".{path.stem}{PART}{path.suffix}")
@@ -203,11 +203,27 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     except (OSError, ValueError) as error:  # ValueError: a kind of file that a library does not know
         if isinstance(error, UserError):
             raise
-        kind = FolderRemoved if isinstance(error, FileNotFoundError) else UserError
+        kind = _FolderRemoved if isinstance(error, FileNotFoundError) else UserError
         raise kind(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def write(path: pathlib.Path, data: bytes) -> None:
+    """Writes a file, whole or not at all; again where somebody removes its folder meanwhile.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    for left in reversed(range(TRIES)):
+        try:
+            with whole(path) as part:
+                part.write_bytes(data)
+            return
+        except _FolderRemoved:
+            if not left:
+                raise
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:
@@ -216,8 +232,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    with whole(path) as part:
-        part.write_text(json.dumps(finite(value), indent=2, allow_nan=False, default=str) + "\n")
+    write(path, (json.dumps(finite(value), indent=2, allow_nan=False, default=str) + "\n").encode())
 
 
 def finite(value: Any) -> Any:

@@ -16,7 +16,6 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import header, machines
 
 Tree = TypeVar("Tree")
-TRIES = 5  # of a file whose folder is removed as it is written
 
 
 class Damaged(UserError):
@@ -40,15 +39,7 @@ def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
     """
     arrays = dict(zip(_names(tree), [np.asarray(x, order="C") for x in jax.tree.leaves(tree)], strict=True))
     text = json.dumps(files.finite(meta), allow_nan=False)
-    data = serialize(arrays, metadata={"meta": text, "crc32": _checksum(arrays)})
-    for left in reversed(range(TRIES)):
-        try:
-            with files.whole(path) as part:
-                part.write_bytes(data)
-            return
-        except files.FolderRemoved:  # a training whose folder was removed makes it anew
-            if not left:
-                raise
+    files.write(path, serialize(arrays, metadata={"meta": text, "crc32": _checksum(arrays)}))
 
 
 def verify(path: pathlib.Path) -> None:
