@@ -21,8 +21,9 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     ``joint_velocity``: likewise, of set-points, as ``mdp.actions.JointVelocity`` has it: shares of the drives' speeds, smoothed
     with the time constant ``time`` [s], at most ``ahead`` [s] of full speed before the joints; targets lead by ``lag`` [s].
     ``binary``: ``close`` for a negative entry, else ``open``, one for all the joints. The others change what is there:
-    ``speed_limit`` (targets ``of`` some joints move at most as fast as the drives), ``delay`` (in control steps, the least and
-    the most) and ``low_pass`` (time constant [s]) of the action.
+    ``anti_windup`` (targets ``of`` some joints that turn back start at most ``ahead`` [s] of full speed behind the joints),
+    ``speed_limit`` (they move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
+    ``low_pass`` (time constant [s]) of the action.
 
     Raises:
         UserError: a term that only this package knows.
@@ -48,6 +49,9 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
     if kind is terms.SpeedLimit:
         limited = _drives(robot, term).joints if term.params["group"] else robot.joints
         return [{"name": name, "type": "speed_limit", "of": list(limited)}]
+    if kind is terms.AntiWindup:
+        of = {"of": list(_drives(robot, term).joints), "ahead": term.params["ahead"]}
+        return [{"name": name, "type": "anti_windup", **of}]
     if kind is terms.Delay:
         return [{"name": name, "type": "delay", "steps": list(term.params["steps"])}]
     if kind is terms.LowPass:

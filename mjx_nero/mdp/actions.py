@@ -180,6 +180,26 @@ class BinaryGripper(Plain):
 
 
 @dataclasses.dataclass(frozen=True)
+class AntiWindup(Plain):
+    """Targets of a group that turn back start at most ``ahead`` [s] of full speed from their joints; for before a speed limit.
+
+    Fingers press with a target that lies far behind what they hold. To let go they would first have to take that way back, at the
+    speed of the drives: half a second in which nothing happens. Without any way back noise opens the hand.
+    """
+
+    group: str = dataclasses.field(default="gripper", kw_only=True)
+    ahead: NonNegative = dataclasses.field(default=0.1, kw_only=True)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """The targets in force nearer to the joints, if the way to the new ones leads there."""
+        to, now, joints = act.targets[self.group], act.ctrl[self.group], act.joint_pos[self.group]
+        most = jnp.asarray(self.groups[self.group].speed * np.float32(self.ahead))
+        start = jnp.clip(now, joints - most, joints + most)
+        start = jnp.clip(start, jnp.minimum(now, to), jnp.maximum(now, to))
+        return memory, dataclasses.replace(act, ctrl={**act.ctrl, self.group: start})
+
+
+@dataclasses.dataclass(frozen=True)
 class SpeedLimit(Plain):
     """Targets move at most as fast as the drives: those of a group, or of all of them (empty)."""
 

@@ -163,7 +163,12 @@ def standing(view: View, *, tower: tuple[str, ...], rise: float, within: Within)
 
 
 def _away(view: View, name: str, clearance: float) -> Scalar:
-    return jnp.minimum(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / clearance, 1.0)
+    """How far the grasp point is above or beside the object, from 0 to 1.
+
+    Below is not away: down a tower a hand slides that hardly opens, to hold what is there; up it takes the object along.
+    """
+    off = view.ee_pos_w - view.objects[name].pos_w
+    return jnp.minimum(jnp.linalg.norm(off.at[2].max(0.0)) / clearance, 1.0)
 
 
 def opened(
@@ -173,23 +178,23 @@ def opened(
     rise: float,
     within: Within,
     open: tuple[float, ...],
-    close: tuple[float, ...],
+    hold: tuple[float, ...],
     clearance: Positive,
 ) -> Scalar:
     """How far the fingers are opened while the object stands, from 0 to 1; or how far they are from it (see ``left``), if that is
     more: they may have work elsewhere.
 
     Args:
-        open, close: positions of the gripper's joints, the last of all [rad or m].
+        open, hold: positions of the gripper's joints, the last of all, wide open and where they hold the object [rad or m].
     """
-    fingers, opens, closes = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(close)
-    share = jnp.clip(jnp.mean((fingers - closes) / (opens - closes)), 0.0, 1.0)
+    fingers, opens, holds = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(hold)
+    share = jnp.clip(jnp.mean((fingers - holds) / (opens - holds)), 0.0, 1.0)
     levels = _levels(view, tower, rise, within)
     return _sum(level.stands * jnp.maximum(share, _away(view, level.object, clearance)) for level in levels)
 
 
 def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
-    """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1."""
+    """How far the grasp point is above or beside an object that stands, as a share of ``clearance`` [m], at most 1."""
     return _sum(level.stands * _away(view, level.object, clearance) for level in _levels(view, tower, rise, within))
 
 

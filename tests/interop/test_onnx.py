@@ -113,6 +113,11 @@ def test_positions_and_speed_limits_are_told():
     assert limit == {"name": "speed_limit", "type": "speed_limit", "of": list(env.cfg.robot.joints)}
 
 
+def test_a_gripper_that_lets_go_at_once_is_told():
+    *_, back, _ = meaning.parts(mjx_nero.make("nero_stack", impl="native"))
+    assert back == {"name": "anti_windup", "type": "anti_windup", "of": ["gripper_joint1", "gripper_joint2"], "ahead": 0.1}
+
+
 def test_histories_and_filters_are_told():
     late = {"observations.state.joint_pos.history": 3, "observations.state.joint_vel.delay": (1, 2), "action_clip": 2.0}
     env = mjx_nero.make("nero_reach", impl="native", **late)
@@ -127,7 +132,7 @@ def test_histories_and_filters_are_told():
         meaning.parts(mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=own), impl="native"))
 
 
-@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push"])
+@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push", "cobotta_stack"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
     """The page's program, word for word, without this package: its joint targets are the environment's."""
     punctual = {} if env_name == "nero_push" else {"actions.delay.params.steps": (0, 0)}

@@ -347,6 +347,19 @@ def test_a_speed_limit_of_one_group_leaves_the_others():
     np.testing.assert_allclose(out, [[0.3, 1.0, 0.02, -0.02]], atol=1e-6)
 
 
+def test_targets_that_turn_back_start_near_the_joints():
+    """Fingers that hold at 30 and -20 mm are pressed by targets of 0 and -1; 0.01 s of full speed are 15 mm."""
+    chain = {**GRIPPER, "back": Term(actions.AntiWindup, params={"ahead": 0.01}), "limit": Term(actions.SpeedLimit)}
+    out = play(chain, [[-1.0], [-1.0], [1.0], [1.0]], joints=(0.25, 2.0, 0.03, -0.02))[:, 2:]
+    np.testing.assert_allclose(out[:2], [[0.0, -0.001]] * 2, atol=1e-7)  # closing goes on
+    np.testing.assert_allclose(out[2:], [[0.045, -0.035], [0.05, -0.05]], atol=1e-7)  # at once, then as fast as ever
+
+
+def test_without_anti_windup_targets_take_all_of_the_way_back():
+    out = play({**GRIPPER, "limit": Term(actions.SpeedLimit)}, [[-1.0], [-1.0], [1.0]], joints=(0.25, 2.0, 0.03, -0.02))[:, 2:]
+    np.testing.assert_allclose(out[-1], [0.03, -0.031], atol=1e-7)
+
+
 def test_a_gripper_closes_for_negative_actions_within_its_ranges():
     out = play({**ARM, **GRIPPER}, [[0.0, 0.0, a] for a in (-1e-6, -5.0, 0.0, 3.0)])
     np.testing.assert_array_equal(out[:, 2:], np.float32([[0.0, -0.001]] * 2 + [[0.05, -0.05]] * 2))

@@ -50,10 +50,11 @@ STACK = {"tower": ("blue", "red"), "rise": 0.04, "within": WITHIN}
 THREE = {**STACK, "tower": ("blue", "red", "top")}
 PLACE = {**STACK, "tower": ("goal", "red")}
 HELD = {"minimal_height": 0.03, "grasp_radius": 0.04}
-GRIPPER = {"open": (0.05, -0.05), "close": (0.0, 0.0), "clearance": 0.05}
+GRIPPER = {"open": (0.05, -0.05), "hold": (0.02, -0.02), "clearance": 0.05}
 WAY = {**HELD, "over": 0.03, "std": 0.05}
 ON, LYING, TOP = (0.4, 0.1, 0.06), (0.4, -0.1, 0.02), (0.4, 0.1, 0.1)
 IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
+HOLDING = (0.02, -0.02)
 
 
 @pytest.mark.parametrize(
@@ -101,13 +102,17 @@ IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
         (towers.standing, THREE, view(LYING, top=TOP), 0.0),
         (towers.standing, PLACE, view(thing((0.31, 0.0, 0.02), EIGHTH), goal=EIGHTH), 1.0),
         (towers.standing, PLACE, view(thing((0.31, 0.0, 0.02), EIGHTH)), 0.0),  # turned
-        # Fingers two fifths open at the cube; wide open; closed, but 3 cm away; nothing stands.
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON, fingers=(0.02, -0.02)), 0.4),
+        # Fingers that hold the cube; two fifths open from there; wide open; closed, but 3 cm away; nothing stands.
+        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON, fingers=HOLDING), 0.0),
+        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON, fingers=(0.032, -0.032)), 0.4),
         (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON), 1.0),
         (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.09), fingers=(0.0, 0.0)), 0.6),
         (towers.opened, {**STACK, **GRIPPER}, view(LYING), 0.0),
+        # At the cube; 3 cm above it; beside it; far below it; as far away as it takes.
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),
+        (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.07, 0.06)), 0.6),
+        (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.0)), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON), 1.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(LYING), 0.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(ON), 1.0),
@@ -172,7 +177,7 @@ def test_rewards_pay_more_for_every_phase_and_nothing_for_shortcuts():
         (towers.left, {**STACK, "clearance": 0.05}),
         (towers.completed, BUILT),
     ]
-    closed = {"fingers": (0.02, -0.02)}
+    closed = {"fingers": HOLDING}
     phases = [
         view(LYING),
         view(LYING, hand=LYING),

@@ -9,7 +9,7 @@ from mjx_nero.envs.regions import Regions
 from mjx_nero.envs.task import SuccessCfg
 from mjx_nero.mdp import metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
-from mjx_nero.sim import contacts
+from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
@@ -92,7 +92,7 @@ class Tower:
         """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones."""
         near, carried = self.near, {**self.near, **self.held}
         way, leave = {**carried, "over": round(0.75 * self.edge, 4)}, {**near, "clearance": self.clearance}
-        fingers = {"open": self.robot.gripper.open, "close": self.robot.gripper.close}
+        fingers = {"open": self.robot.gripper.open, "hold": grasp.opened(self.robot, self.edge).gripper.open}
         turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
         return {
             "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **near}),
