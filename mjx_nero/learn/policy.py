@@ -199,12 +199,17 @@ def load_for(
     terms = {group: list(members) for group, members in env.cfg.observations.items()}
     sizes = jax.tree.map(list, env.observation_size, is_leaf=_is_shape)
     same_terms = policy.meta["observations"]["state"] == terms["state"]
-    if same_terms and (policy.meta["observation_size"]["state"], policy.meta["action_size"]) != (sizes["state"], env.action_size):
-        count = f"{policy.meta['action_size']} actions, {robot} takes {env.action_size}"
+    if same_terms and policy.meta["action_size"] != env.action_size:
+        count = f"{policy.meta['action_size']} actions, {name} takes {env.action_size}"
         raise UserError(f"{path} is of another robot ({count}): leave out --robot, or train one with it and pass --policy")
     if not same_terms:
         raise UserError(
             f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
+        )
+    if (trained_on := policy.meta["observation_size"]["state"]) != sizes["state"]:
+        raise UserError(
+            f"{path} was trained on observations of size {trained_on}, here it is {sizes['state']}: pass the --preset (it had "
+            f"{policy.meta['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
         )
     if header.acts_by(policy.meta) != header.acts_by({"actions": env.action_kinds}):
         given = policy.meta.get("actions", ["JointPosition"])

@@ -170,6 +170,14 @@ def test_all_backends_know_all_pairs_of_shapes_but_a_plain_cylinders():
         make("nero_clutter", impl="jax", **{"scene.objects.cylinder.shape": "cylinder"}).physics  # noqa: B018
 
 
+def test_four_objects_are_one_of_each_shape_and_the_lighter_for_it():
+    cfg = env_cfg("nero_clutter", "four")
+    assert cfg.targets == tuple(cfg.scene.objects) == ("box", "cylinder", "sphere", "capsule")
+    assert cfg.events["scatter"].params["count"] == (3, 4) and CFG.events["scatter"].params["count"] == (3, 6)
+    assert {name: item for name, item in CFG.scene.objects.items() if name in cfg.targets} == cfg.scene.objects
+    assert cfg.sim.constraints_per_env < CFG.sim.constraints_per_env and cfg.robot == CFG.robot
+
+
 def near(term: str) -> dict:
     return {"rewards": {"near": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, "object": term})}}
 
@@ -197,10 +205,12 @@ def test_without_targets_no_term_may_name_one():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cobotta_clutter", "nero_clutter"])
-def test_the_controller_lifts_what_it_is_told_to(name):
-    expert = evaluation.play(evaluation.EvalCfg(name, controller="expert", episodes=32, impl="native")).result
+@pytest.mark.parametrize(
+    ("name", "preset"), [("cobotta_clutter", "default"), ("nero_clutter", "default"), ("nero_clutter", "four")]
+)
+def test_the_controller_lifts_what_it_is_told_to(name, preset):
+    expert = evaluation.play(evaluation.EvalCfg(name, preset=preset, controller="expert", episodes=32, impl="native")).result
     assert expert["success_rate"] >= 28 / 32 and expert["nan_count"] == 0
     for agent in ("zero", "random"):
-        idle = evaluation.play(evaluation.EvalCfg(name, agent=agent, episodes=32, impl="native")).result
+        idle = evaluation.play(evaluation.EvalCfg(name, preset=preset, agent=agent, episodes=32, impl="native")).result
         assert idle["success_rate"] == 0 and expert["return_mean"] > idle["return_mean"] + 50

@@ -132,6 +132,12 @@ def test_policy_of_another_preset(path):
         policy.load_for(recipe, "nero_lift", path)
 
 
+def test_policy_of_the_same_terms_of_other_sizes(path):
+    longer = make("nero_lift", impl="native", **{"observations.state.joint_pos.history": 2})
+    with pytest.raises(UserError, match=r"of size \[47\], here it is \[56\]: pass the --preset \(it had default\) and the"):
+        policy.load_for(longer, "nero_lift", path)
+
+
 def test_policy_of_other_actions(env, trained, tmp_path):
     """Of before 0.5.0, which had positions and did not say so; and the other way round."""
     positions = make("nero_lift", impl="native", actions=joint_actions())
