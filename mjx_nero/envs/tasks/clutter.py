@@ -1,6 +1,7 @@
 """Clutter: of several objects of different shape, lift the one that is commanded and hold it at a commanded point.
 
-Three to six of six objects are on the table; with the preset ``four``, which is faster, three or four of four.
+Three to six of six objects are on the table; with the preset ``four``, three or four, one of each
+shape.
 """
 
 import dataclasses
