@@ -1,7 +1,6 @@
 """Clutter: of several objects of different shape, lift the one that is commanded and hold it at a commanded point.
 
-Three to six of six objects are on the table; with the preset ``four``, three or four, one of each
-shape.
+Three to six of six objects are on the table; with the preset ``four`` three or four, one of each shape.
 """
 
 import dataclasses
