@@ -30,6 +30,7 @@ class _Level:
     """An object that is to be moved: the way to its place [m], and whether those below it stand, and it, too."""
 
     object: str
+    below: str
     way: Float[Array, "3"]
     due: Bool[Array, ""]
     stands: Bool[Array, ""]
@@ -61,7 +62,7 @@ def _levels(view: View, tower: tuple[str, ...], rise: float, within: Within) -> 
         there = (jnp.linalg.norm(to[:2]) < aside) & (jnp.abs(to[2]) < height)
         if below == GOAL:
             there &= jnp.linalg.norm(turn_to_goal(view, object=object)) < angle
-        yield _Level(object, to, due, due & there)
+        yield _Level(object, below, to, due, due & there)
         due &= there
 
 
@@ -162,13 +163,14 @@ def standing(view: View, *, tower: tuple[str, ...], rise: float, within: Within)
     return _sum(level.stands for level in _levels(view, tower, rise, within))
 
 
-def _away(view: View, name: str, clearance: float) -> Scalar:
-    """How far the grasp point is above or beside the object, from 0 to 1.
+def _away(view: View, level: _Level, clearance: float) -> Scalar:
+    """How far the grasp point is from the object, from 0 to 1; where that is on another, above or beside it.
 
-    Below is not away: down a tower a hand slides that hardly opens, to hold what is there; up it takes the object along.
+    Below is not away there: down a tower a hand slides that hardly opens, to hold what is there; up it takes the object along.
     """
-    off = view.ee_pos_w - view.objects[name].pos_w
-    return jnp.minimum(jnp.linalg.norm(off.at[2].max(0.0)) / clearance, 1.0)
+    off = view.ee_pos_w - view.objects[level.object].pos_w
+    off = off if level.below == GOAL else off.at[2].max(0.0)
+    return jnp.minimum(jnp.linalg.norm(off) / clearance, 1.0)
 
 
 def opened(
@@ -185,17 +187,18 @@ def opened(
     more: they may have work elsewhere.
 
     Args:
-        open, hold: positions of the gripper's joints, the last of all, wide open and where they hold the object [rad or m].
+        open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
     """
     fingers, opens, holds = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(hold)
     share = jnp.clip(jnp.mean((fingers - holds) / (opens - holds)), 0.0, 1.0)
     levels = _levels(view, tower, rise, within)
-    return _sum(level.stands * jnp.maximum(share, _away(view, level.object, clearance)) for level in levels)
+    return _sum(level.stands * jnp.maximum(share, _away(view, level, clearance)) for level in levels)
 
 
 def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
-    """How far the grasp point is above or beside an object that stands, as a share of ``clearance`` [m], at most 1."""
-    return _sum(level.stands * _away(view, level.object, clearance) for level in _levels(view, tower, rise, within))
+    """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1; where that is on another
+    one, above or beside it."""
+    return _sum(level.stands * _away(view, level, clearance) for level in _levels(view, tower, rise, within))
 
 
 def completed(

@@ -77,6 +77,13 @@ def test_fingers_close_in_half_a_second_at_the_least():
     assert env_cfg("cobotta_stack").robot.gripper.speed == (0.9, 0.9)  # its own
 
 
+def test_fingers_count_as_opened_from_where_they_hold_a_cube_and_of_a_box_from_shut():
+    holds = {env: env_cfg(env).rewards["releasing"].params["hold"] for env in ("nero_stack", "cobotta_stack", "nero_place")}
+    assert holds["nero_stack"] == pytest.approx((0.02, -0.02))  # a cube of 4 cm
+    assert holds["cobotta_stack"] == pytest.approx((0.242, -0.242), abs=1e-3)
+    assert holds["nero_place"] == NERO.gripper.close
+
+
 def test_robots_that_cannot_are_told_in_one_line():
     low = dataclasses.replace(NERO, pick=((0.3, 0.4), (-0.1, 0.2), (0.02, 0.08)))
     assert stack.default(low).controllers["pick_place"]["end_effector_initial_height"] == pytest.approx(

@@ -113,6 +113,7 @@ HOLDING = (0.02, -0.02)
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.07, 0.06)), 0.6),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.0)), 0.0),
+        (towers.left, {**PLACE, "clearance": 0.05}, view((0.3, 0.0, 0.02), hand=(0.3, 0.0, 0.01)), 0.2),  # on the table
         (towers.left, {**STACK, "clearance": 0.05}, view(ON), 1.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(LYING), 0.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(ON), 1.0),

@@ -9,7 +9,7 @@ from mjx_nero.envs.regions import Regions
 from mjx_nero.envs.task import SuccessCfg
 from mjx_nero.mdp import metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
-from mjx_nero.sim import contacts, grasp
+from mjx_nero.sim import contacts
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
@@ -30,6 +30,7 @@ class Tower:
     Attributes:
         objects: from the bottom up, as in ``mdp.towers``.
         edge: how high an object is, and how far apart the fingers hold it [m].
+        hold: positions of the fingers from which on they count as opened [rad or m].
         aside: how far from its place an object may be, along the table [m].
         angle: from the goal's orientation, likewise [rad].
     """
@@ -38,6 +39,7 @@ class Tower:
     scene: SceneCfg
     objects: tuple[str, ...]
     edge: float
+    hold: tuple[float, ...]
     aside: float
     angle: float = math.pi
 
@@ -92,7 +94,7 @@ class Tower:
         """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones."""
         near, carried = self.near, {**self.near, **self.held}
         way, leave = {**carried, "over": round(0.75 * self.edge, 4)}, {**near, "clearance": self.clearance}
-        fingers = {"open": self.robot.gripper.open, "hold": grasp.opened(self.robot, self.edge).gripper.open}
+        fingers = {"open": self.robot.gripper.open, "hold": self.hold}
         turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
         return {
             "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **near}),

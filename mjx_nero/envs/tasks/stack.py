@@ -32,7 +32,9 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
     scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
     # On it, as far as it stays: the centre within the face below.
-    tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2)
+    # Fingers count as opened from where they hold a cube: while they hold a wide one they are half open already.
+    hold = grasp.opened(robot, edge).gripper.open
+    tower = Tower(robot, scene, tuple(objects), edge, hold, aside=edge / 2)
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
