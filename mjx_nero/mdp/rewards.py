@@ -30,6 +30,20 @@ def object_ee_distance(view: View, *, std: Positive, object: str = "cube") -> Fl
     return 1.0 - jnp.tanh(_ee_distance(view, object) / std)
 
 
+def behind_object_distance(
+    view: View, *, std: Positive, behind: Positive, near: Positive = 0.02, object: str = "cube"
+) -> Float[Array, ""]:
+    """1 - tanh(d / std), d the distance from the grasp point to where the object is pushed from [m].
+
+    That is ``behind`` its centre as seen from the goal, along the table; less from about ``near`` the goal on, where it is the
+    centre itself [m].
+    """
+    seen = view.objects[object].pos_w
+    way = (view.goal_pos_w - seen).at[2].set(0.0)
+    at = seen - behind * way / jnp.sqrt(jnp.sum(jnp.square(way)) + near**2)
+    return 1.0 - jnp.tanh(jnp.linalg.norm(at - view.ee_pos_w) / std)
+
+
 def object_is_lifted(view: View, *, minimal_height: float, object: str = "cube") -> Float[Array, ""]:
     """1 while the object's centre is above ``minimal_height`` [m]. Isaac Lab's lift task."""
     return (view.objects[object].pos_w[2] > minimal_height).astype(jnp.float32)
@@ -95,6 +109,11 @@ def object_goal_pose(
     """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), object to goal (see ``success.object_turn``)."""
     angle = jnp.linalg.norm(success.object_turn(view, fold=fold, object=object))
     return goal_distance(view, std=std, object=object) * (1.0 - jnp.tanh(angle / angle_std))
+
+
+def object_goal_turn(view: View, *, std: Positive, fold: Count = 1, object: str = "cube") -> Float[Array, ""]:
+    """1 - tanh(angle / std), object to goal [rad] (see ``success.object_turn``), wherever the object is."""
+    return 1.0 - jnp.tanh(jnp.linalg.norm(success.object_turn(view, fold=fold, object=object)) / std)
 
 
 def object_at_pose(

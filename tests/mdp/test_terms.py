@@ -59,6 +59,11 @@ def at_height(z: float) -> View:
     return view(object_pos_w=[1.0, 2.0, z], ee_pos_w=[1.0, 2.0, z + 0.03], goal_pos_w=[1.0, 2.0, z + 0.1])
 
 
+def pushed(ee_pos_w: list[float]) -> View:
+    """The goal 4 and 3 cm from the object, along the table."""
+    return view(ee_pos_w=ee_pos_w, goal_pos_w=[1.04, 2.03, 3.2])
+
+
 # 13 cm and a right angle from the goal
 QUARTER = {"ee_pos_w": [1.03, 2.04, 3.42], "goal_quat_w": [0.5**0.5, 0.0, 0.0, 0.5**0.5]}
 LYING = {"object_quat_w": [1.0, 0.0, 0.0, 0.0], "goal_quat_w": [0.5**0.5, 0.0, 0.0, 0.5**0.5]}
@@ -96,6 +101,14 @@ REWARDS = [
     # 10 cm and a right angle from the goal: of a box with four sides alike, none
     (rewards.object_goal_pose, {"std": 0.1, "angle_std": math.pi / 2}, view(**LYING), (1 - TANH_1) ** 2),
     (rewards.object_goal_pose, {"std": 0.1, "angle_std": math.pi / 2, "fold": 4}, view(**LYING), 1 - TANH_1),
+    # wherever it is
+    (rewards.object_goal_turn, {"std": math.pi / 2}, view(**LYING), 1 - TANH_1),
+    (rewards.object_goal_turn, {"std": math.pi}, view(**{**LYING, "object_pos_w": [9.0, 9.0, 9.0]}), 1 - TANH_HALF),
+    (rewards.object_goal_turn, {"std": 1.0, "fold": 4}, view(**LYING), 1.0),
+    # the hand 10 cm above the place that is as far behind the object as the goal is before it; the goal straight above it
+    (rewards.behind_object_distance, {"std": 0.1, "behind": 0.05, "near": 1e-6}, pushed([0.96, 1.97, 3.3]), 1 - TANH_1),
+    (rewards.behind_object_distance, {"std": 0.2, "behind": 0.13, "near": 0.12}, pushed([0.96, 1.97, 3.3]), 1 - TANH_HALF),
+    (rewards.behind_object_distance, {"std": 0.05, "behind": 0.05}, view(), 1 - TANH_1),
     (rewards.object_at_pose, {"threshold": 0.11, "angle": 1.6}, view(**LYING), 1.0),
     (rewards.object_at_pose, {"threshold": 0.11, "angle": 1.5, "fold": 2}, view(**LYING), 0.0),
     (rewards.object_at_pose, {"threshold": 0.11, "angle": 0.1, "fold": 4}, view(**LYING), 1.0),
