@@ -25,12 +25,14 @@ def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
     }
 
 
-def velocity_actions(gripper: bool = True, late: Steps = (0, 1)) -> dict[str, Term]:
+def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: NonNegative = 0.0) -> dict[str, Term]:
     """One action an arm joint (its velocity, at +-1 the drive's), then one for the gripper, if it has one.
 
-    An episode's actions come late by as many control steps as it draws from ``late``, as those of a real arm do.
+    An episode's actions come late by as many control steps as it draws from ``late``, as those of a real arm do. ``hysteresis``
+    is the gripper's (``mdp.actions.BinaryGripper``).
     """
-    hand = {"gripper": Term(actions.BinaryGripper), "speed_limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
+    grip = Term(actions.BinaryGripper, params={"hysteresis": hysteresis})
+    hand = {"gripper": grip, "speed_limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
     return {
         "delay": Term(actions.Delay, params={"steps": late}),
         "arm": Term(actions.JointVelocity),

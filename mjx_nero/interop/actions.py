@@ -20,7 +20,8 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     Those with ``joints`` read entries of the action. ``joint_position``: ``offset + scale * action`` [rad, m], an entry a joint.
     ``joint_velocity``: likewise, of set-points, as ``mdp.actions.JointVelocity`` has it: shares of the drives' speeds, smoothed
     with the time constant ``time`` [s], at most ``ahead`` [s] of full speed before the joints; targets lead by ``lag`` [s].
-    ``binary``: ``close`` for a negative entry, else ``open``, one for all the joints. The others change what is there:
+    ``binary``: ``close`` for an entry below minus ``hysteresis``, ``open`` from plus that on, between as it was (at first open),
+    one for all the joints. The others change what is there:
     ``anti_windup`` (targets ``of`` some joints that turn back start at most ``ahead`` [s] of full speed behind the joints),
     ``speed_limit`` (they move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
     ``low_pass`` (time constant [s]) of the action.
@@ -44,7 +45,8 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
         of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
         return [{"name": name, "type": "joint_position", **of}]
     if kind is terms.BinaryGripper:
-        of = {"joints": list(robot.gripper.joints), "open": list(robot.gripper.open), "close": list(robot.gripper.close)}
+        ends = {"open": list(robot.gripper.open), "close": list(robot.gripper.close)}
+        of = {"joints": list(robot.gripper.joints), **ends, "hysteresis": term.params["hysteresis"]}
         return [{"name": name, "type": "binary", **of}] if robot.gripper.joints else []
     if kind is terms.SpeedLimit:
         limited = _drives(robot, term).joints if term.params["group"] else robot.joints

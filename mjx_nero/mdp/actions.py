@@ -164,19 +164,32 @@ class DriveTargets(Plain):
 
 @dataclasses.dataclass(frozen=True)
 class BinaryGripper(Plain):
-    """One entry, if there is a gripper: closed where negative, else open. Isaac Lab's ``BinaryJointPositionAction``."""
+    """One entry, if there is a gripper: closed where negative, else open. Isaac Lab's ``BinaryJointPositionAction``.
+
+    Attributes:
+        hysteresis: it closes below minus that, opens from plus that on, and stays as it is between, at first open. Noise about
+            zero opens and closes a hand many times a second; so it stays closed for long enough to grasp by chance.
+    """
+
+    hysteresis: NonNegative = dataclasses.field(default=0.0, kw_only=True)
 
     @property
     def home(self) -> np.ndarray:
         """Open."""
         return np.zeros(int(len(self.groups["gripper"].home) > 0), np.float32)
 
+    def init(self, key: Key, act: Act) -> Memory:
+        """Whether it is closed, if that may matter."""
+        return jnp.zeros((), bool) if self.hysteresis and len(self.home) else ()
+
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the gripper."""
         drives = self.groups["gripper"]
         if not len(own):
             return memory, act
-        return memory, act.to("gripper", jnp.clip(jnp.where(own[0] < 0, drives.close, drives.open), drives.low, drives.high))
+        closed = own[0] < (jnp.where(memory, self.hysteresis, -self.hysteresis) if self.hysteresis else 0.0)
+        targets = jnp.clip(jnp.where(closed, drives.close, drives.open), drives.low, drives.high)
+        return (closed if self.hysteresis else memory), act.to("gripper", targets)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -92,7 +92,7 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
     assert meta["observations"][1]["units"] == "rad/s, m/s"
     late, arm, gripper, limit = meta["actions"]
     assert (late["steps"], arm["type"], arm["lag"][0]) == ([0, 1], "joint_velocity", 0.5)
-    assert (gripper["open"], gripper["close"]) == ([0.05, -0.05], [0.0, -0.001])
+    assert (gripper["open"], gripper["close"], gripper["hysteresis"]) == ([0.05, -0.05], [0.0, -0.001], 0.5)
     assert limit == {"name": "speed_limit", "type": "speed_limit", "of": ["gripper_joint1", "gripper_joint2"]}
     assert meta["action_clip"] is None
     assert (meta["control_dt"], meta["robot"], meta["env"]) == (0.02, "nero", "nero_lift")

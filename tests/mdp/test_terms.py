@@ -378,6 +378,15 @@ def test_a_gripper_closes_for_negative_actions_within_its_ranges():
     np.testing.assert_array_equal(out[:, 2:], np.float32([[0.0, -0.001]] * 2 + [[0.05, -0.05]] * 2))
 
 
+def test_a_gripper_with_hysteresis_changes_its_mind_beyond_it_alone():
+    chain = {**ARM, "gripper": Term(actions.BinaryGripper, params={"hysteresis": 0.5})}
+    asked = [(-0.4, False), (-0.6, True), (0.0, True), (0.4, True), (0.6, False), (-0.4, False), (-9.0, True), (0.5, False)]
+    out = play(chain, [[0.0, 0.0, action] for action, _ in asked])
+    np.testing.assert_array_equal(out[:, 2], np.float32([0.0 if closed else 0.05 for _, closed in asked]))
+    assert list(actions.Chain(chain, GROUPS).init(KEY, jnp.zeros(4))) == ["actions.gripper"]
+    assert not actions.Chain({**ARM, **GRIPPER}, GROUPS).init(KEY, jnp.zeros(4))
+
+
 def test_without_a_term_of_its_own_the_gripper_stays_at_home():
     np.testing.assert_array_equal(play(ARM, [[1.0, 0.0]])[0, 2:], np.float32([0.05, -0.05]))
 

@@ -114,7 +114,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     }
     return dataclasses.replace(
         recipe,
-        actions=velocity_actions(),
+        actions=velocity_actions(hysteresis=0.5),
         observations={
             "state": state,
             "privileged_state": {
@@ -139,8 +139,11 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
 
 
 def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
-    """The default with all that differs between a simulated arm and a real one: see ``sim2real``."""
-    return sim2reals.randomized(default(robot, setup))
+    """The default with all that differs between a simulated arm and a real one: see ``sim2real``.
+
+    Its gripper has no hysteresis: it has not been trained with it.
+    """
+    return sim2reals.randomized(dataclasses.replace(default(robot, setup), actions=velocity_actions()))
 
 
 def presets(setup: Setup) -> Presets:
