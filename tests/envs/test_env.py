@@ -152,9 +152,9 @@ def test_targets_stay_in_the_joint_ranges(positions, start):
 
 
 @pytest.mark.parametrize(
-    ("action", "fingers"), [(-0.001, [0.0, -0.001]), (-3.0, [0.0, -0.001]), (0.0, [0.05, -0.05]), (2.0, [0.05, -0.05])]
+    ("action", "fingers"), [(-0.501, [0.0, -0.001]), (-3.0, [0.0, -0.001]), (-0.499, [0.05, -0.05]), (2.0, [0.05, -0.05])]
 )
-def test_gripper_closes_for_negative_actions(env, start, action, fingers):
+def test_an_open_gripper_closes_for_actions_below_its_hysteresis(env, start, action, fingers):
     targets, state = jax.jit(env.targets), start
     for _ in range(2):  # 0.05 m at 0.03 m a step
         ctrl = targets(state, jnp.zeros(8).at[7].set(action))

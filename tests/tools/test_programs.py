@@ -213,7 +213,7 @@ def test_what_a_machine_without_a_gpu_trains():
 
 def test_a_gpu_trains_for_as_long_as_the_task_needs(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    for name, steps in (("nero_lift", 100_000_000), ("nero_reach", 60_000_000), ("nero_push", 300_000_000)):
+    for name, steps in (("nero_lift", 100_000_000), ("nero_reach", 60_000_000), ("nero_push", 150_000_000)):
         run, note = training.fit_machine(training.resolve(name, "default", None, {}, {}))
         assert (run.num_envs, run.num_timesteps, run.max_minutes, note) == (8192, steps, 0, "")
 
