@@ -1,7 +1,7 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
-docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and
-docs/gallery/, an episode of every environment; a name makes one of the three.
+docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
+docs/gallery/, an episode of every environment, and docs/failures/, three failures of tasks that fall short. A name makes one.
 """
 
 import dataclasses
@@ -26,6 +26,8 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
     "lift": (1, (640, 400), 4, 60),
     "thousand": (1000, (640, 360), 5, 45),
 }
+
+FALL_SHORT = ("nero_lift_obstacles", "nero_clutter")  # of what docs/results.md asks of them
 
 
 def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
@@ -58,28 +60,39 @@ def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
 def gallery(folder: pathlib.Path) -> None:
     """A small moving picture of every environment that has a robot of its own: the first episode that succeeds, by who plays it
     by default."""
-    folder.mkdir(exist_ok=True)
-    for name in mjx_nero.list_envs():
-        if not registry.robot_of(name):
-            continue
+    for name in filter(registry.robot_of, mjx_nero.list_envs()):
         played = evaluation.play(evaluation.EvalCfg(name, episodes=8, record=8, backend="mujoco"))
-        episode, frames = played.episodes, []
-        every = max(1, len(episode.qpos) // 40)
-        k = int(np.argmax(episode.metrics["success"]))
-        looks = {of: look[k] for of, look in episode.looks.items()}
-        with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
-            for t in range(0, len(episode.qpos), every):
-                frame = Image.fromarray(renderer.render(episode.qpos[t, k], episode.goals[t, k], looks))
+        film(folder / f"{name}.webp", played, np.argmax(played.episodes.success, keepdims=True))
+
+
+def failures(folder: pathlib.Path) -> None:
+    """The first three of 200 episodes that fail, one after another, as ``eval.py --failures`` shows them."""
+    for name in FALL_SHORT:
+        played = evaluation.play(evaluation.EvalCfg(name, episodes=200, record=200, backend="mujoco"))
+        film(folder / f"{name}.webp", played, np.flatnonzero(~played.episodes.success)[:3])
+
+
+def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> None:
+    """A small moving picture of the recorded episodes named, 40 frames each."""
+    path.parent.mkdir(exist_ok=True)
+    shown, frames = played.episodes.recorded(which), []
+    every = max(1, len(shown.qpos) // 40)
+    with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
+        for k in range(len(which)):
+            looks = {of: look[k] for of, look in shown.looks.items()}
+            for t in range(0, len(shown.qpos), every):
+                frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.goals[t, k], looks))
                 frames.append(frame.resize((320, 240), Image.Resampling.BOX))
-        write(folder / f"{name}.webp", frames, every * played.env.dt, 35)
+    write(path, frames, every * played.env.dt, 35)
 
 
 def main() -> None:
     """All pictures, or those named."""
     cli.setup_jax()
-    for name in sys.argv[1:] or ("gallery", *PICTURES):
-        if name == "gallery":
-            gallery(HERE / name)
+    folders = {"gallery": gallery, "failures": failures}
+    for name in sys.argv[1:] or (*folders, *PICTURES):
+        if name in folders:
+            folders[name](HERE / name)
             continue
         robots, (width, height), every, quality = PICTURES[name]
         cfg = dataclasses.replace(mjx_nero.env_cfg("nero_lift"), corruption=False)

@@ -85,8 +85,7 @@ class Episodes:
         """Figures for people and for JSON: distances in m, times in s. An episode whose physics or policy left the numbers is a
         failure, and in no mean; None is the mean of none."""
         m, n = self.metrics, len(self.returns)
-        whole = ~(m["nan"] > 0) & np.isfinite(self.returns)
-        success = (m["success"] > 0) & whole
+        whole, success = self._whole, self.success
         low, high = wilson(float(success.sum()), n)
         terms = {name.removeprefix("reward/"): value for name, value in m.items() if name.startswith("reward/")}
         return {
@@ -104,6 +103,20 @@ class Episodes:
             "overflow_count": int(m["overflow"].sum()),
             **{f"{name}_mean": _mean(m[name][whole]) for name in m if name not in _KNOWN and not name.startswith("reward/")},
         }
+
+    @property
+    def success(self) -> np.ndarray:
+        """Of each episode, bool [n]."""
+        return (self.metrics["success"] > 0) & self._whole
+
+    @property
+    def _whole(self) -> np.ndarray:
+        return ~(self.metrics["nan"] > 0) & np.isfinite(self.returns)
+
+    def recorded(self, which: np.ndarray) -> "Episodes":
+        """The same episodes, with the records of those named alone; ``which``: int [any], below the number of recorded ones."""
+        looks = {name: look[which] for name, look in self.looks.items()}
+        return dataclasses.replace(self, qpos=self.qpos[:, which], goals=self.goals[:, which], looks=looks)
 
     def _grasps(self, whole: np.ndarray) -> dict[str, float | None]:
         if not {"grasped", "grasp_time"} <= set(self.metrics):

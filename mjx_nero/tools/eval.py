@@ -1,16 +1,21 @@
 """Plays and measures a policy or a controller: python eval.py --env nero_lift. See --help."""
 
 import argparse
+import dataclasses
 import pathlib
 import sys
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from mjx_nero import cli, console, control, files
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.learn import evaluation
 from mjx_nero.sim import render
+
+RECORDED = 1000  # episodes at most, among which those that fail are looked for
 
 
 def main(argv: Sequence[str]) -> None:
@@ -30,6 +35,8 @@ def main(argv: Sequence[str]) -> None:
             seed=args.seed,
             overrides=dotted["env"],
         )
+    if args.failures and not args.video:
+        raise UserError("--failures chooses what a video shows: give --video FILE.mp4, too")
     for path in filter(None, (args.video, args.json)):
         files.check_writable(path)
     video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
@@ -45,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
         seed=args.seed,
         backend=args.backend,
         impl=args.impl,
-        record=video.episodes if args.video else 0,
+        record=(RECORDED if args.failures else video.episodes) if args.video else 0,
         env_fields=dotted["env"],
         control_fields=dotted["control"],
     )
@@ -54,6 +61,11 @@ def main(argv: Sequence[str]) -> None:
     report(played.result)
     if args.json:
         files.write_json(args.json, played.result)
+    if args.video and args.failures:
+        failed = np.flatnonzero(~played.episodes.success[:RECORDED])[: video.episodes]
+        if not failed.size:
+            return console.line(console.screen(), "no video: no episode failed")
+        played = dataclasses.replace(played, episodes=played.episodes.recorded(failed))
     if args.video:
         draw(played, args.video, video)
 
@@ -88,6 +100,7 @@ def _parser() -> cli.Parser:
     )
     parser.add_impl()
     parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three of the episodes")
+    parser.add_argument("--failures", action="store_true", help="the video shows episodes that fail")
     parser.add_video()
     parser.add_argument("--json", type=cli.path(".json"), help="write the result as JSON")
     parser.add_argument("--view", action="store_true", help="play in a browser instead, until Ctrl-C (the extra view)")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import cli
-from mjx_nero.learn import checkpoint, logs, policy, training
+from mjx_nero.learn import checkpoint, evaluation, logs, policy, rollout, training
 from mjx_nero.sim import render
 from mjx_nero.sim.physics.native import NativePhysics
 from mjx_nero.types import UserError
@@ -51,6 +51,7 @@ MISTAKES = [
     ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--json", "."], "--json takes a name that ends in .json, got '.'"),
+    ("eval", ["--failures"], "--failures chooses what a video shows: give --video FILE.mp4, too"),
     ("eval", ["--video", "v.zzz"], "--video takes a name that ends in .mp4, got 'v.zzz'"),
     ("eval", ["--episodes", "1e12"], "--episodes must be at least 1 and at most 1e+06, got '1e12'"),
     ("eval", ["--seed", "18446744073709551616"], "--seed takes a whole number, got '18446744073709551616'"),
@@ -155,6 +156,32 @@ def test_video_has_real_frames(call, tmp_path):
     assert frames.shape == (50, 360, 640, 3)  # every fifth of 250 steps
     assert frames[0].std() > 20  # a picture, not a blank
     assert abs(frames[0].astype(int) - frames[20]).max() > 100  # and things move in it
+
+
+def test_a_video_of_failures_shows_them_alone(call, tmp_path, monkeypatch):
+    """Of the episodes that play, the second and the fourth fail."""
+    drawn = []
+    monkeypatch.setattr(render, "write_episodes", lambda path, model, qpos, goals, *_: drawn.append((qpos, goals)))
+    played = evaluation.play
+    succeeds = np.array([True, False, True, False])
+    monkeypatch.setattr(rollout.Episodes, "success", property(lambda self: succeeds))
+
+    def play(cfg):
+        result = played(cfg)
+        drawn.append((result.episodes.qpos, result.episodes.goals))
+        return result
+
+    monkeypatch.setattr(evaluation, "play", play)
+    flags = ["--agent", "zero", "--backend", "mujoco", "--video", "lift.mp4", "--failures"]
+    code, out, _ = call("eval", "--episodes", 4, *flags)
+    assert code == 0 and "video: lift.mp4" in out
+    for played_ones, shown in zip(*drawn, strict=True):
+        assert played_ones.shape[1] == 4
+        np.testing.assert_array_equal(shown, played_ones[:, [1, 3]])
+    drawn.clear()
+    succeeds = np.ones(4, bool)
+    code, out, _ = call("eval", "--episodes", 4, *flags)
+    assert code == 0 and out.rstrip().endswith("no video: no episode failed") and len(drawn) == 1
 
 
 def test_without_opengl_all_but_the_video(call, tmp_path, monkeypatch):
