@@ -52,6 +52,12 @@ def beyond(robot: RobotCfg, gap: float) -> float:
     return round(max(0.0, float(off @ approach)), 4)
 
 
+def gaps(robot: RobotCfg) -> tuple[float, float] | None:
+    """Between two of its pads, open and closed [m], as their shapes are; 0 where they meet; None: it has no two."""
+    hand = _Hand(robot)
+    return (max(0.0, hand.apart(1.0)), max(0.0, hand.apart(0.0))) if len(hand.pads) > 1 else None
+
+
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:
     """The robot with a hand that opens no further than to ``gap`` between its pads [m], and begins so; as it is where it opens
     less, or has no two pads."""

@@ -96,8 +96,10 @@ def read(folder: pathlib.Path) -> RobotCfg:
         lower, upper = compiled.joint(name).range
         if not lower < upper:
             raise UserError(f"{robot.xml}: joint {name!r} has no range: give it one, drives need it")
-    if [spec.joint(j).type for j in gripper.joints] != [mujoco.mjtJoint.mjJNT_SLIDE] * 2:
-        gripper = dataclasses.replace(gripper, gap=None, positions=None)  # known of two slides alone
+    slides = [spec.joint(j).type for j in gripper.joints] == [mujoco.mjtJoint.mjJNT_SLIDE] * 2
+    # Known of two opposed slides that are together at zero; others open alike, or about another middle.
+    if not slides or not math.isclose(gripper.open[0] - gripper.open[1], robot.opening, abs_tol=1e-3):
+        gripper = dataclasses.replace(gripper, gap=None, positions=None)
     return dataclasses.replace(robot, gripper=gripper)
 
 

@@ -131,6 +131,17 @@ def test_how_far_a_hand_opens_is_found_without_its_formula(gap):
     assert found.home == found.open and found.close == blind.close
 
 
+def test_fingers_that_open_alike_are_measured(tmp_path):
+    """Both slides count outwards, so that their difference says nothing, as it does of Nero's, which count along one axis."""
+    fingers = [line.replace('<mimic joint="left"/>', "") for line in files.fingers(tmp_path, "link6")]
+    text = files.robot(files.base(), *files.six(), *fingers, name="alike")
+    import_urdf(files.write(tmp_path / "in", text), tmp_path / "out")
+    robot = robot_file.read(tmp_path / "out")
+    assert robot.gripper.joints == ("left", "right") and robot.gripper.open == pytest.approx((0.05, 0.05), abs=1e-3)
+    assert grasp.gaps(robot) == pytest.approx((0.1, 0.02), abs=3e-3)
+    assert grasp.opened(robot, 0.04).gripper.open == pytest.approx((0.02, 0.02), abs=2e-3)
+
+
 def test_slow_fingers_begin_near_the_cube(hand):
     """A cube of 4 cm in a hand that opens by 10 cm: a finger goes 3 cm to it. Slow ones begin 8 cm apart."""
     robot = robot_file.read(hand)

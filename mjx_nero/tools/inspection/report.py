@@ -18,7 +18,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import policy
 from mjx_nero.mdp.terms import Term
-from mjx_nero.sim import linkage, render, scene
+from mjx_nero.sim import grasp, linkage, render, scene
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
 from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -168,6 +168,8 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
     gaps = None
     if gripper.joints and gripper.gap:
         gaps = (float(gripper.gap(jnp.array(gripper.open))), float(gripper.gap(jnp.array(gripper.close))))
+    elif gripper.joints:
+        gaps = grasp.gaps(robot)
     return Report(
         robot=robot.name,
         joints=tuple(_joints(model, robot, where)),
