@@ -1,11 +1,14 @@
 """Parallel gripper: drive targets that open, close or step it. Pure functions of the measured joint positions."""
 
+import functools
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.mdp.actions import rate_limit
-from mjx_nero.sim import scene
+from mjx_nero.sim import grasp, scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
@@ -41,7 +44,7 @@ class ParallelGripper:
         action_deltas: tuple[float, ...] | None = None,
     ):
         cfg, model = robot.gripper, scene.robot_model(robot)
-        self.joints, self._gap, self._positions = cfg.joints, cfg.gap, cfg.positions
+        self.joints, self._robot = cfg.joints, robot
         for name, values in (("opened", opened), ("closed", closed), ("action_deltas", action_deltas)):
             if values is not None and len(values) != len(self.joints):
                 raise UserError(f"{name} takes one value for each of {', '.join(self.joints)}, got {values}")
@@ -69,21 +72,24 @@ class ParallelGripper:
         return rate_limit(wanted, targets, step=jnp.asarray(self._speed * dt))
 
     def gap(self, positions: Positions) -> Float[Array, ""]:
-        """Distance between the pads [m].
+        """Distance between the pads [m], by the robot's formula or as the pads are in its model.
 
         Raises:
-            UserError: nobody said how far these joints open it.
+            UserError: there is neither.
         """
-        return self._known(self._gap)(positions)
+        return self._formulas[0](positions)
 
     def positions(self, gap: Float[Array, ""]) -> Positions:
         """Joint positions that leave ``gap`` [m] between the pads, within the joints' ranges. Raises as ``gap``."""
-        return self._clip(self._known(self._positions)(gap))
+        return self._clip(self._formulas[1](gap))
 
-    def _known(self, function):
-        if function is None:
+    @functools.cached_property
+    def _formulas(self) -> tuple[Callable, Callable]:
+        cfg = self._robot.gripper
+        found = (cfg.gap, cfg.positions) if cfg.gap and cfg.positions else grasp.measured(self._robot)
+        if not self.joints or found is None:
             raise UserError(f"the gap of a gripper with the joints {', '.join(self.joints) or 'none'} is unknown")
-        return function
+        return found
 
     def _clip(self, positions) -> Positions:
         return jnp.clip(jnp.asarray(positions, jnp.float32), *self._range)

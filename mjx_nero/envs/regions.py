@@ -15,6 +15,7 @@ from mjx_nero.types import UserError
 HELD = 0.03  # [m] from where the cube is in a good grasp it may be so far off and still count as held
 TURNS = 5  # joints of an arm that can turn its hand at will while that points down
 TRAVEL = 0.1  # [m] a carried cube is this high above the table, if the hand can still point down there
+LEFT = 0.06  # [m] the grasp point travels at least this far over the middle of a cube on the table, which it has left then
 
 
 def box(robot: RobotCfg, name: str, what: str) -> Box:
@@ -66,7 +67,7 @@ def of(robot: RobotCfg) -> Regions:
         cube=(span(x[0] + dx, x[1] + dx), span(y[0] + dy, y[1] + dy)),
         place=(x, y),
         hold=hold,
-        travel=round(min(pick[2][1], pick[2][0] + TRAVEL), 4),
+        travel=round(max(min(pick[2][1], pick[2][0] + TRAVEL), rest - dz + LEFT), 4),
         offset=(*span(-turned[0], -turned[1]), round(pick[2][0] + dz - rest, 4)),
     )
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import mujoco
@@ -52,10 +53,21 @@ def beyond(robot: RobotCfg, gap: float) -> float:
     return round(max(0.0, float(off @ approach)), 4)
 
 
-def gaps(robot: RobotCfg) -> tuple[float, float] | None:
-    """Between two of its pads, open and closed [m], as their shapes are; 0 where they meet; None: it has no two."""
+def measured(robot: RobotCfg) -> tuple[Callable, Callable] | None:
+    """``gap`` and ``positions`` as ``GripperCfg`` has them, from where the pads are as the fingers move together; None: it has no
+    two pads, or fingers that stay where they are."""
     hand = _Hand(robot)
-    return (max(0.0, hand.apart(1.0)), max(0.0, hand.apart(0.0))) if len(hand.pads) > 1 else None
+    close, way = hand.positions(0.0), hand.positions(1.0) - hand.positions(0.0)
+    if len(hand.pads) < 2 or not way.any():
+        return None
+    shares = np.linspace(*hand.ends(), 65)
+    apart = np.maximum.accumulate([max(0.0, hand.apart(share)) for share in shares])
+    moving = np.flatnonzero(way)
+
+    def gap(q):
+        return jnp.interp(jnp.mean((jnp.asarray(q) - close)[moving] / way[moving]), shares, apart)
+
+    return gap, lambda gap: jnp.asarray(close) + jnp.interp(gap, apart, shares) * way
 
 
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:
@@ -83,7 +95,7 @@ def shut(robot: RobotCfg, gap: float) -> RobotCfg:
     hand, fingers = _Hand(robot), robot.gripper
     if hand.apart(0.0) <= gap:
         return robot
-    share = hand.least()
+    share = hand.ends()[0]
     if (least := hand.apart(share)) > gap:
         raise UserError(
             f"the hand of {robot.name} closes to {least:.3g} m between its pads, and is to hold what is {gap:.3g} m wide"
@@ -131,15 +143,15 @@ class _Hand:
             self.data.qpos[coupling.follower] = coupling.position(self.data.qpos)
         mujoco.mj_kinematics(self.model, self.data)
 
-    def least(self) -> float:
-        """The share at which the first of its joints is at its limit; 0 where one has none."""
+    def ends(self) -> tuple[float, float]:
+        """The shares at which the first of its joints is at a limit, closing and opening; 0 and 1 where one has none."""
         close, way = self.positions(0.0), self.positions(1.0) - self.positions(0.0)
         joints = [self.model.joint(name).id for name in self._robot.joints]
-        ends = np.where(way > 0, *self.model.jnt_range[joints].T)
         moving = way != 0
         if not moving.any() or not self.model.jnt_limited[joints].all():
-            return 0.0
-        return float(np.max((ends - close)[moving] / way[moving]))
+            return 0.0, 1.0
+        ends = np.sort((self.model.jnt_range[joints].T - close)[:, moving] / way[moving], axis=0)
+        return float(ends[0].max()), float(ends[1].min())
 
     def share(self, gap: float) -> float:
         """At which two pads are ``gap`` apart [m]; 1 where they never are as far."""

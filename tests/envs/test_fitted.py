@@ -13,6 +13,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from mjx_nero import UserError, env_cfg, make
+from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.arms.so_arm100 import SO_ARM100
@@ -126,7 +127,10 @@ def test_edits_of_the_robots_file_count(hand):
 def test_how_far_a_hand_opens_is_found_without_its_formula(gap):
     """The RG6's linkage: its pads in the model are as far apart as its formula says."""
     blind = dataclasses.replace(COBOTTA_PRO_900.gripper, gap=None, positions=None)
-    found = grasp.opened(dataclasses.replace(COBOTTA_PRO_900, gripper=blind), gap).gripper
+    robot = dataclasses.replace(COBOTTA_PRO_900, gripper=blind)
+    found = grasp.opened(robot, gap).gripper
+    at, known = ParallelGripper(robot).positions(jnp.array(gap)), ParallelGripper(COBOTTA_PRO_900)
+    assert float(known.gap(at)) == pytest.approx(gap, abs=3e-4)
     np.testing.assert_allclose(found.open, grasp.opened(COBOTTA_PRO_900, gap).gripper.open, atol=2e-4)
     assert found.home == found.open and found.close == blind.close
 
@@ -138,7 +142,10 @@ def test_fingers_that_open_alike_are_measured(tmp_path):
     import_urdf(files.write(tmp_path / "in", text), tmp_path / "out")
     robot = robot_file.read(tmp_path / "out")
     assert robot.gripper.joints == ("left", "right") and robot.gripper.open == pytest.approx((0.05, 0.05), abs=1e-3)
-    assert grasp.gaps(robot) == pytest.approx((0.1, 0.02), abs=3e-3)
+    gripper = ParallelGripper(robot)
+    for at, apart in ((0.05, 0.1), (0.02, 0.04), (0.01, 0.02)):  # each finger's own way, twice
+        assert float(gripper.gap(jnp.full(2, at))) == pytest.approx(apart, abs=3e-3)
+        np.testing.assert_allclose(gripper.positions(jnp.array(apart)), [at, at], atol=2e-3)
     assert grasp.opened(robot, 0.04).gripper.open == pytest.approx((0.02, 0.02), abs=2e-3)
 
 

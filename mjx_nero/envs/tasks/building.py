@@ -137,7 +137,8 @@ class Tower:
             needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, and pick ends at {high:.3g} m"
             raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
         # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
-        leave = max(there.travel, top + max(self.edge, self.clearance + LIFTED))
+        below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
+        leave = max(there.travel, top + max(self.edge, below + self.clearance + LIFTED))
         fields = {
             "tower": self.objects,
             "rise": self.edge,

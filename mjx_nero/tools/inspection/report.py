@@ -166,10 +166,8 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
     mujoco.mj_forward(model, data)
     bodies = [model.body(b) for b in range(1, model.nbody) if model.body(b).name not in (*where.objects, "goal", "obstacles")]
     gaps = None
-    if gripper.joints and gripper.gap:
-        gaps = (float(gripper.gap(jnp.array(gripper.open))), float(gripper.gap(jnp.array(gripper.close))))
-    elif gripper.joints:
-        gaps = grasp.gaps(robot)
+    if gripper.joints and (gap := (gripper.gap or (grasp.measured(robot) or (None,))[0])):
+        gaps = (float(gap(jnp.array(gripper.open))), float(gap(jnp.array(gripper.close))))
     return Report(
         robot=robot.name,
         joints=tuple(_joints(model, robot, where)),
