@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.envs import regions
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.arms.so_arm100 import SO_ARM100
+from mjx_nero.envs.tasks import building
 from mjx_nero.learn import evaluation
 from mjx_nero.sim import contacts, grasp, robot_file, scene
 from mjx_nero.sim.robot import GripperCfg
@@ -168,6 +170,38 @@ def test_towers_begin_with_slow_fingers_near_the_cube(hand):
     for env in ("place", "stack"):
         assert env_cfg(env, robot=robot).robot.gripper.open == robot.gripper.open
         assert env_cfg(env, robot=slow).robot.gripper.open == env_cfg("lift", robot=slow).robot.gripper.open
+
+
+def test_experts_wait_for_slow_fingers(hand):
+    """8 cm open, a cube of 4 cm, 2 cm/s: a second to close. The usual half second is 25 control steps of 20 ms."""
+    robot = robot_file.read(hand)
+    slow = dataclasses.replace(robot, gripper=dataclasses.replace(robot.gripper, speed=(0.02,)))
+    for env in ("place", "stack"):
+        usual, patient = (env_cfg(env, robot=each) for each in (robot, slow))
+        assert usual.controllers["pick_place"]["events_dt"] == building.QUICK and usual.episode_length_s == 7.0
+        late = 1.0 + building.PRESS - building.CLOSING
+        assert patient.episode_length_s == pytest.approx(7.0 + 2 * late, abs=0.05)
+        steps = [1 / share for share in patient.controllers["pick_place"]["events_dt"]]
+        assert steps[3] == pytest.approx(25 + late / 0.02, abs=1.1) and steps[7] == pytest.approx(20 + late / 0.02, abs=1.1)
+    nero = dataclasses.replace(NERO, gripper=dataclasses.replace(NERO.gripper, speed=(0.02, 0.02)))
+    closing = [env_cfg("clutter", robot=each).controllers["pick_up"]["closing"] for each in (NERO, nero)]
+    assert closing == [0.3, pytest.approx((0.06 - 0.0143) / 2 / 0.02, abs=0.06)]  # from 6 cm to the thinnest there is
+
+
+def test_a_hand_leaves_what_is_held_above_its_grasp_point(hand):
+    """The grasp point 18 mm below the middle of the pads: the hand goes up by as much more to be as far away."""
+    robot = robot_file.read(hand)
+    low = dataclasses.replace(robot, pick=(*robot.pick[:2], (robot.pick[2][0] - 0.018, robot.pick[2][0] + 0.042)))
+    rest = env_cfg("lift", robot=robot).scene.objects["cube"].rest_height
+    assert regions.of(low).offset[2] == pytest.approx(regions.of(robot).offset[2] - 0.018)
+    assert regions.of(low).travel >= rest + regions.LEFT
+    stack = env_cfg("stack", robot=low)
+    leave, clearance = (
+        stack.controllers["pick_place"]["end_effector_initial_height"],
+        stack.success.condition.params["clearance"],
+    )
+    edge = 2 * rest
+    assert leave - (rest + edge) > clearance + 0.005  # over the upper cube's middle
 
 
 def test_hands_close_on_what_is_narrow_or_say_so():

@@ -9,7 +9,7 @@ from mjx_nero.envs.regions import Regions
 from mjx_nero.envs.task import SuccessCfg
 from mjx_nero.mdp import metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
-from mjx_nero.sim import contacts
+from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
@@ -19,8 +19,10 @@ FLAT = 0.005  # [m] how far above or below its place an object may be
 LIFTED = 0.01  # [m] above where it lies
 AWAY = 0.02  # [m] the pads are as far above an object that the hand has left
 CLOSING = 0.5  # [s] the fingers take to close, at least: at a metre a second they throw what they meet
-# Shares of the ten phases that a control step takes: 305 steps in all.
+PRESS = 0.075  # [s] they press before an object is lifted, at least
+# Shares of the ten phases that a control step takes: 305 steps in all, 25 of them to close and 20 to open.
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
+CLOSES, OPENS = 3, 7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +84,16 @@ class Tower:
             self.robot, gravity_compensation=True, gripper=dataclasses.replace(fingers, speed=tuple(round(v, 4) for v in slow))
         )
 
+    @property
+    def slow(self) -> float:
+        """What the fingers need to close beyond the time that ``QUICK`` has for it [s]."""
+        return round(max(0.0, grasp.closing_time(self.builder, self.edge) + PRESS - CLOSING), 2)
+
+    @property
+    def extra(self) -> float:
+        """... and for all objects, to open, too [s]."""
+        return round(2 * self.slow * (len(self.objects) - 1), 2)
+
     def sim(self) -> SimCfg:
         """Buffers by count."""
         return contacts.sized(self.robot, self.scene, SimCfg())
@@ -139,10 +151,13 @@ class Tower:
         # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
         below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
         leave = max(there.travel, top + max(self.edge, below + self.clearance + LIFTED))
+        sim, quick = self.sim(), list(QUICK)
+        for phase in (CLOSES, OPENS):
+            quick[phase] = 1 / (round(1 / quick[phase]) + round(self.slow / (sim.dt * sim.decimation)))
         fields = {
             "tower": self.objects,
             "rise": self.edge,
-            "events_dt": QUICK,
+            "events_dt": tuple(quick),
             "end_effector_initial_height": round(leave, 4),
             "end_effector_offset": there.offset,
             "motion": "ik",

@@ -24,6 +24,7 @@ DENSITY = 2000.0  # [kg/m3] of stone: what is round and light sinks deep into th
 LEAST = 3  # objects on the table
 MARGIN = 0.003  # [m] between an open hand and the nearest object
 OPEN = 1.5  # the hand opens so many times as far as the widest object asks for: in clutter it takes no more room than it must
+QUICK = 0.3  # [s] fingers take to close, at least
 FOOT = 0.1  # [m] no object lies nearer to the robot's axis
 LIFTED = 0.005  # [m] an object that is held is that much higher than its largest like lies
 AWAY = 4.0  # [m] from the table's centre: the objects that an episode leaves out
@@ -50,8 +51,7 @@ class Setup:
         robot: its hand opens as far as these ask for.
         there: where it can grasp, and where it can hold.
         pitch, jitter: of the objects' cells (``events.scatter``).
-        lowest: height of the pads' middle above the table in a grasp, at least.
-        beyond: the grasp point, so much further down, is the pads' middle.
+        grasp: for the controller that picks up: how low, how far beyond the grasp point (``PickUpCfg``), and how long to close.
         grasp_radius: how near to the grasp point the object counts as held.
     """
 
@@ -60,8 +60,7 @@ class Setup:
     there: regions.Regions
     pitch: float
     jitter: float
-    lowest: float
-    beyond: float
+    grasp: dict[str, float]
     grasp_radius: float
 
 
@@ -100,8 +99,8 @@ def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> Setup:
     edge = grasp.cube_for(robot).size[0]
     unit = edge / SIZES[1]
     objects = {name: _object(unit, **SHAPES[name]) for name in names}
-    robot = grasp.shut(robot, SIZES[0] * min(map(across, objects.values())))
-    robot = grasp.opened(robot, OPEN * edge)
+    thinnest = SIZES[0] * min(map(across, objects.values()))
+    robot = grasp.opened(grasp.shut(robot, thinnest), OPEN * edge)
     around = SIZES[1] * max(extent(item) for item in objects.values())
     hand = float(np.hypot(min(OPEN * edge, robot.opening) / 2 + thickness, width / 2)) + MARGIN
     jitter = edge / 5
@@ -115,8 +114,11 @@ def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> Setup:
         there=dataclasses.replace(there, cube=(regions.span(max(low, min(high, foot)), high), there.cube[1])),
         pitch=pitch,
         jitter=jitter,
-        lowest=grasp.lowest(robot.pad),
-        beyond=grasp.beyond(robot, edge),
+        grasp={
+            "lowest": grasp.lowest(robot.pad),
+            "beyond": grasp.beyond(robot, edge),
+            "closing": round(max(QUICK, grasp.closing_time(robot, thinnest)), 3),
+        },
         grasp_radius=regions.near(there),
     )
 
@@ -163,7 +165,7 @@ def _clutter(setup: Setup) -> EnvCfg:
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4)),
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5),
-        controllers={"pick_up": {"object": TARGET, **_fits(scene), "lowest": setup.lowest, "beyond": setup.beyond}},
+        controllers={"pick_up": {"object": TARGET, **_fits(scene), **setup.grasp}},
         targets=names,
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.there.hold, strict=True)), resample_s=ONCE),
         success=SuccessCfg(

@@ -47,7 +47,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         robot=tower.builder,
         scene=scene,
         sim=tower.sim(),
-        episode_length_s=7.0,
+        episode_length_s=7.0 + tower.extra,
         actions=joint_actions(scale=0.5),
         command=CommandTerm(
             commands.uniform_pose,

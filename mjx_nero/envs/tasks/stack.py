@@ -58,7 +58,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         robot=tower.builder,
         scene=scene,
         sim=tower.sim(),
-        episode_length_s=episode_length_s,
+        episode_length_s=episode_length_s + tower.extra,
         # Anti-windup before the speed limit, which starts from where it leaves the targets.
         actions={**others, "anti_windup": Term(AntiWindup), "speed_limit": speed_limit},
         command=CommandTerm(commands.nothing, resample_s=ONCE),
