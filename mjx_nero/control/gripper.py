@@ -85,9 +85,8 @@ class ParallelGripper:
 
     @functools.cached_property
     def _formulas(self) -> tuple[Callable, Callable]:
-        cfg = self._robot.gripper
-        found = (cfg.gap, cfg.positions) if cfg.gap and cfg.positions else grasp.measured(self._robot)
-        if not self.joints or found is None:
+        found = grasp.formulas(self._robot)
+        if found is None:
             raise UserError(f"the gap of a gripper with the joints {', '.join(self.joints) or 'none'} is unknown")
         return found
 

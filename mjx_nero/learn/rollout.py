@@ -93,7 +93,7 @@ class Episodes:
             "success_rate_95": [low, high],
             "final_distance_mean": _mean(m["final_distance"][whole]),
             "final_distance_median": float(np.median(m["final_distance"][whole])) if whole.any() else None,
-            **self._grasps(whole),
+            **self._grasps(),
             "dropped_rate": float((m["dropped"] * whole).mean()),
             "return_mean": _mean(self.returns[whole]),
             "return_by_term": {name: _mean(value[whole]) for name, value in terms.items()},
@@ -118,10 +118,10 @@ class Episodes:
         looks = {name: look[which] for name, look in self.looks.items()}
         return dataclasses.replace(self, qpos=self.qpos[:, which], goals=self.goals[:, which], looks=looks)
 
-    def _grasps(self, whole: np.ndarray) -> dict[str, float | None]:
+    def _grasps(self) -> dict[str, float | None]:
         if not {"grasped", "grasp_time"} <= set(self.metrics):
             return {}
-        grasped = (self.metrics["grasped"] > 0) & whole
+        grasped = (self.metrics["grasped"] > 0) & self._whole
         return {"grasp_rate": float(grasped.mean()), "time_to_grasp_mean": _mean(self.metrics["grasp_time"][grasped])}
 
 

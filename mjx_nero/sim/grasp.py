@@ -53,9 +53,14 @@ def beyond(robot: RobotCfg, gap: float) -> float:
     return round(max(0.0, float(off @ approach)), 4)
 
 
-def measured(robot: RobotCfg) -> tuple[Callable, Callable] | None:
-    """``gap`` and ``positions`` as ``GripperCfg`` has them, from where the pads are as the fingers move together; None: it has no
-    two pads, or fingers that stay where they are."""
+def formulas(robot: RobotCfg) -> tuple[Callable, Callable] | None:
+    """``gap`` and ``positions`` of its gripper, or the like from where the pads are as the fingers move together; None: it has no
+    gripper, no two pads, or fingers that stay where they are."""
+    fingers = robot.gripper
+    if not fingers.joints:
+        return None
+    if fingers.gap is not None and fingers.positions is not None:
+        return fingers.gap, fingers.positions
     hand = _Hand(robot)
     close, way = hand.positions(0.0), hand.positions(1.0) - hand.positions(0.0)
     if len(hand.pads) < 2 or not way.any():
@@ -67,7 +72,10 @@ def measured(robot: RobotCfg) -> tuple[Callable, Callable] | None:
     def gap(q):
         return jnp.interp(jnp.mean((jnp.asarray(q) - close)[moving] / way[moving]), shares, apart)
 
-    return gap, lambda gap: jnp.asarray(close) + jnp.interp(gap, apart, shares) * way
+    def positions(gap):
+        return jnp.asarray(close) + jnp.interp(gap, apart, shares) * way
+
+    return gap, positions
 
 
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:

@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
         seed=args.seed,
         backend=args.backend,
         impl=args.impl,
-        record=(RECORDED if args.failures else video.episodes) if args.video else 0,
+        record=RECORDED if args.failures else video.episodes if args.video else 0,
         env_fields=dotted["env"],
         control_fields=dotted["control"],
     )
@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> None:
     report(played.result)
     if args.json:
         files.write_json(args.json, played.result)
-    if args.video and args.failures:
+    if args.failures:
         failed = np.flatnonzero(~played.episodes.success[:RECORDED])[: video.episodes]
         if not failed.size:
             return console.line(console.screen(), "no video: no episode failed")

@@ -1,6 +1,7 @@
 """What ``place`` and ``stack`` have in common: how near is there, what leads there, and who can do it. See ``mdp.towers``."""
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -84,7 +85,7 @@ class Tower:
             self.robot, gravity_compensation=True, gripper=dataclasses.replace(fingers, speed=tuple(round(v, 4) for v in slow))
         )
 
-    @property
+    @functools.cached_property
     def slow(self) -> float:
         """What the fingers need to close beyond the time that ``QUICK`` has for it [s]."""
         return round(max(0.0, grasp.closing_time(self.builder, self.edge) + PRESS - CLOSING), 2)
@@ -151,9 +152,9 @@ class Tower:
         # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
         below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
         leave = max(there.travel, top + max(self.edge, below + self.clearance + LIFTED))
-        sim, quick = self.sim(), list(QUICK)
+        quick, late = list(QUICK), round(self.slow / (SimCfg().dt * SimCfg().decimation))  # control steps
         for phase in (CLOSES, OPENS):
-            quick[phase] = 1 / (round(1 / quick[phase]) + round(self.slow / (sim.dt * sim.decimation)))
+            quick[phase] = 1 / (round(1 / quick[phase]) + late)
         fields = {
             "tower": self.objects,
             "rise": self.edge,

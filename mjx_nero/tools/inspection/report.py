@@ -165,9 +165,9 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
         data.joint(joint).qpos[0] = position
     mujoco.mj_forward(model, data)
     bodies = [model.body(b) for b in range(1, model.nbody) if model.body(b).name not in (*where.objects, "goal", "obstacles")]
-    gaps = None
-    if gripper.joints and (gap := (gripper.gap or (grasp.measured(robot) or (None,))[0])):
-        gaps = (float(gap(jnp.array(gripper.open))), float(gap(jnp.array(gripper.close))))
+    formulas, gaps = grasp.formulas(robot), None
+    if formulas:
+        gaps = (float(formulas[0](jnp.array(gripper.open))), float(formulas[0](jnp.array(gripper.close))))
     return Report(
         robot=robot.name,
         joints=tuple(_joints(model, robot, where)),
