@@ -76,7 +76,8 @@ class EnvCfg:
             (``Start.target``), else it is the first.
         pushes: sudden changes of objects' velocities (``mdp.pushes``).
         widening: how much of randomization, sensors, late observations and actions, the targets' noise, and pushes an environment
-            of ``wrappers.for_training`` has, by its own successes (``mdp.curriculum``); None: all of it, as everywhere else.
+            of ``wrappers.for_training`` has, and of rewards by ``curriculum.level_weight``, by its own successes
+            (``mdp.curriculum``); None: all of it, as everywhere else.
         identified: a file of ``python -m mjx_nero identify``, whose drives and delay take the place of the robot's own.
         controllers: those of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config by
             dotted name.

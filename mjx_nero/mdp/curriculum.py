@@ -1,4 +1,7 @@
-"""Curriculum: (step count, weight, *, params) -> weight of a reward term; and what makes an environment's episodes harder."""
+"""Curriculum: (step count, level, weight, *, params) -> weight of a reward term; and what makes an environment's episodes harder.
+
+A level is what share of all that makes them harder an episode has (``types.LEVEL``); None, outside of training: all of it.
+"""
 
 import dataclasses
 from typing import TypeVar
@@ -12,9 +15,17 @@ from mjx_nero.bounds import Share
 Tree = TypeVar("Tree")
 
 
-def step_weight(count: Int[Array, ""], weight: float, *, to: float, num_steps: int) -> Float[Array, ""]:
+Level = Float[Array, ""] | None
+
+
+def step_weight(count: Int[Array, ""], level: Level, weight: float, *, to: float, num_steps: int) -> Float[Array, ""]:
     """Changes the weight at once after ``num_steps`` control steps of every environment. Isaac Lab's ``modify_reward_weight``."""
     return jnp.where(count > num_steps, to, weight)
+
+
+def level_weight(count: Int[Array, ""], level: Level, weight: float, *, start: float) -> Float[Array, ""]:
+    """From ``start`` at level 0 to the weight itself at level 1: what would keep a beginner from trying counts as it succeeds."""
+    return jnp.asarray(toward(level, start, weight))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,7 +49,7 @@ class BySuccess:
         return jnp.clip(level + jnp.where(success > 0, self.up, -self.down), 0.0, 1.0)
 
 
-def toward(level: Float[Array, ""] | None, plain: Tree, drawn: Tree) -> Tree:
+def toward(level: Level, plain: Tree, drawn: Tree) -> Tree:
     """From what is plain to what was drawn, as far as the level; None: all the way. Integers are the drawn ones."""
 
     def blend(a, b):

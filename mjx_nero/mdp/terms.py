@@ -181,7 +181,7 @@ def rewards(
     """
     out = {}
     for name, term in terms.items():
-        weight = curriculum[name](count, term.weight) if name in curriculum else term.weight
+        weight = curriculum[name](count, recall.memory.get(LEVEL), term.weight) if name in curriculum else term.weight
         out[name] = recall(f"rewards.{name}", term, view) * weight * dt
     return out
 

@@ -127,6 +127,16 @@ def test_robots_without_rmpflow_have_no_expert(robot):
     assert "detour" in env_cfg("reach_obstacles", robot="nero").controllers
 
 
+def test_a_touch_costs_a_beginner_a_tenth():
+    """And all of it where there is no level: everywhere but in training."""
+    env = make("nero_lift_obstacles", impl="native")
+    touched, still = jnp.asarray(2.0), jnp.zeros(env.action_size)
+    for level, price in ((0.0, -1.0), (0.5, -5.5), (1.0, -10.0), (None, -10.0)):
+        state = env.reset(jax.random.PRNGKey(0), level)
+        after = env.advance(state, still, state.pipeline_state.replace(touch=touched), jnp.zeros(()))
+        assert float(after.metrics["reward/touching"]) == pytest.approx(price * env.dt)
+
+
 @pytest.mark.slow
 def test_nero_reaches_past_obstacles_without_a_touch():
     cfg = evaluation.EvalCfg("nero_reach_obstacles", controller="expert", episodes=64, backend="mujoco")

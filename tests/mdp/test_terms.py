@@ -11,7 +11,7 @@ from mjx_nero import UserError
 from mjx_nero.mdp import actions, commands, curriculum, events, metrics, observations, rewards, success, terminations, terms
 from mjx_nero.mdp.memory import Delay, History
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
-from mjx_nero.types import ObjectView, ObstacleView, Start, View
+from mjx_nero.types import LEVEL, ObjectView, ObstacleView, Start, View
 
 KEY = jax.random.PRNGKey(0)
 RECALL = terms.Recall({})  # no term here remembers anything
@@ -522,8 +522,17 @@ def test_one_joint_is_turned():
 
 @pytest.mark.parametrize(("count", "weight"), [(0, -1e-4), (10_000, -1e-4), (10_001, -0.1), (20_000, -0.1)])
 def test_step_weight(count, weight):
-    got = curriculum.step_weight(jnp.asarray(count), -1e-4, to=-0.1, num_steps=10_000)
+    got = curriculum.step_weight(jnp.asarray(count), None, -1e-4, to=-0.1, num_steps=10_000)
     assert float(got) == np.float32(weight)
+
+
+@pytest.mark.parametrize(("level", "weight"), [(0.0, -1.0), (0.5, -5.5), (1.0, -10.0), (None, -10.0)])
+def test_level_weight(level, weight):
+    change = {"speed": Term(curriculum.level_weight, params={"start": -1.0})}
+    recall = terms.Recall({} if level is None else {LEVEL: jnp.asarray(level)})
+    group = {"speed": RewardTerm(rewards.joint_vel_l2, weight=-10.0)}
+    out = terms.rewards(group, change, view(), jnp.asarray(0), 0.02, recall)
+    assert float(out["speed"]) == pytest.approx(0.02 * weight * 13.0, rel=1e-6)
 
 
 def test_rewards_fold_weighs_scales_by_time_and_follows_the_curriculum():
