@@ -193,8 +193,7 @@ def test_what_cannot_be_drawn_is_refused_when_the_environment_is_made(term, mess
 @pytest.fixture(scope="module")
 def gripped():
     """Eight states of the shipped policy after three seconds: most cubes are in the air, in the grip. And the targets then."""
-    as_trained = {"actions.gripper.params.hysteresis": 0.0}
-    env = make("nero_lift", impl="native", corruption=False, **as_trained)
+    env = make("nero_lift", impl="native", corruption=False)
     trained = policy.load_for(env, "nero_lift", None)
     step = jax.jit(jax.vmap(env.step))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 8))
