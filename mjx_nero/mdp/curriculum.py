@@ -13,8 +13,6 @@ from jaxtyping import Array, Float, Int
 from mjx_nero.bounds import Share
 
 Tree = TypeVar("Tree")
-
-
 Level = Float[Array, ""] | None
 
 

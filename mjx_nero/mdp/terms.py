@@ -179,9 +179,9 @@ def rewards(
         curriculum: by the name of the reward whose weight it changes.
         count: control steps that the environment has made in all.
     """
-    out = {}
+    out, level = {}, recall.memory.get(LEVEL)
     for name, term in terms.items():
-        weight = curriculum[name](count, recall.memory.get(LEVEL), term.weight) if name in curriculum else term.weight
+        weight = curriculum[name](count, level, term.weight) if name in curriculum else term.weight
         out[name] = recall(f"rewards.{name}", term, view) * weight * dt
     return out
 
