@@ -129,7 +129,7 @@ def test_robots_without_rmpflow_have_no_expert(robot):
 
 def test_a_touch_costs_a_beginner_a_tenth():
     """And all of it where there is no level: everywhere but in training."""
-    env = make("nero_lift_obstacles", preset="by_success", impl="native")
+    env = make("nero_lift_obstacles", impl="native")
     touched, still = jnp.asarray(2.0), jnp.zeros(env.action_size)
     for level, price in ((0.0, -1.0), (0.5, -5.5), (1.0, -10.0), (None, -10.0)):
         state = env.reset(jax.random.PRNGKey(0), level)

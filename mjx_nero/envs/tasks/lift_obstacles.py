@@ -53,7 +53,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=12.0,
         actions=joint_actions(scale=0.5),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
-        training={"num_timesteps": 300_000_000},
+        training={"num_timesteps": 170_000_000},
         command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),
@@ -65,21 +65,13 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "touching": RewardTerm(rewards.touching, weight=-10.0),
             "nearness": RewardTerm(rewards.obstacle_nearness, weight=-1.0, params={"margin": 0.05}),
         },
-    )
-
-
-def by_success(robot: RobotCfg, setup: Setup) -> EnvCfg:
-    """A touch costs an environment a tenth until it succeeds: at ten times what a hand at the cube earns it teaches little but to
-    keep away."""
-    return dataclasses.replace(
-        default(robot, setup),
+        # Until an environment succeeds a touch costs it a tenth: ten times what a hand at the cube earns would teach it
+        # little but to keep away.
         curriculum={"touching": Term(curriculum.level_weight, params={"start": -1.0})},
         widening=Term(curriculum.BySuccess, params={"up": 0.5, "down": 0.1}),
-        training={"num_timesteps": 170_000_000},
     )
 
 
 def presets(setup: Setup | None = None) -> Presets:
     """Preset -> robot -> config; the default first."""
-    setup = setup or Setup()
-    return {"default": functools.partial(default, setup=setup), "by_success": functools.partial(by_success, setup=setup)}
+    return {"default": functools.partial(default, setup=setup or Setup())}
