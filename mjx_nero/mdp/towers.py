@@ -27,12 +27,14 @@ Scalar = Float[Array, ""]
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """An object that is to be moved: the way to its place [m], and whether those below it stand, and it, too."""
+    """An object that is to be moved: the way to its place [m], whether those below it stand, whether it is over its place, and
+    whether it stands."""
 
     object: str
     below: str
     way: Float[Array, "3"]
     due: Bool[Array, ""]
+    over: Bool[Array, ""]
     stands: Bool[Array, ""]
 
 
@@ -59,10 +61,11 @@ def _levels(view: View, tower: tuple[str, ...], rise: float, within: Within) -> 
     due = jnp.ones((), bool)
     for below, object in zip(tower, tower[1:], strict=False):
         to = way(view, below=below, object=object, rise=rise)
-        there = (jnp.linalg.norm(to[:2]) < aside) & (jnp.abs(to[2]) < height)
+        over = jnp.linalg.norm(to[:2]) < aside
+        there = over & (jnp.abs(to[2]) < height)
         if below == GOAL:
             there &= jnp.linalg.norm(turn_to_goal(view, object=object)) < angle
-        yield _Level(object, below, to, due, due & there)
+        yield _Level(object, below, to, due, over, due & there)
         due &= there
 
 
@@ -105,8 +108,10 @@ def reached(view: View, *, tower: tuple[str, ...], rise: float, within: Within, 
 
 
 def _carried(view: View, level: _Level, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
-    up = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=level.object)
-    return level.due & (up | level.stands)
+    grasp = {"grasp_radius": grasp_radius, "object": level.object}
+    # Over its place an object may be as low as it likes: else its last centimetre down would cost all that is paid.
+    lowered = level.over & held(view, minimal_height=-jnp.inf, **grasp)
+    return level.due & (held(view, minimal_height=minimal_height, **grasp) | lowered | level.stands)
 
 
 def carried(

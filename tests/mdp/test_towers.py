@@ -76,6 +76,11 @@ HOLDING = (0.02, -0.02)
         (towers.carried, {**STACK, **HELD}, view(IN_HAND, hand=(0.4, -0.1, 0.09)), 1.0),
         (towers.carried, {**STACK, **HELD}, view(IN_HAND, hand=(0.4, -0.1, 0.11)), 0.0),
         (towers.carried, {**STACK, **HELD}, view(ON), 1.0),
+        # Over its place it may be as low as it likes, and turned, while the hand has it; not 3 cm beside it.
+        (towers.carried, {**PLACE, **HELD}, view((0.31, 0.0, 0.028), hand=(0.31, 0.0, 0.028)), 1.0),
+        (towers.carried, {**PLACE, **HELD}, view(thing((0.31, 0.0, 0.02), EIGHTH), hand=(0.31, 0.0, 0.02)), 1.0),
+        (towers.carried, {**PLACE, **HELD}, view((0.31, 0.0, 0.028)), 0.0),
+        (towers.carried, {**PLACE, **HELD}, view((0.33, 0.0, 0.028), hand=(0.33, 0.0, 0.028)), 0.0),
         (towers.carried, {**THREE, **HELD}, view(LYING, top=TOP, hand=TOP), 0.0),  # first the second one
         (towers.carried, {**THREE, **HELD}, view(ON, top=(0.0, 0.0, 0.1), hand=(0.0, 0.0, 0.1)), 2.0),
         # 20 cm beside, and 3 cm too low for the way over: hypot(0.2, 0.03) from there; on the cone at 2 cm beside; at its place.
