@@ -108,10 +108,10 @@ def reached(view: View, *, tower: tuple[str, ...], rise: float, within: Within, 
 
 
 def _carried(view: View, level: _Level, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
-    grasp = {"grasp_radius": grasp_radius, "object": level.object}
+    grasped = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=level.object)
     # Over its place an object may be as low as it likes: else its last centimetre down would cost all that is paid.
-    lowered = level.over & held(view, minimal_height=-jnp.inf, **grasp)
-    return level.due & (held(view, minimal_height=minimal_height, **grasp) | lowered | level.stands)
+    lowered = level.over & held(view, minimal_height=-jnp.inf, grasp_radius=grasp_radius, object=level.object)
+    return level.due & (grasped | lowered | level.stands)
 
 
 def carried(
