@@ -128,6 +128,11 @@ def action_rate_l2(view: View) -> Float[Array, ""]:
     return jnp.sum(jnp.square(view.action - view.last_action))
 
 
+def gripper_action_l2(view: View) -> Float[Array, ""]:
+    """Squared action of the gripper, the last one: of a binary one only the sign acts."""
+    return jnp.square(view.action[-1])
+
+
 def joint_vel_l2(view: View) -> Float[Array, ""]:
     """Squared joint speeds, all joints of the robot [rad^2/s^2, m^2/s^2]."""
     return jnp.sum(jnp.square(view.joint_vel))

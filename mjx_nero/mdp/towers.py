@@ -178,6 +178,11 @@ def _away(view: View, level: _Level, clearance: float) -> Scalar:
     return jnp.minimum(jnp.linalg.norm(off) / clearance, 1.0)
 
 
+def _opened(at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
+    opens, holds = jnp.array(open), jnp.array(hold)
+    return jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
+
+
 def opened(
     view: View,
     *,
@@ -194,10 +199,21 @@ def opened(
     Args:
         open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
     """
-    fingers, opens, holds = view.joint_pos[-len(open) :], jnp.array(open), jnp.array(hold)
-    share = jnp.clip(jnp.mean((fingers - holds) / (opens - holds)), 0.0, 1.0)
+    share = _opened(view.joint_pos, open, hold)
     levels = _levels(view, tower, rise, within)
     return _sum(level.stands * jnp.maximum(share, _away(view, level, clearance)) for level in levels)
+
+
+def told_to_open(
+    view: View, *, tower: tuple[str, ...], rise: float, within: Within, open: tuple[float, ...], hold: tuple[float, ...]
+) -> Scalar:
+    """How far the targets of the fingers are opened while the object stands, from 0 to 1: so a step to let go is paid at once.
+
+    Args:
+        open, hold: targets of the gripper's drives, the last of all, wide open and where that begins to count [rad or m].
+    """
+    share = _opened(view.ctrl, open, hold)
+    return _sum(level.stands * share for level in _levels(view, tower, rise, within))
 
 
 def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:

@@ -84,6 +84,11 @@ def test_fingers_count_as_opened_from_where_they_hold_a_cube_and_of_a_box_from_s
     assert holds["nero_place"] == NERO.gripper.close
 
 
+@pytest.mark.parametrize("name", ["nero_place", "cobotta_place", "nero_stack", "cobotta_stack"])
+def test_fingers_that_press_turn_back_before_their_speed_is_limited(name):
+    assert list(env_cfg(name).actions)[-2:] == ["anti_windup", "speed_limit"]
+
+
 def test_robots_that_cannot_are_told_in_one_line():
     low = dataclasses.replace(NERO, pick=((0.3, 0.4), (-0.1, 0.2), (0.02, 0.08)))
     assert stack.default(low).controllers["pick_place"]["end_effector_initial_height"] == pytest.approx(

@@ -114,6 +114,7 @@ REWARDS = [
     (rewards.object_at_pose, {"threshold": 0.11, "angle": 0.1, "fold": 4}, view(**LYING), 1.0),
     (rewards.object_at_pose, {"threshold": 0.09, "angle": 1.6}, view(**LYING), 0.0),
     (rewards.action_rate_l2, {}, view(), 0.25 + 4.0 + 0.0),
+    (rewards.gripper_action_l2, {}, view(), 4.0),
     (rewards.joint_vel_l2, {}, view(), 4.0 + 9.0),
     (rewards.touching, {}, beside(), 0.0),
     (rewards.touching, {}, beside(touch=1e-3), 1.0),

@@ -20,8 +20,10 @@ def thing(pos, quat=STRAIGHT, linvel=(0.0, 0.0, 0.0), angvel=(0.0, 0.0, 0.0)) ->
     return ObjectView(*(jnp.array(x, jnp.float32) for x in (pos, quat, linvel, angvel)))
 
 
-def view(red, *, blue=(0.4, 0.1, 0.02), top=(0.0, 0.0, 0.02), hand=(0.0, 0.0, 0.5), fingers=(0.05, -0.05), goal=STRAIGHT) -> View:
-    """Cubes of 4 cm, by position or whole; the goal is at (0.3, 0, 0.02)."""
+def view(
+    red, *, blue=(0.4, 0.1, 0.02), top=(0.0, 0.0, 0.02), hand=(0.0, 0.0, 0.5), fingers=(0.05, -0.05), told=None, goal=STRAIGHT
+) -> View:
+    """Cubes of 4 cm, by position or whole; the goal is at (0.3, 0, 0.02). Fingers are where they are told to be, or ``told``."""
     given = {"blue": blue, "red": red, "top": top}
     objects = {name: at if isinstance(at, ObjectView) else thing(at) for name, at in given.items()}
     zero, joints = jnp.zeros(3), jnp.array([0.7, *fingers])
@@ -29,7 +31,7 @@ def view(red, *, blue=(0.4, 0.1, 0.02), top=(0.0, 0.0, 0.02), hand=(0.0, 0.0, 0.
         joint_pos=joints,
         joint_vel=jnp.zeros(3),
         default_joint_pos=joints,
-        ctrl=joints,
+        ctrl=joints if told is None else jnp.array([0.7, *told]),
         ee_pos_w=jnp.array(hand, jnp.float32),
         ee_quat_w=jnp.array([0.0, 1.0, 0.0, 0.0]),
         objects=objects,
@@ -50,7 +52,8 @@ STACK = {"tower": ("blue", "red"), "rise": 0.04, "within": WITHIN}
 THREE = {**STACK, "tower": ("blue", "red", "top")}
 PLACE = {**STACK, "tower": ("goal", "red")}
 HELD = {"minimal_height": 0.03, "grasp_radius": 0.04}
-GRIPPER = {"open": (0.05, -0.05), "hold": (0.02, -0.02), "clearance": 0.05}
+FINGERS = {"open": (0.05, -0.05), "hold": (0.02, -0.02)}
+GRIPPER = {**FINGERS, "clearance": 0.05}
 WAY = {**HELD, "over": 0.03, "std": 0.05}
 ON, LYING, TOP = (0.4, 0.1, 0.06), (0.4, -0.1, 0.02), (0.4, 0.1, 0.1)
 IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
@@ -113,6 +116,13 @@ HOLDING = (0.02, -0.02)
         (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON), 1.0),
         (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.09), fingers=(0.0, 0.0)), 0.6),
         (towers.opened, {**STACK, **GRIPPER}, view(LYING), 0.0),
+        # Told to hold, wherever they are; told to open by a fifth and not moved yet; wide open; nothing stands.
+        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, told=HOLDING), 0.0),
+        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, fingers=HOLDING, told=(0.026, -0.026)), 0.2),
+        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, fingers=HOLDING, told=(0.0, 0.0)), 0.0),
+        (towers.told_to_open, {**STACK, **FINGERS}, view(ON), 1.0),
+        (towers.told_to_open, {**THREE, **FINGERS}, view(ON, top=TOP), 2.0),
+        (towers.told_to_open, {**STACK, **FINGERS}, view(LYING), 0.0),
         # At the cube; 3 cm above it; beside it; far below it; as far away as it takes.
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),

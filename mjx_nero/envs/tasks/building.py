@@ -8,7 +8,7 @@ from typing import Any
 from mjx_nero.envs import regions
 from mjx_nero.envs.regions import Regions
 from mjx_nero.envs.task import SuccessCfg
-from mjx_nero.mdp import metrics, rewards, terminations, towers
+from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
@@ -24,6 +24,13 @@ PRESS = 0.075  # [s] they press before an object is lifted, at least
 # Shares of the ten phases that a control step takes: 305 steps in all, 25 of them to close and 20 to open.
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
 CLOSES, OPENS = 3, 7
+
+
+def lets_go(acts: dict[str, Term]) -> dict[str, Term]:
+    """With anti-windup for a gripper that lets go at once, before the speed limit, which starts where it leaves the targets."""
+    others = dict(acts)
+    limit = others.pop("speed_limit")
+    return {**others, "anti_windup": Term(actions.AntiWindup), "speed_limit": limit}
 
 
 @dataclasses.dataclass(frozen=True)

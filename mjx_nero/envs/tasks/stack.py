@@ -4,9 +4,8 @@ import dataclasses
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, EnvCfg, Presets, velocity_actions
-from mjx_nero.envs.tasks.building import Tower
+from mjx_nero.envs.tasks.building import Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.actions import AntiWindup
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
@@ -51,16 +50,13 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         **_each(objects, "{}_velocity", observations.object_velocity),
         **_each(objects, "{}_orientation", observations.object_orientation),
     }
-    others = velocity_actions()
-    speed_limit = others.pop("speed_limit")
     apart = round(robot.opening / 2 + edge / 2 + BESIDE, 4)
     return EnvCfg(
         robot=tower.builder,
         scene=scene,
         sim=tower.sim(),
         episode_length_s=episode_length_s + tower.extra,
-        # Anti-windup before the speed limit, which starts from where it leaves the targets.
-        actions={**others, "anti_windup": Term(AntiWindup), "speed_limit": speed_limit},
+        actions=lets_go(velocity_actions()),
         command=CommandTerm(commands.nothing, resample_s=ONCE),
         events={
             "reset_object_positions": Term(
