@@ -8,7 +8,7 @@ import pytest
 from mjx_nero import UserError, bounds, config, control, env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.task import CALM, EnvCfg
+from mjx_nero.envs.task import CALM, QUIET, EnvCfg
 from mjx_nero.learn.policy import NetworkCfg
 from mjx_nero.learn.ppo import PRESETS
 from mjx_nero.mdp import actions
@@ -390,11 +390,12 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, for velocities, and for the recipes' presets, whose runners differ."""
+    """But for how long it takes, for velocities, for placing, and for the recipes' presets, whose runners differ."""
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
-        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == (CALM if moves else {}), env
+        calm = CALM if moves else QUIET if env in ("place", "nero_place", "cobotta_place") else {}
+        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env
     assert registry.env_cfg("nero_reach", "isaac").training["num_epochs"] == 8
 
 

@@ -40,8 +40,9 @@ def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: Non
     }
 
 
-# Of the learner, for velocities: noise of half the speed at most, and a policy that changes its mind for a reason.
-CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
+# Of the learner: noise of half of an action at most; for velocities, a policy that changes its mind for a reason, too.
+QUIET = {"network.init_std": 0.5, "max_std": 0.5}
+CALM = {**QUIET, "change_cost": 0.03}
 
 
 def drive_targets() -> dict[str, Term]:
