@@ -13,6 +13,8 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.types import UserError
 
+_ONE = ("binary", "continuous")  # of a gripper: one entry for all its joints
+
 
 def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     """How the action becomes position targets of the drives: the task's action terms, in their order.
@@ -21,7 +23,7 @@ def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
     ``joint_velocity``: likewise, of set-points, as ``mdp.actions.JointVelocity`` has it: shares of the drives' speeds, smoothed
     with the time constant ``time`` [s], at most ``ahead`` [s] of full speed before the joints; targets lead by ``lag`` [s].
     ``binary``: ``close`` for an entry below minus ``hysteresis``, ``open`` from plus that on, between as it was (at first open),
-    one for all the joints. The others change what is there:
+    one for all the joints. ``continuous``: from ``close`` at -1 to ``open`` at 1, likewise. The others change what is there:
     ``anti_windup`` (targets ``of`` some joints that turn back start at most ``ahead`` [s] of full speed behind the joints),
     ``speed_limit`` (they move at most as fast as the drives), ``delay`` (in control steps, the least and the most) and
     ``low_pass`` (time constant [s]) of the action.
@@ -44,10 +46,10 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
     if kind is terms.DriveTargets:
         of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
         return [{"name": name, "type": "joint_position", **of}]
-    if kind is terms.BinaryGripper:
-        ends = {"open": list(robot.gripper.open), "close": list(robot.gripper.close)}
-        of = {"joints": list(robot.gripper.joints), **ends, "hysteresis": term.params["hysteresis"]}
-        return [{"name": name, "type": "binary", **of}] if robot.gripper.joints else []
+    if kind in (terms.BinaryGripper, terms.ContinuousGripper):
+        of = {"joints": list(robot.gripper.joints), "open": list(robot.gripper.open), "close": list(robot.gripper.close)}
+        told = {"type": "binary", **of, **term.params} if kind is terms.BinaryGripper else {"type": "continuous", **of}
+        return [{"name": name, **told}] if robot.gripper.joints else []
     if kind is terms.SpeedLimit:
         limited = _drives(robot, term).joints if term.params["group"] else robot.joints
         return [{"name": name, "type": "speed_limit", "of": list(limited)}]
@@ -66,12 +68,12 @@ def _drives(robot: RobotCfg, term: Term) -> DriveCfg:
 
 
 def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
-    """The actions that take each joint to its limits; beyond them nothing more happens. A binary action is in +-1."""
+    """The actions that take each joint to its limits; beyond them nothing more happens. A gripper's one action is in +-1."""
     low: list[float] = []
     high: list[float] = []
     for part in (part for part in parts(env) if "joints" in part):
         if part["type"] != "joint_position":
-            n = 1 if part["type"] == "binary" else len(part["joints"])
+            n = 1 if part["type"] in _ONE else len(part["joints"])
             low, high = [*low, *[-1.0] * n], [*high, *[1.0] * n]
             continue
         limits = np.array([env.physics_model.joint(name).range for name in part["joints"]]).T
@@ -83,7 +85,8 @@ def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
 def for_targets(env: ManipulationEnv, targets: jax.Array, joint_pos: jax.Array) -> jax.Array:
     """The action that gives position targets of the drives: so a controller can act where a policy would.
 
-    A gripper without an action of its own stays where it is; a binary one opens or closes, whichever is nearer.
+    A gripper without an action of its own stays where it is; a binary one opens or closes, whichever is nearer; a continuous one
+    opens as far as comes nearest.
 
     Args:
         targets: [..., joints], in the order of ``RobotCfg.joints`` [rad or m].
@@ -98,6 +101,9 @@ def for_targets(env: ManipulationEnv, targets: jax.Array, joint_pos: jax.Array) 
         if part["type"] == "binary":
             to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))
             out.append(jnp.where(to_close < to_open, -1.0, 1.0)[..., None])
+        elif part["type"] == "continuous":
+            close, way = np.array(part["close"]), np.subtract(part["open"], part["close"])
+            out.append((2.0 * ((want - close) @ way) / (way @ way or 1.0) - 1.0)[..., None])
         elif part["type"] == "joint_velocity":  # as slowly as velocities follow: faster would swing
             slow = 2 * (part["time"] + late * env.dt)
             out.append(jnp.clip((want - joint_pos[..., ids]) / (slow * speed[ids]), -1.0, 1.0))

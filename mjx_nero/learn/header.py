@@ -95,9 +95,10 @@ def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
             raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run (its {name} is {shown})")
 
 
-def acts_by(meta: Mapping[str, Any]) -> str:
-    """What a policy's actions are, of the arm. Files of before 0.5.0 do not say: they are positions."""
-    return next(iter(meta.get("actions", ())), "JointPosition")
+def acts_alike(*metas: Mapping[str, Any]) -> bool:
+    """Whether two policies' actions are of the same kinds. Files of before 0.5.0 do not say: the arm's are positions."""
+    said = [list(meta["actions"]) for meta in metas if "actions" in meta]
+    return said[0] == said[1] if len(said) == 2 else all(kinds[:1] == ["JointPosition"] for kinds in said)
 
 
 def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:

@@ -211,7 +211,7 @@ def load_for(
             f"{path} was trained on observations of size {trained_on}, here it is {sizes['state']}: pass the --preset (it had "
             f"{policy.meta['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
         )
-    if header.acts_by(policy.meta) != header.acts_by({"actions": env.action_kinds}):
+    if not header.acts_alike(policy.meta, {"actions": env.action_kinds}):
         given = policy.meta.get("actions", ["JointPosition"])
         raise UserError(
             f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "

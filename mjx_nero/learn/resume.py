@@ -156,7 +156,8 @@ def check(source: Source, meta: dict[str, Any]) -> None:
             )
     if there.get("learner", "ppo") != meta["learner"]:
         raise UserError(f"{path} was made by the learner {there.get('learner', 'ppo')}: pass --learner to say so")
-    if any(map(differs, ("observations", "observation_size", "action_size"))) or header.acts_by(there) != header.acts_by(meta):
+    sized = ("observations", "observation_size", "action_size")
+    if any(map(differs, sized)) or not header.acts_alike(there, meta):
         where = f"{there.get('env')} (preset {there.get('preset')})"
         raise UserError(
             f"{path} does not fit: it was trained in {where} on other observations or actions "

@@ -193,6 +193,32 @@ class BinaryGripper(Plain):
 
 
 @dataclasses.dataclass(frozen=True)
+class ContinuousGripper(Plain):
+    """One entry, if there is a gripper: closed at -1, open at 1, and between in proportion.
+
+    A binary gripper that must not lose what it carries is told to close so surely that noise hardly ever opens it, and what would
+    be paid for letting go is not found. Of a continuous one a little more is told at every step.
+    """
+
+    @property
+    def home(self) -> np.ndarray:
+        """As far open as it is at home."""
+        drives = self.groups["gripper"]
+        if not len(drives.home):
+            return np.zeros(0, np.float32)
+        way = drives.open - drives.close
+        return np.array([2.0 * ((drives.home - drives.close) @ way) / (way @ way or 1.0) - 1.0], np.float32)
+
+    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
+        """Targets of the gripper."""
+        drives = self.groups["gripper"]
+        if not len(own):
+            return memory, act
+        share = jnp.clip(0.5 + 0.5 * own[0], 0.0, 1.0)
+        return memory, act.to("gripper", jnp.clip(drives.close + share * (drives.open - drives.close), drives.low, drives.high))
+
+
+@dataclasses.dataclass(frozen=True)
 class AntiWindup(Plain):
     """Targets of a group that turn back start at most ``ahead`` [s] of full speed from their joints; for before a speed limit.
 

@@ -132,16 +132,21 @@ def approached(
     grasp_radius: Positive,
     over: Positive,
     std: Positive,
+    flat: NonNegative = 0.0,
 ) -> Scalar:
     """1 - tanh(distance from the way to its place / std), while the object is held or stands.
 
     The way comes down a cone of 45 degrees from ``over`` above the place [m]: straight to it would be through the side of what is
     below. The distance is that along the table and that in height from the cone, together: 0 at the place alone.
+
+    Args:
+        flat: so far from the middle of its place the cone ends there [m], and an object may come straight down. Without, one that
+            is a little beside its place is paid for as much height as that.
     """
 
     def near(level: _Level) -> Scalar:
         aside = jnp.linalg.norm(level.way[:2])
-        off = jnp.hypot(aside, level.way[2] + jnp.minimum(aside, over))
+        off = jnp.hypot(aside, level.way[2] + jnp.clip(aside - flat, 0.0, over))
         return _carried(view, level, minimal_height, grasp_radius) * (1.0 - jnp.tanh(off / std))
 
     return _sum(near(level) for level in _levels(view, tower, rise, within))
@@ -220,6 +225,26 @@ def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, cle
     """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1; where that is on another
     one, above or beside it."""
     return _sum(level.stands * _away(view, level, clearance) for level in _levels(view, tower, rise, within))
+
+
+def left_upwards(
+    view: View,
+    *,
+    tower: tuple[str, ...],
+    rise: float,
+    within: Within,
+    open: tuple[float, ...],
+    hold: tuple[float, ...],
+    clearance: Positive,
+) -> Scalar:
+    """How far the grasp point is above an object that stands, as a share of ``clearance`` [m], times how far the fingers are
+    opened (see ``opened``): so a hand that holds an object by its edge has not left it a little."""
+    share = _opened(view.joint_pos, open, hold)
+
+    def above(level: _Level) -> Scalar:
+        return jnp.clip((view.ee_pos_w[2] - view.objects[level.object].pos_w[2]) / clearance, 0.0, 1.0)
+
+    return _sum(level.stands * share * above(level) for level in _levels(view, tower, rise, within))
 
 
 def completed(

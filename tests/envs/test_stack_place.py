@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import math
 
 import jax
 import mujoco
@@ -87,6 +88,16 @@ def test_fingers_count_as_opened_from_where_they_hold_a_cube_and_of_a_box_from_s
 @pytest.mark.parametrize("name", ["nero_place", "cobotta_place", "nero_stack", "cobotta_stack"])
 def test_fingers_that_press_turn_back_before_their_speed_is_limited(name):
     assert list(env_cfg(name).actions)[-2:] == ["anti_windup", "speed_limit"]
+
+
+@pytest.mark.parametrize("name", ["nero_stack", "cobotta_stack"])
+def test_a_cube_that_leans_on_its_edge_is_not_held_by_preset_continuous(name):
+    cfg = env_cfg(name, "continuous")
+    edge = cfg.scene.objects["red"].size[0]
+    assert cfg.rewards["holding_object"].params["minimal_height"] > edge / math.sqrt(2)
+    assert cfg.metrics["grasped"].params["minimal_height"] == pytest.approx(0.75 * edge)
+    assert cfg.rewards["approaching"].params["flat"] == edge / 2  # as far as it counts as over its place
+    assert cfg.rewards["releasing"].params["hold"] == cfg.robot.gripper.close
 
 
 def test_robots_that_cannot_are_told_in_one_line():

@@ -118,6 +118,16 @@ def test_a_gripper_that_lets_go_at_once_is_told():
     assert back == {"name": "anti_windup", "type": "anti_windup", "of": ["gripper_joint1", "gripper_joint2"], "ahead": 0.1}
 
 
+def test_a_continuous_gripper_is_told():
+    env = mjx_nero.make("nero_stack", impl="native", preset="continuous")
+    _, _, hand, *_ = meaning.parts(env)
+    fingers = {"joints": ["gripper_joint1", "gripper_joint2"], "open": [0.05, -0.05], "close": [0.0, -0.001]}
+    assert hand == {"name": "gripper", "type": "continuous", **fingers}
+    assert [bound[-1] for bound in meaning.bounds(env)] == [-1.0, 1.0]
+    half = jnp.array([*env.cfg.robot.arm.home, 0.025, -0.0255])
+    assert meaning.for_targets(env, half, half)[-1] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_histories_and_filters_are_told():
     late = {"observations.state.joint_pos.history": 3, "observations.state.joint_vel.delay": (1, 2), "action_clip": 2.0}
     env = mjx_nero.make("nero_reach", impl="native", **late)

@@ -152,6 +152,12 @@ def test_policy_of_other_actions(env, trained, tmp_path):
         policy.load_for(positions, "nero_lift", tmp_path / "new.safetensors")
 
 
+def test_policy_of_another_gripper():
+    hand = make("nero_stack", "continuous", impl="native")
+    with pytest.raises(UserError, match=r"\(JointVelocity, BinaryGripper; here JointVelocity, ContinuousGripper\): pass"):
+        policy.load_for(hand, "nero_stack", policy.shipped("nero_stack"))
+
+
 def test_policy_of_another_robot_of_the_same_name(trained, path):
     """Its arm has other limits to its drives' forces."""
     other = make("nero_lift", impl="native", **{"robot.arm.effort": (1.0,) * 7})

@@ -388,6 +388,23 @@ def test_a_gripper_with_hysteresis_changes_its_mind_beyond_it_alone():
     assert not actions.Chain({**ARM, **GRIPPER}, GROUPS).init(KEY, jnp.zeros(4))
 
 
+def test_a_continuous_gripper_is_as_far_open_as_it_is_told():
+    """Of fingers from 0 and -1 mm to 50 and -60: a quarter is 12.5 and -15.75; -60 is beyond the range."""
+    chain = {**ARM, "gripper": Term(actions.ContinuousGripper)}
+    out = play(chain, [[0.0, 0.0, a] for a in (-7.0, -1.0, -0.5, 0.0, 9.0)])
+    want = [[0.0, -0.001], [0.0, -0.001], [0.0125, -0.01575], [0.025, -0.0305], [0.05, -0.05]]
+    np.testing.assert_allclose(out[:, 2:], want, atol=1e-7)
+
+
+@pytest.mark.parametrize(("home", "action"), [([0.0, -0.001], -1.0), ([0.05, -0.06], 1.0), ([0.0125, -0.01575], -0.5)])
+def test_a_continuous_gripper_knows_how_far_open_it_is_at_home(home, action):
+    hand = drives(home, -0.05, 0.05, open=[0.05, -0.06], close=[0.0, -0.001])
+    chain = actions.Chain({"gripper": Term(actions.ContinuousGripper)}, {"arm": GROUPS["arm"], "gripper": hand})
+    np.testing.assert_allclose(chain.home, [action], atol=1e-6)
+    none = {"arm": GROUPS["arm"], "gripper": drives([], 0.0, 0.0, open=[], close=[])}
+    np.testing.assert_array_equal(actions.Chain({**ARM, "gripper": Term(actions.ContinuousGripper)}, none).home, [0.0, 0.0])
+
+
 def test_without_a_term_of_its_own_the_gripper_stays_at_home():
     np.testing.assert_array_equal(play(ARM, [[1.0, 0.0]])[0, 2:], np.float32([0.05, -0.05]))
 

@@ -57,7 +57,9 @@ GRIPPER = {**FINGERS, "clearance": 0.05}
 WAY = {**HELD, "over": 0.03, "std": 0.05}
 ON, LYING, TOP = (0.4, 0.1, 0.06), (0.4, -0.1, 0.02), (0.4, 0.1, 0.1)
 IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
-HOLDING = (0.02, -0.02)
+HOLDING, HALF = (0.02, -0.02), (0.035, -0.035)
+ABOVE = (0.4, 0.1, 0.09)
+ASIDE = (0.4, 0.12, 0.06)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +97,9 @@ HOLDING = (0.02, -0.02)
             view((0.4, 0.12, 0.07), hand=(0.4, 0.12, 0.07)),
             1 - math.tanh(0.2**0.5),
         ),
+        # Straight down 2 cm beside its place, where the cone ends; where it ends at 1 cm it would still be 1 cm too low.
+        (towers.approached, {**STACK, **WAY, "flat": 0.02}, view(ASIDE, hand=ASIDE), 1 - math.tanh(0.4)),
+        (towers.approached, {**STACK, **WAY, "flat": 0.01}, view(ASIDE, hand=ASIDE), 1 - math.tanh(0.2**0.5)),
         (towers.approached, {**STACK, **WAY}, view(ON), 1.0),
         (towers.approached, {**STACK, **WAY}, view(LYING, hand=LYING), 0.0),  # pushed along the table it is not held
         (towers.approached, {**STACK, **WAY}, view((0.4, 0.1, 0.09)), 0.0),  # thrown
@@ -123,6 +128,13 @@ HOLDING = (0.02, -0.02)
         (towers.told_to_open, {**STACK, **FINGERS}, view(ON), 1.0),
         (towers.told_to_open, {**THREE, **FINGERS}, view(ON, top=TOP), 2.0),
         (towers.told_to_open, {**STACK, **FINGERS}, view(LYING), 0.0),
+        # Open by half and 3 cm of 5 above it; as far and holding it; beside it or below it; on a table.
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HALF), 0.3),
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HOLDING), 0.0),
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.2, 0.06)), 0.0),
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.02)), 0.0),
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.5)), 1.0),
+        (towers.left_upwards, {**STACK, **GRIPPER}, view(LYING), 0.0),
         # At the cube; 3 cm above it; beside it; far below it; as far away as it takes.
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),

@@ -43,6 +43,8 @@ class Tower:
         hold: positions of the fingers from which on they count as opened [rad or m].
         aside: how far from its place an object may be, along the table [m].
         angle: from the goal's orientation, likewise [rad].
+        lifted: above where it lies an object is held [m].
+        flat: so far from the middle of its place an object may come straight down [m] (``towers.approached``).
     """
 
     robot: RobotCfg
@@ -52,6 +54,8 @@ class Tower:
     hold: tuple[float, ...]
     aside: float
     angle: float = math.pi
+    lifted: float = LIFTED
+    flat: float = 0.0
 
     @property
     def place(self) -> dict[str, Any]:
@@ -71,7 +75,7 @@ class Tower:
     @property
     def held(self) -> dict[str, float]:
         """An object is held if it is this high, and this near to the grasp point [m]."""
-        return {"minimal_height": self.edge / 2 + LIFTED, "grasp_radius": regions.near(self.there)}
+        return {"minimal_height": self.edge / 2 + self.lifted, "grasp_radius": regions.near(self.there)}
 
     @property
     def clearance(self) -> float:
@@ -113,7 +117,7 @@ class Tower:
     def rewards(self) -> dict[str, RewardTerm]:
         """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones."""
         near, carried = self.near, {**self.near, **self.held}
-        way, leave = {**carried, "over": round(0.75 * self.edge, 4)}, {**near, "clearance": self.clearance}
+        way, leave = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.flat}, {**near, "clearance": self.clearance}
         fingers = {"open": self.robot.gripper.open, "hold": self.hold}
         turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
         return {
@@ -129,6 +133,15 @@ class Tower:
             "completed": RewardTerm(towers.completed, weight=15.0, params=self.done),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        }
+
+    def letting_go(self) -> dict[str, RewardTerm]:
+        """The fingers' targets are paid for, from shut on, and a gripper that is told too firmly to hold costs: else nothing that
+        noise tries for a step at a time shows that letting go pays."""
+        fingers = {"open": self.robot.gripper.open, "hold": self.robot.gripper.close}
+        return {
+            "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**self.near, **fingers}),
+            "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
         }
 
     def metrics(self) -> dict[str, MetricTerm]:

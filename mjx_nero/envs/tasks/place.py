@@ -6,8 +6,8 @@ import math
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import QUIET, EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks.building import Tower, lets_go
-from mjx_nero.mdp import commands, events, observations, rewards, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp import commands, events, observations, towers
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -62,23 +62,13 @@ def default(robot: RobotCfg) -> EnvCfg:
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
         observations={"state": state, "privileged_state": {**exact(state), **seen}},
-        rewards={**tower.rewards(), **_letting_go(tower)},
+        rewards={**tower.rewards(), **tower.letting_go()},
         success=tower.success(),
         metrics=tower.metrics(),
         terminations=tower.terminations(),
         controllers=tower.controllers(),
         training={**QUIET, "num_timesteps": 150_000_000},
     )
-
-
-def _letting_go(tower: Tower) -> dict[str, RewardTerm]:
-    """The fingers' targets are paid for, and a gripper that is told too firmly to hold costs: else nothing that noise tries for a
-    step at a time shows that letting go pays."""
-    fingers = {"open": tower.robot.gripper.open, "hold": tower.hold}
-    return {
-        "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**tower.near, **fingers}),
-        "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
-    }
 
 
 def _box(robot: RobotCfg, long: float) -> ObjectCfg:

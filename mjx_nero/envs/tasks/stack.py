@@ -1,12 +1,16 @@
-"""Stack: one cube onto another, let go of and at rest. Preset ``three`` puts one more on top. For any robot with a gripper."""
+"""Stack: one cube onto another, let go of and at rest. For any robot with a gripper.
+
+Preset ``three`` puts one more on top; ``continuous`` is of a hand that opens as far as it is told.
+"""
 
 import dataclasses
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, EnvCfg, Presets, velocity_actions
-from mjx_nero.envs.tasks.building import Tower, lets_go
+from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
+from mjx_nero.mdp.actions import ContinuousGripper
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -26,7 +30,13 @@ def three(robot: RobotCfg) -> EnvCfg:
     return _stack(robot, 3, 13.0)
 
 
-def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
+def continuous(robot: RobotCfg) -> EnvCfg:
+    """The red cube onto the blue one with a continuous gripper: straight down, and paid for being told to open, then for leaving
+    upwards. A cube counts as held from where none gets that leans on its edge."""
+    return _stack(robot, 2, 7.0, continuous=True)
+
+
+def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: bool = False) -> EnvCfg:
     cube, there = grasp.cube_for(robot), regions.of(robot)
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
     scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
@@ -34,6 +44,13 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     # Fingers count as opened from where they hold a cube: while they hold a wide one they are half open already.
     hold = grasp.opened(robot, edge).gripper.open
     tower = Tower(robot, scene, tuple(objects), edge, hold, aside=edge / 2)
+    acts, rewards = velocity_actions(), tower.rewards()
+    if continuous:
+        tower = dataclasses.replace(tower, lifted=max(LIFTED, edge / 4), flat=tower.aside)
+        acts["gripper"] = Term(ContinuousGripper)
+        leave = {**tower.near, "clearance": tower.clearance, "open": robot.gripper.open, "hold": hold}
+        leaving = RewardTerm(towers.left_upwards, weight=10.0, params=leave)
+        rewards = {**tower.rewards(), **tower.letting_go(), "leaving": leaving}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
@@ -56,7 +73,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         scene=scene,
         sim=tower.sim(),
         episode_length_s=episode_length_s + tower.extra,
-        actions=lets_go(velocity_actions()),
+        actions=lets_go(acts),
         command=CommandTerm(commands.nothing, resample_s=ONCE),
         events={
             "reset_object_positions": Term(
@@ -65,7 +82,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
             ),
         },
         observations={"state": state, "privileged_state": {**exact(state), **seen}},
-        rewards=tower.rewards(),
+        rewards=rewards,
         success=tower.success(),
         metrics=tower.metrics(),
         terminations=tower.terminations(),
@@ -81,4 +98,4 @@ def _each(objects, name, func, noise=0.0) -> dict[str, ObservationTerm]:
 
 def presets() -> Presets:
     """Preset -> robot -> config; the default first."""
-    return {"default": default, "three": three}
+    return {"default": default, "three": three, "continuous": continuous}
