@@ -227,7 +227,7 @@ def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, cle
     return _sum(level.stands * _away(view, level, clearance) for level in _levels(view, tower, rise, within))
 
 
-def left_upwards(
+def left_with_open_fingers(
     view: View,
     *,
     tower: tuple[str, ...],
@@ -237,14 +237,10 @@ def left_upwards(
     hold: tuple[float, ...],
     clearance: Positive,
 ) -> Scalar:
-    """How far the grasp point is above an object that stands, as a share of ``clearance`` [m], times how far the fingers are
-    opened (see ``opened``): so a hand that holds an object by its edge has not left it a little."""
+    """As ``left``, times how far the fingers are opened (see ``opened``): so a hand that holds an object by its edge has not left
+    it a little."""
     share = _opened(view.joint_pos, open, hold)
-
-    def above(level: _Level) -> Scalar:
-        return jnp.clip((view.ee_pos_w[2] - view.objects[level.object].pos_w[2]) / clearance, 0.0, 1.0)
-
-    return _sum(level.stands * share * above(level) for level in _levels(view, tower, rise, within))
+    return share * left(view, tower=tower, rise=rise, within=within, clearance=clearance)
 
 
 def completed(

@@ -128,13 +128,12 @@ ASIDE = (0.4, 0.12, 0.06)
         (towers.told_to_open, {**STACK, **FINGERS}, view(ON), 1.0),
         (towers.told_to_open, {**THREE, **FINGERS}, view(ON, top=TOP), 2.0),
         (towers.told_to_open, {**STACK, **FINGERS}, view(LYING), 0.0),
-        # Open by half and 3 cm of 5 above it; as far and holding it; beside it or below it; on a table.
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HALF), 0.3),
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HOLDING), 0.0),
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.2, 0.06)), 0.0),
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.02)), 0.0),
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.5)), 1.0),
-        (towers.left_upwards, {**STACK, **GRIPPER}, view(LYING), 0.0),
+        # 3 cm of 5 above it, open by half; holding it; 10 cm beside it, wide open; below it; on a table.
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HALF), 0.3),
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HOLDING), 0.0),
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.2, 0.06)), 1.0),
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.02)), 0.0),
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(LYING), 0.0),
         # At the cube; 3 cm above it; beside it; far below it; as far away as it takes.
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),

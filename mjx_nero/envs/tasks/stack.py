@@ -32,7 +32,7 @@ def three(robot: RobotCfg) -> EnvCfg:
 
 def continuous(robot: RobotCfg) -> EnvCfg:
     """The red cube onto the blue one with a continuous gripper: straight down, and paid for being told to open, then for leaving
-    upwards. A cube counts as held from where none gets that leans on its edge."""
+    with open fingers. A cube counts as held from where none gets that leans on its edge."""
     return _stack(robot, 2, 7.0, continuous=True)
 
 
@@ -49,7 +49,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: boo
         tower = dataclasses.replace(tower, lifted=max(LIFTED, edge / 4), flat=tower.aside)
         acts["gripper"] = Term(ContinuousGripper)
         leave = {**tower.near, "clearance": tower.clearance, "open": robot.gripper.open, "hold": hold}
-        leaving = RewardTerm(towers.left_upwards, weight=10.0, params=leave)
+        leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params=leave)
         rewards = {**tower.rewards(), **tower.letting_go(), "leaving": leaving}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
