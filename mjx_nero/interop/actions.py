@@ -13,7 +13,7 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.types import UserError
 
-_ONE = ("binary", "continuous")  # of a gripper: one entry for all its joints
+_GRIPPERS = {terms.BinaryGripper: "binary", terms.ContinuousGripper: "continuous"}  # one entry for all joints
 
 
 def parts(env: ManipulationEnv) -> list[dict[str, Any]]:
@@ -46,10 +46,9 @@ def _part(env: ManipulationEnv, name: str, term: Term) -> list[dict[str, Any]]:
     if kind is terms.DriveTargets:
         of = {"joints": list(robot.joints), "scale": 1.0, "offset": [0.0] * len(robot.joints)}
         return [{"name": name, "type": "joint_position", **of}]
-    if kind in (terms.BinaryGripper, terms.ContinuousGripper):
+    if kind in _GRIPPERS:
         of = {"joints": list(robot.gripper.joints), "open": list(robot.gripper.open), "close": list(robot.gripper.close)}
-        told = {"type": "binary", **of, **term.params} if kind is terms.BinaryGripper else {"type": "continuous", **of}
-        return [{"name": name, **told}] if robot.gripper.joints else []
+        return [{"name": name, "type": _GRIPPERS[kind], **of, **term.params}] if robot.gripper.joints else []
     if kind is terms.SpeedLimit:
         limited = _drives(robot, term).joints if term.params["group"] else robot.joints
         return [{"name": name, "type": "speed_limit", "of": list(limited)}]
@@ -73,7 +72,7 @@ def bounds(env: ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
     high: list[float] = []
     for part in (part for part in parts(env) if "joints" in part):
         if part["type"] != "joint_position":
-            n = 1 if part["type"] in _ONE else len(part["joints"])
+            n = 1 if part["type"] in _GRIPPERS.values() else len(part["joints"])
             low, high = [*low, *[-1.0] * n], [*high, *[1.0] * n]
             continue
         limits = np.array([env.physics_model.joint(name).range for name in part["joints"]]).T
@@ -102,8 +101,7 @@ def for_targets(env: ManipulationEnv, targets: jax.Array, joint_pos: jax.Array) 
             to_open, to_close = (jnp.abs(want - jnp.array(part[end])).sum(-1) for end in ("open", "close"))
             out.append(jnp.where(to_close < to_open, -1.0, 1.0)[..., None])
         elif part["type"] == "continuous":
-            close, way = np.array(part["close"]), np.subtract(part["open"], part["close"])
-            out.append((2.0 * ((want - close) @ way) / (way @ way or 1.0) - 1.0)[..., None])
+            out.append(terms.opening(want, np.array(part["open"]), np.array(part["close"]))[..., None])
         elif part["type"] == "joint_velocity":  # as slowly as velocities follow: faster would swing
             slow = 2 * (part["time"] + late * env.dt)
             out.append(jnp.clip((want - joint_pos[..., ids]) / (slow * speed[ids]), -1.0, 1.0))

@@ -206,8 +206,7 @@ class ContinuousGripper(Plain):
         drives = self.groups["gripper"]
         if not len(drives.home):
             return np.zeros(0, np.float32)
-        way = drives.open - drives.close
-        return np.array([2.0 * ((drives.home - drives.close) @ way) / (way @ way or 1.0) - 1.0], np.float32)
+        return np.array([opening(drives.home, drives.open, drives.close)], np.float32)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the gripper."""
@@ -302,6 +301,12 @@ class LowPass(Plain):
         """An action nearer to the last one."""
         memory = memory + (1.0 - np.exp(-self.dt / self.time)) * (act.action - memory)
         return memory, dataclasses.replace(act, action=memory)
+
+
+def opening(at: Any, open: np.ndarray, close: np.ndarray) -> Any:
+    """The action of a ``ContinuousGripper`` that brings fingers nearest to ``at`` [..., joints] [rad or m]."""
+    way = open - close
+    return 2.0 * ((at - close) @ way) / (way @ way or 1.0) - 1.0
 
 
 class Chain:

@@ -43,14 +43,13 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: boo
     # On it, as far as it stays: the centre within the face below.
     # Fingers count as opened from where they hold a cube: while they hold a wide one they are half open already.
     hold = grasp.opened(robot, edge).gripper.open
-    tower = Tower(robot, scene, tuple(objects), edge, hold, aside=edge / 2)
+    lifted, flat = (max(LIFTED, edge / 4), edge / 2) if continuous else (LIFTED, 0.0)
+    tower = Tower(robot, scene, tuple(objects), edge, hold, aside=edge / 2, lifted=lifted, flat=flat)
     acts, rewards = velocity_actions(), tower.rewards()
     if continuous:
-        tower = dataclasses.replace(tower, lifted=max(LIFTED, edge / 4), flat=tower.aside)
         acts["gripper"] = Term(ContinuousGripper)
-        leave = {**tower.near, "clearance": tower.clearance, "open": robot.gripper.open, "hold": hold}
-        leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params=leave)
-        rewards = {**tower.rewards(), **tower.letting_go(), "leaving": leaving}
+        leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params=rewards["releasing"].params)
+        rewards |= {**tower.letting_go(), "leaving": leaving}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
