@@ -183,12 +183,23 @@ def _away(view: View, level: _Level, clearance: float) -> Scalar:
     return jnp.minimum(jnp.linalg.norm(off) / clearance, 1.0)
 
 
-def _opened(at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
+def _let_go(
+    view: View,
+    tower: tuple[str, ...],
+    level: _Level,
+    at: Array,
+    open: tuple[float, ...],
+    hold: tuple[float, ...],
+    clearance: float,
+) -> Scalar:
+    """How far fingers that are ``at`` are opened, from 0 to 1; below the top of a tower, where they have work elsewhere, or how
+    far they are away, if that is more."""
     opens, holds = jnp.array(open), jnp.array(hold)
-    return jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
+    share = jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
+    return share if level.object == tower[-1] else jnp.maximum(share, _away(view, level, clearance))
 
 
-def opened(
+def told_to_open(
     view: View,
     *,
     tower: tuple[str, ...],
@@ -198,27 +209,14 @@ def opened(
     hold: tuple[float, ...],
     clearance: Positive,
 ) -> Scalar:
-    """How far the fingers are opened while the object stands, from 0 to 1; or how far they are from it (see ``left``), if that is
-    more: they may have work elsewhere.
-
-    Args:
-        open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
-    """
-    share = _opened(view.joint_pos, open, hold)
-    levels = _levels(view, tower, rise, within)
-    return _sum(level.stands * jnp.maximum(share, _away(view, level, clearance)) for level in levels)
-
-
-def told_to_open(
-    view: View, *, tower: tuple[str, ...], rise: float, within: Within, open: tuple[float, ...], hold: tuple[float, ...]
-) -> Scalar:
     """How far the targets of the fingers are opened while the object stands, from 0 to 1: so a step to let go is paid at once.
+    Below the top of a tower, or how far they are from it (see ``left``), if that is more: they have work elsewhere.
 
     Args:
         open, hold: targets of the gripper's drives, the last of all, wide open and where that begins to count [rad or m].
     """
-    share = _opened(view.ctrl, open, hold)
-    return _sum(level.stands * share for level in _levels(view, tower, rise, within))
+    levels = _levels(view, tower, rise, within)
+    return _sum(level.stands * _let_go(view, tower, level, view.ctrl, open, hold, clearance) for level in levels)
 
 
 def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
@@ -237,10 +235,17 @@ def left_with_open_fingers(
     hold: tuple[float, ...],
     clearance: Positive,
 ) -> Scalar:
-    """As ``left``, times how far the fingers are opened (see ``opened``): so a hand that holds an object by its edge has not left
-    it a little."""
-    share = _opened(view.joint_pos, open, hold)
-    return share * left(view, tower=tower, rise=rise, within=within, clearance=clearance)
+    """As ``left``, times how far the fingers are opened, so that a hand which holds an object by its edge has not left it a
+    little; below the top of a tower as ``told_to_open``.
+
+    Args:
+        open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
+    """
+
+    def gone(level: _Level) -> Scalar:
+        return _let_go(view, tower, level, view.joint_pos, open, hold, clearance) * _away(view, level, clearance)
+
+    return _sum(level.stands * gone(level) for level in _levels(view, tower, rise, within))
 
 
 def completed(

@@ -119,7 +119,7 @@ def test_a_gripper_that_lets_go_at_once_is_told():
 
 
 def test_a_continuous_gripper_is_told():
-    env = mjx_nero.make("nero_stack", impl="native", preset="continuous")
+    env = mjx_nero.make("nero_stack", impl="native")
     _, _, hand, *_ = meaning.parts(env)
     fingers = {"joints": ["gripper_joint1", "gripper_joint2"], "open": [0.05, -0.05], "close": [0.0, -0.001]}
     assert hand == {"name": "gripper", "type": "continuous", **fingers}
@@ -142,18 +142,12 @@ def test_histories_and_filters_are_told():
         meaning.parts(mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=own), impl="native"))
 
 
-@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push", "cobotta_stack", "nero_stack continuous"])
+@pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push", "nero_place", "cobotta_stack", "nero_stack"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
     """The page's program, word for word, without this package: its joint targets are the environment's."""
-    env_name, _, preset = env_name.partition(" ")
-    punctual = {} if env_name == "nero_push" else {"actions.delay.params.steps": (0, 0)}
-    env = mjx_nero.make(env_name, preset or "default", impl="native", corruption=False, **punctual)
-    source = policy.shipped(env_name)
-    if preset:  # its own policy as one of another gripper: it is to move, no more
-        ready = policy.load(source)
-        source = tmp_path / "policy.safetensors"
-        checkpoint.save(source, ready.params, {**ready.meta, "preset": preset, "actions": env.action_kinds})
-    trained = policy.load_for(env, env_name, source)
+    punctual = {"actions.delay.params.steps": (0, 0)} if env_name not in ("nero_push", "nero_place") else {}
+    env = mjx_nero.make(env_name, impl="native", corruption=False, **punctual)
+    trained = policy.load_for(env, env_name, policy.shipped(env_name))
     reset, step, targets, view = (jax.jit(f) for f in (env.reset, env.step, env.targets, env.view))
     named = jax.jit(lambda state: env.named_observations(state)["state"])
     state, terms, want = reset(jax.random.PRNGKey(1)), [], []
@@ -169,7 +163,7 @@ def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, 
     np.savez(tmp_path / "terms.npz", positions=positions, **named_terms)
 
     (program,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert call("mjx_nero", "export", str(source), "--out", "policy.onnx")[0] == 0
+    assert call("mjx_nero", "export", env_name, "--out", "policy.onnx")[0] == 0
     (tmp_path / "run_policy.py").write_text(program)
     drive = f"""
 import sys

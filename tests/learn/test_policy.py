@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero import UserError, make
+from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.task import joint_actions
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.policy import NetworkCfg
+from mjx_nero.mdp.actions import BinaryGripper
+from mjx_nero.mdp.terms import Term
 
 CFG = NetworkCfg(actor=(16, 8), critic=(8,))
 
@@ -153,8 +155,8 @@ def test_policy_of_other_actions(env, trained, tmp_path):
 
 
 def test_policy_of_another_gripper():
-    hand = make("nero_stack", "continuous", impl="native")
-    with pytest.raises(UserError, match=r"\(JointVelocity, BinaryGripper; here JointVelocity, ContinuousGripper\): pass"):
+    hand = make("nero_stack", impl="native", actions={**env_cfg("nero_stack").actions, "gripper": Term(BinaryGripper)})
+    with pytest.raises(UserError, match=r"\(JointVelocity, ContinuousGripper; here JointVelocity, BinaryGripper\): pass"):
         policy.load_for(hand, "nero_stack", policy.shipped("nero_stack"))
 
 

@@ -52,8 +52,7 @@ STACK = {"tower": ("blue", "red"), "rise": 0.04, "within": WITHIN}
 THREE = {**STACK, "tower": ("blue", "red", "top")}
 PLACE = {**STACK, "tower": ("goal", "red")}
 HELD = {"minimal_height": 0.03, "grasp_radius": 0.04}
-FINGERS = {"open": (0.05, -0.05), "hold": (0.02, -0.02)}
-GRIPPER = {**FINGERS, "clearance": 0.05}
+GRIPPER = {"open": (0.05, -0.05), "hold": (0.02, -0.02), "clearance": 0.05}
 WAY = {**HELD, "over": 0.03, "std": 0.05}
 ON, LYING, TOP = (0.4, 0.1, 0.06), (0.4, -0.1, 0.02), (0.4, 0.1, 0.1)
 IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
@@ -115,25 +114,26 @@ ASIDE = (0.4, 0.12, 0.06)
         (towers.standing, THREE, view(LYING, top=TOP), 0.0),
         (towers.standing, PLACE, view(thing((0.31, 0.0, 0.02), EIGHTH), goal=EIGHTH), 1.0),
         (towers.standing, PLACE, view(thing((0.31, 0.0, 0.02), EIGHTH)), 0.0),  # turned
-        # Fingers that hold the cube; two fifths open from there; wide open; closed, but 3 cm away; nothing stands.
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON, fingers=HOLDING), 0.0),
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON, fingers=(0.032, -0.032)), 0.4),
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=ON), 1.0),
-        (towers.opened, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.09), fingers=(0.0, 0.0)), 0.6),
-        (towers.opened, {**STACK, **GRIPPER}, view(LYING), 0.0),
-        # Told to hold, wherever they are; told to open by a fifth and not moved yet; wide open; nothing stands.
-        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, told=HOLDING), 0.0),
-        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, fingers=HOLDING, told=(0.026, -0.026)), 0.2),
-        (towers.told_to_open, {**STACK, **FINGERS}, view(ON, fingers=HOLDING, told=(0.0, 0.0)), 0.0),
-        (towers.told_to_open, {**STACK, **FINGERS}, view(ON), 1.0),
-        (towers.told_to_open, {**THREE, **FINGERS}, view(ON, top=TOP), 2.0),
-        (towers.told_to_open, {**STACK, **FINGERS}, view(LYING), 0.0),
+        # Told to hold, wherever they are; told to open by a fifth and not moved yet; told to shut; wide open; nothing stands.
+        (towers.told_to_open, {**STACK, **GRIPPER}, view(ON, told=HOLDING), 0.0),
+        (towers.told_to_open, {**STACK, **GRIPPER}, view(ON, fingers=HOLDING, told=(0.026, -0.026)), 0.2),
+        (towers.told_to_open, {**STACK, **GRIPPER}, view(ON, fingers=HOLDING, told=(0.0, 0.0)), 0.0),
+        (towers.told_to_open, {**STACK, **GRIPPER}, view(ON), 1.0),
+        (towers.told_to_open, {**STACK, **GRIPPER}, view(LYING), 0.0),
+        # All stand, wide open; away for the next one with shut fingers; 3 cm away; and at the topmost, which it holds.
+        (towers.told_to_open, {**THREE, **GRIPPER}, view(ON, top=TOP), 2.0),
+        (towers.told_to_open, {**THREE, **GRIPPER}, view(ON, told=(0.0, 0.0)), 1.0),
+        (towers.told_to_open, {**THREE, **GRIPPER}, view(ON, hand=ABOVE, told=(0.026, -0.026)), 0.6),
+        (towers.told_to_open, {**THREE, **GRIPPER}, view(ON, top=TOP, hand=TOP, told=HOLDING), 0.8),
         # 3 cm of 5 above it, open by half; holding it; 10 cm beside it, wide open; below it; on a table.
         (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HALF), 0.3),
         (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=ABOVE, fingers=HOLDING), 0.0),
         (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.2, 0.06)), 1.0),
         (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(ON, hand=(0.4, 0.1, 0.02)), 0.0),
         (towers.left_with_open_fingers, {**STACK, **GRIPPER}, view(LYING), 0.0),
+        (towers.left_with_open_fingers, {**THREE, **GRIPPER}, view(ON, fingers=HOLDING), 1.0),  # it holds the next one
+        (towers.left_with_open_fingers, {**THREE, **GRIPPER}, view(ON, hand=ABOVE, fingers=HOLDING), 0.36),
+        (towers.left_with_open_fingers, {**THREE, **GRIPPER}, view(ON, top=TOP, fingers=HOLDING), 1.0),
         # At the cube; 3 cm above it; beside it; far below it; as far away as it takes.
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=ON), 0.0),
         (towers.left, {**STACK, "clearance": 0.05}, view(ON, hand=(0.4, 0.1, 0.09)), 0.6),
@@ -200,8 +200,8 @@ def test_rewards_pay_more_for_every_phase_and_nothing_for_shortcuts():
         (towers.carried, {**STACK, **HELD}),
         (towers.approached, {**STACK, **WAY}),
         (towers.standing, STACK),
-        (towers.opened, {**STACK, **GRIPPER}),
-        (towers.left, {**STACK, "clearance": 0.05}),
+        (towers.told_to_open, {**STACK, **GRIPPER}),
+        (towers.left_with_open_fingers, {**STACK, **GRIPPER}),
         (towers.completed, BUILT),
     ]
     closed = {"fingers": HOLDING}

@@ -40,7 +40,6 @@ class Tower:
     Attributes:
         objects: from the bottom up, as in ``mdp.towers``.
         edge: how high an object is, and how far apart the fingers hold it [m].
-        hold: positions of the fingers from which on they count as opened [rad or m].
         aside: how far from its place an object may be, along the table [m].
         angle: from the goal's orientation, likewise [rad].
         lifted: above where it lies an object is held [m].
@@ -51,7 +50,6 @@ class Tower:
     scene: SceneCfg
     objects: tuple[str, ...]
     edge: float
-    hold: tuple[float, ...]
     aside: float
     angle: float = math.pi
     lifted: float = LIFTED
@@ -83,9 +81,14 @@ class Tower:
         return round(self.edge / 2 + self.robot.pad[0] / 2 + AWAY, 4)
 
     @property
+    def leave(self) -> dict[str, Any]:
+        """... and how far away a hand is that has left it."""
+        return {**self.near, "clearance": self.clearance}
+
+    @property
     def done(self) -> dict[str, Any]:
         """All stand, at rest, and the hand is away."""
-        return {**self.near, "max_speed": STILL, "clearance": self.clearance}
+        return {**self.leave, "max_speed": STILL}
 
     @property
     def builder(self) -> RobotCfg:
@@ -115,10 +118,14 @@ class Tower:
         return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
-        """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones."""
+        """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones.
+
+        The fingers' targets are paid for, from shut on, and a gripper that is told too firmly to hold costs: else nothing that
+        noise tries for a step at a time shows that letting go pays.
+        """
         near, carried = self.near, {**self.near, **self.held}
-        way, leave = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.flat}, {**near, "clearance": self.clearance}
-        fingers = {"open": self.robot.gripper.open, "hold": self.hold}
+        way = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.flat}
+        fingers = {"open": self.robot.gripper.open, "hold": self.robot.gripper.close}
         turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
         return {
             "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **near}),
@@ -128,20 +135,12 @@ class Tower:
             "approaching_fine": RewardTerm(towers.approached, weight=15.0, params={"std": 0.03, **way}),
             **(turned if self.angle < math.pi else {}),
             "standing": RewardTerm(towers.standing, weight=10.0, params=near),
-            "releasing": RewardTerm(towers.opened, weight=10.0, params={**leave, **fingers}),
-            "leaving": RewardTerm(towers.left, weight=10.0, params=leave),
+            "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**self.leave, **fingers}),
+            "leaving": RewardTerm(towers.left, weight=10.0, params=self.leave),
             "completed": RewardTerm(towers.completed, weight=15.0, params=self.done),
+            "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
-        }
-
-    def letting_go(self) -> dict[str, RewardTerm]:
-        """The fingers' targets are paid for, from shut on, and a gripper that is told too firmly to hold costs: else nothing that
-        noise tries for a step at a time shows that letting go pays."""
-        fingers = {"open": self.robot.gripper.open, "hold": self.robot.gripper.close}
-        return {
-            "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**self.near, **fingers}),
-            "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
         }
 
     def metrics(self) -> dict[str, MetricTerm]:

@@ -26,7 +26,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     yaw, rest = TURN if turns else STILL, box.rest_height - robot.base_pos[2]
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
     angle = math.radians(15) if turns else math.pi  # a hand that cannot turn at will is not asked to
-    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], robot.gripper.close, aside=0.02, angle=angle)
+    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle)
     named = {"object": "box"}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
@@ -62,7 +62,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
         observations={"state": state, "privileged_state": {**exact(state), **seen}},
-        rewards={**tower.rewards(), **tower.letting_go()},
+        rewards=tower.rewards(),
         success=tower.success(),
         metrics=tower.metrics(),
         terminations=tower.terminations(),

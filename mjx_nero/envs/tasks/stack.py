@@ -1,6 +1,6 @@
 """Stack: one cube onto another, let go of and at rest. For any robot with a gripper.
 
-Preset ``three`` puts one more on top; ``continuous`` is of a hand that opens as far as it is told.
+Preset ``three`` puts one more on top.
 """
 
 import dataclasses
@@ -30,26 +30,16 @@ def three(robot: RobotCfg) -> EnvCfg:
     return _stack(robot, 3, 13.0)
 
 
-def continuous(robot: RobotCfg) -> EnvCfg:
-    """The red cube onto the blue one with a continuous gripper: straight down, and paid for being told to open, then for leaving
-    with open fingers. A cube counts as held from where none gets that leans on its edge."""
-    return _stack(robot, 2, 7.0, continuous=True)
-
-
-def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: bool = False) -> EnvCfg:
+def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     cube, there = grasp.cube_for(robot), regions.of(robot)
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
     scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
-    # On it, as far as it stays: the centre within the face below.
-    # Fingers count as opened from where they hold a cube: while they hold a wide one they are half open already.
-    hold = grasp.opened(robot, edge).gripper.open
-    lifted, flat = (max(LIFTED, edge / 4), edge / 2) if continuous else (LIFTED, 0.0)
-    tower = Tower(robot, scene, tuple(objects), edge, hold, aside=edge / 2, lifted=lifted, flat=flat)
-    acts, rewards = velocity_actions(), tower.rewards()
-    if continuous:
-        acts["gripper"] = Term(ContinuousGripper)
-        leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params=rewards["releasing"].params)
-        rewards |= {**tower.letting_go(), "leaving": leaving}
+    # On it, as far as it stays, and so far beside it straight down: the centre within the face below. A cube counts as held from
+    # where none gets that leans on its edge.
+    tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4), flat=edge / 2)
+    # Leaving is paid for as far as the fingers have let go: from where they hold a cube, half open already if it is wide.
+    fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
+    leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.leave, **fingers})
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
@@ -72,7 +62,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: boo
         scene=scene,
         sim=tower.sim(),
         episode_length_s=episode_length_s + tower.extra,
-        actions=lets_go(acts),
+        actions=lets_go({**velocity_actions(), "gripper": Term(ContinuousGripper)}),
         command=CommandTerm(commands.nothing, resample_s=ONCE),
         events={
             "reset_object_positions": Term(
@@ -81,7 +71,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float, continuous: boo
             ),
         },
         observations={"state": state, "privileged_state": {**exact(state), **seen}},
-        rewards=rewards,
+        rewards={**tower.rewards(), "leaving": leaving},
         success=tower.success(),
         metrics=tower.metrics(),
         terminations=tower.terminations(),
@@ -97,4 +87,4 @@ def _each(objects, name, func, noise=0.0) -> dict[str, ObservationTerm]:
 
 def presets() -> Presets:
     """Preset -> robot -> config; the default first."""
-    return {"default": default, "three": three, "continuous": continuous}
+    return {"default": default, "three": three}
