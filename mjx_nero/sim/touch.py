@@ -108,9 +108,11 @@ class Reader:
 
     Attributes:
         addresses: of the three numbers of each contact's force.
+        pairs: the geoms that they are about, [ngeom, ngeom] of booleans.
     """
 
     addresses: np.ndarray
+    pairs: np.ndarray
 
     def __call__(self, values: Any) -> Any:
         """The force."""
@@ -120,7 +122,10 @@ class Reader:
 def reader(model: mujoco.MjModel) -> Reader | None:
     """Reads a model's sensors; None: the scene does not ask for it."""
     ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(_PREFIX)]
-    return Reader(np.array(model.sensor_adr[ours])) if ours else None
+    pairs = np.zeros((model.ngeom, model.ngeom), bool)
+    for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
+        pairs[first, second if second >= 0 else slice(None)] = True
+    return Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T) if ours else None
 
 
 @functools.cache

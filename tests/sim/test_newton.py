@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
+from mjx_nero.envs import registry
 from mjx_nero.learn import policy
 
 wp = pytest.importorskip("warp")
@@ -15,7 +16,7 @@ wp = pytest.importorskip("warp")
 # leaves, another that falls; condim 1, 3 and 6.
 KINDS = """
 <mujoco>
-  <option timestep="0.01" cone="{cone}" impratio="3" iterations="50" ls_iterations="50" jacobian="dense"/>
+  <option timestep="0.01" cone="{cone}" impratio="3" iterations="50" ls_iterations="50" jacobian="{jacobian}"/>
   <worldbody>
     <geom type="plane" size="0 0 1" condim="1"/>
     <body pos="0 0 1">
@@ -39,12 +40,13 @@ KINDS = """
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_accelerations_are_mujocos(cone):
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_accelerations_are_mujocos(cone, jacobian):
     from mujoco.mjx.third_party import mujoco_warp
 
     from mjx_nero.sim.physics import newton
 
-    model = mujoco.MjModel.from_xml_string(KINDS.format(cone=cone))
+    model = mujoco.MjModel.from_xml_string(KINDS.format(cone=cone, jacobian=jacobian))
     reference, n = mujoco.MjData(model), 8
     rng, states, expected = np.random.default_rng(0), [], []
     for i in range(n):
@@ -118,3 +120,13 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
     after, _ = jax.vmap(jax.vmap(warp.step))(*twice)
     np.testing.assert_allclose(after.qpos.reshape(n, -1), ours.qpos, rtol=0, atol=1e-6)
     assert jnp.isfinite(after.qvel).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in registry.list_envs() if registry.robot_of(name)])
+def test_no_environment_of_the_package_is_too_large(name):
+    from mjx_nero.sim.physics import newton
+
+    env = make(name, impl="native", num_envs=1)
+    nv = env.physics_model.nv
+    assert newton.floats(nv, env.cfg.sim.constraints_per_env, dense=nv <= 32)

@@ -183,27 +183,45 @@ class WarpPhysics:
         return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
 
     def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
-        """The strongest contact that counts of each world [N], and what brings it up to date after the solver."""
+        """The strongest contact that counts of each world [N], and what brings it up to date after the solver.
+
+        What MuJoCo's contact sensors say, for which MuJoCo Warp looks through all contacts once more for each.
+        """
         import warp as wp
-        from mujoco.mjx.third_party import mujoco_warp
+        from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
 
         if self._touch is None:
             return None, lambda: None
         strongest: Any = wp.zeros(data.nworld, dtype=float)
-        at: Any = wp.array(self._touch.addresses, dtype=int)
+        found, inputs = data.contact, [model.opt.cone, wp.array(self._touch.pairs, dtype=bool)]
+        inputs += [found.frame, found.friction, found.dim, found.efc_address, found.adhesion, found.geom, found.worldid]
+        inputs += [data.efc.force, data.njmax, data.nacon, strongest]
 
         @wp.kernel(module="unique", enable_backward=False)
-        def keep(values: wp.array2d(dtype=float), at: wp.array(dtype=int), strongest: wp.array(dtype=float)):  # type: ignore
-            world = wp.tid()
-            for i in range(at.shape[0]):
-                force = wp.vec3(values[world, at[i]], values[world, at[i] + 1], values[world, at[i] + 2])
-                strongest[world] = wp.max(strongest[world], wp.length(force))
+        def keep(
+            cone: int,
+            counts: wp.array2d(dtype=bool),  # type: ignore
+            frame: wp.array(dtype=wp.mat33),  # type: ignore
+            friction: wp.array(dtype=found.friction.dtype),  # type: ignore
+            dim: wp.array(dtype=int),  # type: ignore
+            address: wp.array2d(dtype=int),  # type: ignore
+            adhesion: wp.array(dtype=float),  # type: ignore
+            geom: wp.array(dtype=wp.vec2i),  # type: ignore
+            worldid: wp.array(dtype=int),  # type: ignore
+            forces: wp.array2d(dtype=float),  # type: ignore
+            njmax: int,
+            nacon: wp.array(dtype=int),  # type: ignore
+            strongest: wp.array(dtype=float),  # type: ignore
+        ):
+            i = wp.tid()
+            if i >= nacon[0]:
+                return
+            if counts[geom[i][0], geom[i][1]]:
+                world = worldid[i]
+                force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, False)
+                wp.atomic_max(strongest, world, wp.length(wp.spatial_top(force)))
 
-        def sense():
-            mujoco_warp.sensor_acc(model, data, skip_rne_postconstraint=True)
-            wp.launch(keep, dim=data.nworld, inputs=[data.sensordata, at, strongest])
-
-        return strongest, sense
+        return strongest, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs)
 
     def _world_fields(self, model: Any, n: int) -> Any:
         """Puts the drawn fields in the model's place, one row a world: views of one array [n, numbers], None without any."""

@@ -2,13 +2,15 @@
 
 MuJoCo Warp solves with a dozen kernels an iteration, each for all environments, until the slowest of them has converged: at
 thousands of environments that is most of a step that grasps. Here a block of 32 threads takes one environment from beginning to
-end, in shared memory. The problem is MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that
-minimise Gauss' cost and the constraints' cost, with elliptic or pyramidal friction cones), so the solution is, too.
+end, in shared memory; the Jacobian only where it is dense, which MuJoCo Warp has it for up to 32 degrees of freedom. The problem
+is MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that minimise Gauss' cost and the
+constraints' cost, with elliptic or pyramidal friction cones), so the solution is, too.
 
 The source, ``newton.cu``, compiles for the CPU as well, with one thread for all 32: slow, for tests.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from importlib import resources
 from typing import Any
@@ -16,11 +18,19 @@ from typing import Any
 import mujoco
 
 _SHARED_BYTES = 48 * 1024  # of a block, on every GPU that Warp supports
+_DOFS = 64  # a bit for each
 
 
 @functools.cache
 def _solver() -> str:
     return resources.files(__package__).joinpath("newton.cu").read_text()
+
+
+def floats(nv: int, njmax: int, dense: bool) -> int | None:
+    """Numbers that an environment takes in shared memory; None: the model is too large."""
+    stride, pairs = (nv + 1) | 1, nv * (nv + 1) // 2
+    size = nv * (stride + 5) + njmax * (7 + dense * nv) + math.ceil((2 * pairs + nv) / 4)
+    return size if nv <= _DOFS and 4 * size <= _SHARED_BYTES else None
 
 
 def make(model, data) -> Callable[[], None]:
@@ -36,15 +46,17 @@ def make(model, data) -> Callable[[], None]:
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
 
-    nv, njmax = model.nv, data.njmax
-    size = 2 * nv * nv + njmax * nv + 5 * nv + 8 * njmax
-    if model.is_sparse or 4 * size > _SHARED_BYTES:
+    nv, njmax, dense = model.nv, data.njmax, not model.is_sparse
+    size = floats(nv, njmax, dense)
+    if size is None:
         return lambda: mujoco_warp.solve(model, data)
-    numbers = {"NV": nv, "NJ": njmax, "SIZE": size, "ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)}
+    numbers = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "SIZE": size}
+    numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
     numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
     source = "".join(f"constexpr int {name} = {value};\n" for name, value in numbers.items()) + _solver()
     arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_smooth", "qacc_warmstart")}
     arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
+    arrays |= {f"efc_J_{name}": getattr(data.efc, f"J_{name}") for name in ("rownnz", "rowadr", "colind")}
     arrays |= {f"contact_{name}": getattr(data.contact, name) for name in ("friction", "dim", "efc_address")}
     arrays |= {name: getattr(model, name) for name in ("M_rownnz", "M_rowadr", "M_colind")}
     arrays |= {name: getattr(model.opt, name) for name in ("impratio_invsqrt", "tolerance", "ls_tolerance")}
