@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 
 import pytest
 import yaml
@@ -152,6 +153,11 @@ def test_the_file_formats_are_those_that_are_read():
         section = page.split(f"## {title}")[1].split("\n## ")[0]
         named = {name for row in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
         assert named == fields, title
+
+
+def test_the_extra_of_the_site_has_what_documented_modules_import():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(extras["gym"]) <= set(extras["docs"])  # the environment of the tests has it in any case
 
 
 @pytest.mark.slow
