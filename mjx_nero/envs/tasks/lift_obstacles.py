@@ -6,7 +6,7 @@ import functools
 
 from mjx_nero.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.task import CALM, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import curriculum, metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, MetricTerm, RewardTerm, Term
@@ -51,9 +51,9 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         plain,
         sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, and a box that is leant on
         episode_length_s=12.0,
-        actions=joint_actions(scale=0.5),
+        actions=velocity_actions(),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
-        training={"num_timesteps": 170_000_000},
+        training={**CALM, "num_timesteps": 170_000_000},
         command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),
@@ -64,6 +64,8 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             **plain.rewards,
             "touching": RewardTerm(rewards.touching, weight=-10.0),
             "nearness": RewardTerm(rewards.obstacle_nearness, weight=-1.0, params={"margin": 0.05}),
+            # Else a hand that learns to come open learns it too firmly for noise ever to close it.
+            "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
         },
         # Until an environment succeeds a touch costs it a tenth: ten times what a hand at the cube earns would teach it
         # little but to keep away.
