@@ -102,6 +102,17 @@ def test_a_cube_that_leans_on_its_edge_is_not_held(name):
     assert cfg.rewards["approaching"].params["flat"] == edge / 2  # as far as it counts as over its place
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_box_that_is_only_tipped_over_an_edge_is_not_held(robot):
+    cfg = env_cfg("place", robot=robot)
+    long, _, high = cfg.scene.objects["box"].size
+    angles = np.radians(np.arange(91))  # until it stands on its end
+    highest = max(np.sin(angles) * long / 2 + np.cos(angles) * high / 2)
+    for term in (cfg.rewards["holding_object"], cfg.rewards["approaching"], cfg.metrics["grasped"]):
+        assert highest < term.params["minimal_height"] < highest + 0.004
+    assert cfg.rewards["approaching"].params["flat"] == 0.02  # as far as it counts as over its place
+
+
 def test_robots_that_cannot_are_told_in_one_line():
     low = dataclasses.replace(NERO, pick=((0.3, 0.4), (-0.1, 0.2), (0.02, 0.08)))
     assert stack.default(low).controllers["pick_place"]["end_effector_initial_height"] == pytest.approx(

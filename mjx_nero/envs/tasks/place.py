@@ -16,6 +16,7 @@ from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 TURN = (-math.pi / 6, math.pi / 6)  # [rad] of the box at the start, and of its goal
 STILL = (0.0, 0.0)
 APART = 2.5  # from its start to its goal at least, in heights of the box: one that lies there already is best left alone
+ASIDE = 0.02  # [m] from the goal it may be, along the table
 LONG = 1.5  # its longest edge, along x, in shorter ones: its turn can be seen
 
 
@@ -26,7 +27,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     yaw, rest = TURN if turns else STILL, box.rest_height - robot.base_pos[2]
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
     angle = math.radians(15) if turns else math.pi  # a hand that cannot turn at will is not asked to
-    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle)
+    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], ASIDE, angle, lifted=_lifted(box), flat=ASIDE)
     named = {"object": "box"}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
@@ -76,6 +77,12 @@ def _box(robot: RobotCfg, long: float) -> ObjectCfg:
     cube = grasp.cube_for(robot)
     edge = cube.size[0]
     return dataclasses.replace(cube, size=(round(long * edge, 4), edge, edge), mass=float(f"{long * cube.mass:.3g}"))
+
+
+def _lifted(box: ObjectCfg) -> float:
+    """Higher than a box gets that is only tipped over an edge [m], and its turn lost: that is easier learnt than to lift it."""
+    long, _, high = box.size
+    return round((math.hypot(long, high) - high) / 2 + high / 20, 4)
 
 
 def presets() -> Presets:
