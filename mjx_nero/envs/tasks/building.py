@@ -40,10 +40,9 @@ class Tower:
     Attributes:
         objects: from the bottom up, as in ``mdp.towers``.
         edge: how high an object is, and how far apart the fingers hold it [m].
-        aside: how far from its place an object may be, along the table [m].
+        aside: how far from its place an object may be, along the table, and come straight down (``towers.approached``) [m].
         angle: from the goal's orientation, likewise [rad].
         lifted: above where it lies an object is held [m].
-        flat: so far from the middle of its place an object may come straight down [m] (``towers.approached``).
     """
 
     robot: RobotCfg
@@ -53,7 +52,6 @@ class Tower:
     aside: float
     angle: float = math.pi
     lifted: float = LIFTED
-    flat: float = 0.0
 
     @property
     def place(self) -> dict[str, Any]:
@@ -124,7 +122,7 @@ class Tower:
         noise tries for a step at a time shows that letting go pays.
         """
         near, carried = self.near, {**self.near, **self.held}
-        way = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.flat}
+        way = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.aside}
         fingers = {"open": self.robot.gripper.open, "hold": self.robot.gripper.close}
         turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
         return {

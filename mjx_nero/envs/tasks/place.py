@@ -16,7 +16,6 @@ from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 TURN = (-math.pi / 6, math.pi / 6)  # [rad] of the box at the start, and of its goal
 STILL = (0.0, 0.0)
 APART = 2.5  # from its start to its goal at least, in heights of the box: one that lies there already is best left alone
-ASIDE = 0.02  # [m] from the goal it may be, along the table
 LONG = 1.5  # its longest edge, along x, in shorter ones: its turn can be seen
 
 
@@ -27,7 +26,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     yaw, rest = TURN if turns else STILL, box.rest_height - robot.base_pos[2]
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
     angle = math.radians(15) if turns else math.pi  # a hand that cannot turn at will is not asked to
-    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], ASIDE, angle, lifted=_lifted(box), flat=ASIDE)
+    tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle, lifted=_lifted(box))
     named = {"object": "box"}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),

@@ -36,7 +36,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
     # On it, as far as it stays, and so far beside it straight down: the centre within the face below. A cube counts as held from
     # where none gets that leans on its edge.
-    tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4), flat=edge / 2)
+    tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))
     # Leaving is paid for as far as the fingers have let go: from where they hold a cube, half open already if it is wide.
     fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
     leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.leave, **fingers})
