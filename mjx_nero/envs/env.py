@@ -59,6 +59,7 @@ class ManipulationEnv(Env):
         num_envs: how many are meant to be stepped together.
 
     Attributes:
+        actions: the task's action terms, one after another: they describe and invert themselves, too.
         home_action: the action that keeps the robot at home [na].
 
     Raises:
@@ -81,8 +82,8 @@ class ManipulationEnv(Env):
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
-        self._actions = Chain(cfg.actions, self._drives())
-        self.home_action, self.action_kinds = self._actions.home, self._actions.kinds
+        self.actions = Chain(cfg.actions, self._drives())
+        self.home_action, self.action_kinds = self.actions.home, self.actions.kinds
         self._randomization = Randomization(model, cfg.randomization)
         self._hold = Hold(round(cfg.success.hold_s / self.dt))
         self._resample_steps = round(cfg.command.resample_s / self.dt)
@@ -94,7 +95,7 @@ class ManipulationEnv(Env):
             open, close = (getattr(cfg, end, cfg.home) for end in ("open", "close"))
             home, speed, open, close, lag = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close, cfg.lead))
             low, high = self._range[:, own]
-            groups[name] = Drives(home, low, high, speed, open, close, lag, self.dt)
+            groups[name] = Drives(home, low, high, speed, open, close, lag, self.dt, cfg.joints)
         return groups
 
     @functools.cached_property
@@ -202,7 +203,7 @@ class ManipulationEnv(Env):
         apart = jax.random.fold_in(key, _SENSORS)
         return {
             **carry.memory,
-            **self._actions.init(k_actions, view.joint_pos),
+            **self.actions.init(k_actions, view.joint_pos),
             **terms.init({"sensors": self.cfg.sensors, "pushes": self.cfg.pushes}, apart, view),
             **terms.init(self.cfg.view_terms(), k_terms, view),
             "success.hold": self._hold.init(k_terms, view),
@@ -328,7 +329,7 @@ class ManipulationEnv(Env):
             raise UserError(f"{shape}: jax.vmap the step for many environments")
         sim, carry = state.pipeline_state, state.info["carry"]
         joint_pos = sim.qpos[self._viewer.qpos_ids]
-        memory, ctrl = self._actions.step(carry.memory, self._clip(action), joint_pos, sim.ctrl)
+        memory, ctrl = self.actions.step(carry.memory, self._clip(action), joint_pos, sim.ctrl)
         sim, memory = self._push(sim, carry, memory)
         return state.replace(pipeline_state=sim, info={**state.info, "carry": carry.replace(memory=memory)}), ctrl
 

@@ -14,7 +14,7 @@ import numpy as np
 import mjx_nero
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import actions, missing, need
+from mjx_nero.interop import missing, need
 from mjx_nero.interop.batch import Batch
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import UserError
@@ -176,7 +176,7 @@ def _spaces(env: ManipulationEnv, group: str | None) -> tuple[Any, Any]:
         raise UserError(f"no observation group {group!r}: choose one of {', '.join(sizes)}, or None for all")
     boxes: dict[str, Any] = {name: box(-np.inf, np.inf, size, np.float32) for name, size in sizes.items()}
     observations = gymnasium.spaces.Dict(boxes) if group is None else boxes[group]
-    return observations, box(*actions.bounds(env), dtype=np.float32)
+    return observations, box(*env.actions.bounds(), dtype=np.float32)
 
 
 def _group(obs: Any, group: str | None) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_nero.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import actions, need
+from mjx_nero.interop import need
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.run_folder import versions
 from mjx_nero.types import UserError
@@ -122,7 +122,7 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
         },
         "base": {"position": list(robot.base_pos), "quaternion_wxyz": list(robot.base_quat)},
         "observations": _observations(env),
-        "actions": actions.parts(env),
+        "actions": env.actions.describe(),
         "action_clip": env.cfg.action_clip or None,
         "versions": versions(),
         "env_steps": policy.meta.get("env_steps"),

@@ -1,7 +1,9 @@
 """Action terms: from the policy's output to the drives' position targets, one after another as a task lists them.
 
-A term is a class, made as ``Term(drives, **params)``. ``home`` are the entries of the action that it reads, as they are at home;
-``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries.
+A term is a class, made as ``Term(drives, **params)``. ``home`` holds the entries of the action that it reads, as they are at home;
+``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries. A term also describes
+itself as JSON, for programs that don't know this package (``deploy.executor`` runs that description in numpy), says within which
+bounds its entries matter, and inverts itself: from targets back to entries.
 """
 
 import dataclasses
@@ -30,6 +32,7 @@ class Drives:
         speed: of targets, at most [rad/s or m/s].
         lag: of a joint behind a target that moves [s].
         dt: control step [s].
+        joints: names.
     """
 
     home: np.ndarray
@@ -40,6 +43,7 @@ class Drives:
     close: np.ndarray
     lag: np.ndarray
     dt: float
+    joints: tuple[str, ...] = ()
 
     @property
     def step(self) -> np.ndarray:
@@ -54,15 +58,19 @@ Groups = Mapping[str, Drives]  # ``arm`` and ``gripper``
 class Act:
     """An action on its way to the drives. Positions and targets by group of drives [rad or m]."""
 
-    action: Float[Array, " na"]  # all of it, bounded
-    joint_pos: dict[str, Float[Array, " n"]]
-    ctrl: dict[str, Float[Array, " n"]]  # the targets now in force
-    targets: dict[str, Float[Array, " n"]]  # what comes of the action: at first, home
+    action: Float[Array, "... na"]  # all of it, bounded
+    joint_pos: dict[str, Float[Array, "... n"]]
+    ctrl: dict[str, Float[Array, "... n"]]  # the targets now in force
+    targets: dict[str, Float[Array, "... n"]]  # what comes of the action: at first, home
     level: Float[Array, ""] | None = None  # see ``types.LEVEL``
 
     def to(self, group: str, targets: Float[Array, " n"]) -> "Act":
         """With other targets of a group."""
         return dataclasses.replace(self, targets={**self.targets, group: targets})
+
+
+Description = dict[str, Any]  # ``type``, and what else ``deploy.executor`` reads of that type
+Bounds = tuple[np.ndarray, np.ndarray]  # the least and the greatest
 
 
 class ActionTerm(Protocol):
@@ -72,11 +80,14 @@ class ActionTerm(Protocol):
 
     def init(self, key: Key, act: Act) -> Memory: ...
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]: ...
+    def describe(self) -> Description | None: ...
+    def bounds(self) -> Bounds: ...
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]: ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
-    """What terms have in common that read no entry and remember nothing."""
+    """Base of terms that read no entry and remember nothing."""
 
     groups: Groups
 
@@ -89,10 +100,22 @@ class Plain:
         """Nothing."""
         return ()
 
+    def describe(self) -> Description | None:
+        """None: only this package knows what the term does."""
+        return None
+
+    def bounds(self) -> Bounds:
+        """The entries beyond which nothing more happens: +-1."""
+        return -np.ones(len(self.home), np.float32), np.ones(len(self.home), np.float32)
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """The entries that give ``act.targets``, or come nearest to them, for actions that come up to ``late`` control steps late."""
+        return jnp.zeros((*next(iter(act.targets.values())).shape[:-1], 0))
+
 
 @dataclasses.dataclass(frozen=True)
 class Joints(Plain):
-    """What terms have in common that read an entry for each joint of a group, zero at home."""
+    """Base of terms that read an entry for each joint of a group, zero at home."""
 
     group: str = dataclasses.field(default="arm", kw_only=True)
 
@@ -100,6 +123,20 @@ class Joints(Plain):
     def home(self) -> np.ndarray:
         """Zero."""
         return np.zeros_like(self.groups[self.group].home)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gripper(Plain):
+    """Base of terms that read one entry for all joints of the gripper, if there is one."""
+
+    @property
+    def drives(self) -> Drives:
+        """The gripper's."""
+        return self.groups["gripper"]
+
+    def _described(self, kind: str) -> Description:
+        own = self.drives
+        return {"type": kind, "joints": list(own.joints), "open": decimals(own.open), "close": decimals(own.close)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +149,22 @@ class JointPosition(Joints):
         """Targets of the group."""
         drives = self.groups[self.group]
         return memory, act.to(self.group, jnp.clip(drives.home + self.scale * own, drives.low, drives.high))
+
+    def describe(self) -> Description:
+        """``offset + scale * action``, an entry a joint."""
+        drives = self.groups[self.group]
+        of = {"joints": list(drives.joints), "scale": self.scale, "offset": decimals(drives.home)}
+        return {"type": "joint_position", **of}
+
+    def bounds(self) -> Bounds:
+        """Where each joint reaches its limits."""
+        drives = self.groups[self.group]
+        low, high = np.sort([(end - drives.home) / np.float32(self.scale) for end in (drives.low, drives.high)], axis=0)
+        return low, high
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """Exact."""
+        return (act.targets[self.group] - self.groups[self.group].home) / self.scale
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +197,18 @@ class JointVelocity(Joints):
         targets = jnp.clip(point + drives.lag * drives.speed * rate, drives.low, drives.high)
         return (point, rate), act.to(self.group, targets)
 
+    def describe(self) -> Description:
+        """Entries move set-points, which targets lead by ``lag`` [s]."""
+        drives = self.groups[self.group]
+        of = {"joints": list(drives.joints), "time": self.time, "ahead": self.ahead, "lag": decimals(drives.lag)}
+        return {"type": "joint_velocity", **of}
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """Towards the targets as slowly as velocities follow the action: faster would swing."""
+        drives, slow = self.groups[self.group], 2 * (self.time + late * self.groups[self.group].dt)
+        way = act.targets[self.group] - act.joint_pos[self.group]
+        return jnp.clip(way / (slow * drives.speed), -1.0, 1.0)
+
 
 @dataclasses.dataclass(frozen=True)
 class DriveTargets(Plain):
@@ -161,9 +226,23 @@ class DriveTargets(Plain):
             act = act.to(group, jnp.clip(targets, drives.low, drives.high))
         return memory, act
 
+    def describe(self) -> Description:
+        """Joint positions of scale 1."""
+        joints = [name for drives in self.groups.values() for name in drives.joints]
+        return {"type": "joint_position", "joints": joints, "scale": 1.0, "offset": [0.0] * len(joints)}
+
+    def bounds(self) -> Bounds:
+        """The joints' ranges."""
+        every = self.groups.values()
+        return np.concatenate([drives.low for drives in every]), np.concatenate([drives.high for drives in every])
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """The targets themselves."""
+        return jnp.concatenate([act.targets[group] for group in self.groups], axis=-1)
+
 
 @dataclasses.dataclass(frozen=True)
-class BinaryGripper(Plain):
+class BinaryGripper(Gripper):
     """One entry, if there is a gripper: closed where negative, else open. Isaac Lab's ``BinaryJointPositionAction``.
 
     Attributes:
@@ -176,7 +255,7 @@ class BinaryGripper(Plain):
     @property
     def home(self) -> np.ndarray:
         """Open."""
-        return np.zeros(int(len(self.groups["gripper"].home) > 0), np.float32)
+        return np.zeros(int(len(self.drives.home) > 0), np.float32)
 
     def init(self, key: Key, act: Act) -> Memory:
         """Whether it is closed, if that may matter."""
@@ -184,16 +263,27 @@ class BinaryGripper(Plain):
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the gripper."""
-        drives = self.groups["gripper"]
+        drives = self.drives
         if not len(own):
             return memory, act
         closed = own[0] < (jnp.where(memory, self.hysteresis, -self.hysteresis) if self.hysteresis else 0.0)
         targets = jnp.clip(jnp.where(closed, drives.close, drives.open), drives.low, drives.high)
         return (closed if self.hysteresis else memory), act.to("gripper", targets)
 
+    def describe(self) -> Description:
+        """``close`` for an entry below minus ``hysteresis``, ``open`` from plus that on, between as it was."""
+        return {**self._described("binary"), "hysteresis": self.hysteresis}
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """Whichever of open and closed is nearer."""
+        if not len(self.home):
+            return super().invert(act, late)
+        to_open, to_close = (jnp.abs(act.targets["gripper"] - end).sum(-1) for end in (self.drives.open, self.drives.close))
+        return jnp.where(to_close < to_open, -1.0, 1.0)[..., None]
+
 
 @dataclasses.dataclass(frozen=True)
-class ContinuousGripper(Plain):
+class ContinuousGripper(Gripper):
     """One entry, if there is a gripper: closed at -1, open at 1, and between in proportion.
 
     A binary gripper that must not lose what it carries is told to close so surely that noise hardly ever opens it, and what would
@@ -203,18 +293,28 @@ class ContinuousGripper(Plain):
     @property
     def home(self) -> np.ndarray:
         """As far open as it is at home."""
-        drives = self.groups["gripper"]
+        drives = self.drives
         if not len(drives.home):
             return np.zeros(0, np.float32)
         return np.array([opening(drives.home, drives.open, drives.close)], np.float32)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
         """Targets of the gripper."""
-        drives = self.groups["gripper"]
+        drives = self.drives
         if not len(own):
             return memory, act
         share = jnp.clip(0.5 + 0.5 * own[0], 0.0, 1.0)
         return memory, act.to("gripper", jnp.clip(drives.close + share * (drives.open - drives.close), drives.low, drives.high))
+
+    def describe(self) -> Description:
+        """From ``close`` at -1 to ``open`` at 1."""
+        return self._described("continuous")
+
+    def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
+        """As far open as comes nearest."""
+        if not len(self.home):
+            return super().invert(act, late)
+        return opening(act.targets["gripper"], self.drives.open, self.drives.close)[..., None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,6 +336,10 @@ class AntiWindup(Plain):
         start = jnp.clip(start, jnp.minimum(now, to), jnp.maximum(now, to))
         return memory, dataclasses.replace(act, ctrl={**act.ctrl, self.group: start})
 
+    def describe(self) -> Description:
+        """Targets ``of`` joints that turn back."""
+        return {"type": "anti_windup", "of": list(self.groups[self.group].joints), "ahead": self.ahead}
+
 
 @dataclasses.dataclass(frozen=True)
 class SpeedLimit(Plain):
@@ -249,6 +353,11 @@ class SpeedLimit(Plain):
             step = jnp.asarray(self.groups[group].step)
             act = act.to(group, rate_limit(act.targets[group], act.ctrl[group], step=step))
         return memory, act
+
+    def describe(self) -> Description:
+        """Targets ``of`` joints move at most as fast as their drives."""
+        limited = (self.group,) if self.group else self.groups
+        return {"type": "speed_limit", "of": [name for group in limited for name in self.groups[group].joints]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,6 +375,10 @@ class Delay(Plain):
         """An action late."""
         memory, action = memories.Delay(self.steps, self.hold).step(memory, act.action)
         return memory, dataclasses.replace(act, action=toward(act.level, act.action, action))
+
+    def describe(self) -> Description:
+        """Control steps, the least and the most: what training reckoned with."""
+        return {"type": "delay", "steps": list(self.steps)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,6 +398,10 @@ class Noise(Plain):
         off = jax.random.uniform(k_noise, targets.shape, minval=-self.amount, maxval=self.amount)
         return memory, act.to("arm", jnp.clip(toward(act.level, targets, targets + off), drives.low, drives.high))
 
+    def describe(self) -> Description:
+        """What training reckoned with."""
+        return {"type": "noise", "amount": self.amount}
+
 
 @dataclasses.dataclass(frozen=True)
 class LowPass(Plain):
@@ -301,6 +418,15 @@ class LowPass(Plain):
         """An action nearer to the last one."""
         memory = memory + (1.0 - np.exp(-self.dt / self.time)) * (act.action - memory)
         return memory, dataclasses.replace(act, action=memory)
+
+    def describe(self) -> Description:
+        """The time constant and the step [s]."""
+        return {"type": "low_pass", "time": self.time, "dt": self.dt}
+
+
+def decimals(values: np.ndarray) -> list[float]:
+    """Single-precision numbers as the shortest decimals that stand for them: 0.05, not 0.05000000074505806."""
+    return [float(str(np.float32(value))) for value in values]
 
 
 def opening(at: Any, open: np.ndarray, close: np.ndarray) -> Any:
@@ -351,9 +477,42 @@ class Chain:
                 after[f"actions.{name}"] = remembered
         return after, jnp.concatenate(list(act.targets.values()))
 
-    def _act(self, action, joint_pos, ctrl) -> Act:
+    def describe(self) -> list[Description]:
+        """How the action becomes position targets of the drives, as JSON: see ``docs/deploy_onnx.md``.
+
+        Raises:
+            UserError: a term that only this package knows.
+        """
+        every = {name: getattr(term, "describe", lambda: None)() for name, term in self.terms.items()}
+        if unknown := [name for name, description in every.items() if description is None]:
+            kind = type(self.terms[unknown[0]]).__name__
+            raise UserError(f"the action term {unknown[0]} ({kind}) does not describe itself, so only this package knows it")
+        # A gripper's term of a robot without one reads nothing and does nothing.
+        return [{"name": name, **what} for name, what in every.items() if what.get("joints", True)]
+
+    def bounds(self) -> Bounds:
+        """The actions that take each joint to its limits; beyond them nothing more happens."""
+        low, high = zip(*(term.bounds() for term in self.terms.values()), strict=True)
+        return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
+
+    def invert(self, targets: Float[Array, "... nu"], joint_pos: Float[Array, "... nu"]) -> Float[Array, "... na"]:
+        """The action that gives position targets of the drives, or comes nearest: so a controller acts where a policy would.
+
+        Args:
+            targets: [rad or m].
+            joint_pos: where the joints are [rad or m].
+        """
+        late = sum(term.steps[1] for term in self.terms.values() if isinstance(term, Delay))
+        wanted, joints = self._by_group(targets), self._by_group(joint_pos)
+        act = Act(jnp.zeros((*jnp.shape(targets)[:-1], len(self.home))), joints, joints, wanted)
+        return jnp.concatenate([term.invert(act, late) for term in self.terms.values()], axis=-1)
+
+    def _by_group(self, values: Float[Array, "... nu"]) -> dict[str, Float[Array, "... n"]]:
         ends = np.cumsum([len(drives.home) for drives in self._groups.values()])[:-1]
-        joints, now = (dict(zip(self._groups, jnp.split(x, ends), strict=True)) for x in (joint_pos, ctrl))
+        return dict(zip(self._groups, jnp.split(values, ends, axis=-1), strict=True))
+
+    def _act(self, action, joint_pos, ctrl) -> Act:
+        joints, now = self._by_group(joint_pos), self._by_group(ctrl)
         targets = {g: jnp.asarray(np.clip(drives.home, drives.low, drives.high)) for g, drives in self._groups.items()}
         return Act(action, joints, now, targets)
 

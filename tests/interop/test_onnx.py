@@ -16,7 +16,6 @@ import pytest
 
 import mjx_nero
 from mjx_nero import interop
-from mjx_nero.interop import actions as meaning
 from mjx_nero.interop import onnx as export
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.ppo_cfg import ACTIVATIONS
@@ -26,7 +25,7 @@ from mjx_nero.types import UserError
 
 PAGE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "deploy_onnx.md"
 # What a robot's computer has not: the program fails if it imports any of these.
-ABSENT = ("mjx_nero", "jax", "brax", "flax", "mujoco", "onnx")
+ABSENT = ("jax", "brax", "flax", "mujoco", "onnx", "yaml", "lxml")
 
 
 def fresh(path, **network):
@@ -99,7 +98,7 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
 
 
 def test_velocities_and_delays_are_told():
-    late, arm = meaning.parts(mjx_nero.make("nero_reach", impl="native"))
+    late, arm = mjx_nero.make("nero_reach", impl="native").actions.describe()
     assert late == {"name": "delay", "type": "delay", "steps": [0, 1]}
     assert arm.pop("lag") == pytest.approx([0.2, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1])  # damping over stiffness
     joints = [f"joint{i}" for i in range(1, 8)]
@@ -108,24 +107,24 @@ def test_velocities_and_delays_are_told():
 
 def test_positions_and_speed_limits_are_told():
     env = mjx_nero.make("nero_push", impl="native")
-    arm, limit = meaning.parts(env)
+    arm, limit = env.actions.describe()
     assert (arm["scale"], arm["offset"]) == (0.5, [0, 0, 0, 2, 0, 0, 0])
     assert limit == {"name": "speed_limit", "type": "speed_limit", "of": list(env.cfg.robot.joints)}
 
 
 def test_a_gripper_that_lets_go_at_once_is_told():
-    *_, back, _ = meaning.parts(mjx_nero.make("nero_stack", impl="native"))
+    *_, back, _ = mjx_nero.make("nero_stack", impl="native").actions.describe()
     assert back == {"name": "anti_windup", "type": "anti_windup", "of": ["gripper_joint1", "gripper_joint2"], "ahead": 0.1}
 
 
 def test_a_continuous_gripper_is_told():
     env = mjx_nero.make("nero_stack", impl="native")
-    _, _, hand, *_ = meaning.parts(env)
+    _, _, hand, *_ = env.actions.describe()
     fingers = {"joints": ["gripper_joint1", "gripper_joint2"], "open": [0.05, -0.05], "close": [0.0, -0.001]}
     assert hand == {"name": "gripper", "type": "continuous", **fingers}
-    assert [bound[-1] for bound in meaning.bounds(env)] == [-1.0, 1.0]
+    assert [bound[-1] for bound in env.actions.bounds()] == [-1.0, 1.0]
     half = jnp.array([*env.cfg.robot.arm.home, 0.025, -0.0255])
-    assert meaning.for_targets(env, half, half)[-1] == pytest.approx(0.0, abs=1e-6)
+    assert env.actions.invert(half, half)[-1] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_histories_and_filters_are_told():
@@ -136,15 +135,16 @@ def test_histories_and_filters_are_told():
     assert (second["start"], second["size"], second["delay_steps"]) == (27, 9, [1, 2])
     smooth = {**env.cfg.actions, "smooth": Term(actions.LowPass, params={"time": 0.1, "dt": env.dt})}
     filtered = mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=smooth), impl="native")
-    assert meaning.parts(filtered)[-1] == {"name": "smooth", "type": "low_pass", "time": 0.1}
-    own = {**env.cfg.actions, "own": Term(lambda groups: actions.SpeedLimit(groups))}
-    with pytest.raises(UserError, match="the action term own .* is one that only this package knows"):
-        meaning.parts(mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=own), impl="native"))
+    assert filtered.actions.describe()[-1] == {"name": "smooth", "type": "low_pass", "time": 0.1, "dt": env.dt}
+    own = {**env.cfg.actions, "own": Term(actions.Plain)}
+    guest = mjx_nero.ManipulationEnv(dataclasses.replace(env.cfg, actions=own), impl="native")
+    with pytest.raises(UserError, match=r"the action term own \(Plain\) does not describe itself"):
+        guest.actions.describe()
 
 
 @pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push", "nero_place", "cobotta_stack", "nero_stack"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
-    """The page's program, word for word, without this package: its joint targets are the environment's."""
+    """The page's program, word for word, without JAX or MuJoCo: its joint targets are the environment's."""
     punctual = {"actions.delay.params.steps": (0, 0)} if env_name not in ("nero_push", "nero_place") else {}
     env = mjx_nero.make(env_name, impl="native", corruption=False, **punctual)
     trained = policy.load_for(env, env_name, policy.shipped(env_name))
@@ -172,9 +172,10 @@ import numpy as np, runpy
 run = runpy.run_path(sys.argv[0])
 data = np.load("terms.npz")
 rows = [{{k.split("/", 1)[1]: data[k] for k in data if k.startswith(f"{{i}}/")}} for i in range({len(terms)})]
-out, targets = [], run["Targets"](data["positions"][0])
+out, policy = [], run["policy"]
+targets = policy.executor(data["positions"][0])
 for row, position in zip(rows, data["positions"]):
-    out.append(targets(run["act"](row), position))
+    out.append(targets(policy.act(row), position))
 np.save("targets.npy", out)
 """
     argv = f"import sys; sys.argv = ['run_policy.py', 'policy.onnx']\n{drive}"

@@ -12,7 +12,6 @@ from flax import struct
 
 from mjx_nero import control
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import actions
 from mjx_nero.learn import checkpoint, header, policy, rollout
 from mjx_nero.types import UserError
 
@@ -82,7 +81,7 @@ def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollo
 
     def act(params, memory, state, key):
         targets, memory = steering.act(params, memory, state, key)
-        return actions.for_targets(env, targets, _joint_pos(env, state)), memory
+        return env.actions.invert(targets, _joint_pos(env, state)), memory
 
     return dataclasses.replace(steering, act=act)
 
@@ -92,7 +91,7 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
     def act(targets, memory, state, key):
         wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
-        return actions.for_targets(env, wanted, _joint_pos(env, state)), memory
+        return env.actions.invert(wanted, _joint_pos(env, state)), memory
 
     return rollout.Agent(act, init=lambda state: ())
 

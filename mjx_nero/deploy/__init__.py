@@ -1,0 +1,1 @@
+"""Policies on machines without JAX or MuJoCo: numpy, and a runtime for the network."""

@@ -1,0 +1,239 @@
+"""The action chain in numpy: a policy's actions, one after another, become position targets of the drives.
+
+The file needs numpy alone. The chain is the JSON by which ``mdp.actions`` terms describe themselves, as ``export`` writes it into
+an ONNX file: each type of it is a class here, and the tests hold both equal, step for step.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Joints:
+    """What an executor knows of the robot's joints, arrays along ``names`` [rad or m].
+
+    Attributes:
+        speed: of targets, at most [rad/s or m/s].
+        dt: control step [s].
+    """
+
+    names: tuple[str, ...]
+    home: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    speed: np.ndarray
+    dt: float
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, Any]) -> "Joints":
+        """From the metadata of an exported policy."""
+        own = metadata["joints"]
+        arrays = {name: np.array(own[name], float) for name in ("home", "lower", "upper", "speed")}
+        return cls(names=tuple(own["names"]), **arrays, dt=float(metadata["control_dt"]))
+
+    def ids(self, names: Sequence[str]) -> np.ndarray:
+        """Places of some joints in all joint vectors."""
+        return np.array([self.names.index(name) for name in names], int)
+
+
+@dataclasses.dataclass
+class Step:
+    """One action on its way to the drives."""
+
+    action: np.ndarray  # all of it
+    position: np.ndarray  # where the joints are
+    last: np.ndarray  # the targets now in force
+    targets: np.ndarray  # what comes of the action: at first, home
+
+
+class Part(Protocol):
+    """A term of the chain. ``size``: how many entries of the action it reads."""
+
+    size: int
+
+    def reset(self, position: np.ndarray, home_action: np.ndarray) -> None: ...
+    def __call__(self, own: np.ndarray, step: Step) -> None: ...
+
+
+class _Stateless:
+    size = 0
+
+    def __init__(self, joints: Joints, what: Mapping[str, Any]):
+        self.joints, self.what = joints, what
+        self.ids = joints.ids(what.get("joints", what.get("of", ())))
+
+    def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
+        """Nothing to forget."""
+
+    def home(self) -> np.ndarray:
+        """The entries that keep the robot at home."""
+        return np.zeros(self.size)
+
+    def bounded(self, values: np.ndarray) -> np.ndarray:
+        """Within the ranges of the term's joints."""
+        return np.clip(values, self.joints.lower[self.ids], self.joints.upper[self.ids])
+
+
+class JointPosition(_Stateless):
+    """``offset + scale * action``."""
+
+    def __init__(self, joints: Joints, what: Mapping[str, Any]):
+        super().__init__(joints, what)
+        self.size = len(self.ids)
+
+    def home(self) -> np.ndarray:
+        """Zero, unless the offset is not home."""
+        return (self.joints.home[self.ids] - self.what["offset"]) / self.what["scale"]
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        step.targets[self.ids] = self.bounded(self.what["offset"] + self.what["scale"] * own)
+
+
+class JointVelocity(_Stateless):
+    """Entries move set-points, which stay near the joints and which targets lead."""
+
+    def __init__(self, joints: Joints, what: Mapping[str, Any]):
+        super().__init__(joints, what)
+        self.size = len(self.ids)
+        self.follow = 1 - np.exp(-joints.dt / what["time"])
+
+    def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
+        """At the joints, at rest."""
+        self.point, self.rate = position[self.ids], np.zeros(self.size)
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        speed, at = self.joints.speed[self.ids], step.position[self.ids]
+        self.rate = self.rate + self.follow * (np.clip(own, -1, 1) - self.rate)
+        most = speed * self.what["ahead"]
+        self.point = self.bounded(np.clip(self.point + self.joints.dt * speed * self.rate, at - most, at + most))
+        step.targets[self.ids] = self.bounded(self.point + self.what["lag"] * speed * self.rate)
+
+
+class Binary(_Stateless):
+    """A gripper: closed below minus ``hysteresis``, open from plus that on, between as it was, at first open."""
+
+    size = 1
+
+    def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
+        """Open."""
+        self.closed = False
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        self.closed = bool(own[0] < self.what.get("hysteresis", 0.0) * (1 if self.closed else -1))
+        step.targets[self.ids] = self.bounded(self.what["close" if self.closed else "open"])
+
+
+class Continuous(_Stateless):
+    """A gripper: closed at -1, open at 1, and between in proportion."""
+
+    size = 1
+
+    def home(self) -> np.ndarray:
+        """As far open as it is at home."""
+        close, way = np.array(self.what["close"]), np.subtract(self.what["open"], self.what["close"])
+        return np.array([2 * ((self.joints.home[self.ids] - close) @ way) / (way @ way or 1.0) - 1])
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        close, share = np.array(self.what["close"]), np.clip((1 + own[0]) / 2, 0, 1)
+        step.targets[self.ids] = self.bounded(close + share * (np.array(self.what["open"]) - close))
+
+
+class AntiWindup(_Stateless):
+    """Targets that turn back start near the joints."""
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        now, to, at = (values[self.ids] for values in (step.last, step.targets, step.position))
+        most = self.what["ahead"] * self.joints.speed[self.ids]
+        step.last[self.ids] = np.clip(np.clip(now, at - most, at + most), np.minimum(now, to), np.maximum(now, to))
+
+
+class SpeedLimit(_Stateless):
+    """Targets move at most as fast as their drives."""
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        most = self.joints.dt * self.joints.speed[self.ids]
+        step.targets[self.ids] = step.last[self.ids] + np.clip(step.targets[self.ids] - step.last[self.ids], -most, most)
+
+
+class LowPass(_Stateless):
+    """A first-order filter of the action, for the parts after it."""
+
+    def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
+        """It has been home's."""
+        self.value = home_action
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        self.value = self.value + (1 - np.exp(-self.what["dt"] / self.what["time"])) * (step.action - self.value)
+        step.action = self.value
+
+
+class Nothing(_Stateless):
+    """What training reckoned with, and the real world brings by itself."""
+
+    def __call__(self, own: np.ndarray, step: Step) -> None:
+        """Leaves all as it is."""
+
+
+PARTS: dict[str, Callable[[Joints, Mapping[str, Any]], Any]] = {
+    "joint_position": JointPosition,
+    "joint_velocity": JointVelocity,
+    "binary": Binary,
+    "continuous": Continuous,
+    "anti_windup": AntiWindup,
+    "speed_limit": SpeedLimit,
+    "low_pass": LowPass,
+    "delay": Nothing,
+    "noise": Nothing,
+}
+
+
+class Executor:
+    """From actions to targets; begins where the joints are.
+
+    Args:
+        joints: of the robot.
+        parts: the chain, term after term.
+        clip: bounds actions to +- this first; 0: it does not.
+        position: of the joints, at the start [rad or m].
+
+    Attributes:
+        home_action: the action that keeps the robot at home.
+
+    Raises:
+        ValueError: a part is of a type that is not known here.
+    """
+
+    def __init__(self, joints: Joints, parts: Sequence[Mapping[str, Any]], position: np.ndarray, clip: float = 0.0):
+        if unknown := [part.get("type") for part in parts if part.get("type") not in PARTS]:
+            raise ValueError(f"unknown type of action {unknown[0]!r}: not one of {', '.join(PARTS)}")
+        self.joints, self.clip = joints, clip
+        self._parts = [PARTS[part["type"]](joints, part) for part in parts]
+        self._splits = np.cumsum([part.size for part in self._parts])[:-1]
+        self.home_action = np.concatenate([part.home() for part in self._parts])
+        self.reset(position)
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, Any], position: np.ndarray) -> "Executor":
+        """The chain of an exported policy."""
+        return cls(Joints.of(metadata), metadata["actions"], position, metadata.get("action_clip") or 0.0)
+
+    def reset(self, position: np.ndarray) -> None:
+        """Begins anew, with targets where the joints are."""
+        self.last = np.array(position, float)
+        for part in self._parts:
+            part.reset(self.last.copy(), self.home_action)
+
+    def __call__(self, action: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """The targets for an action and where the joints are now, arrays along ``joints.names`` [rad or m]."""
+        action = np.asarray(action, float)
+        if self.clip:
+            action = np.clip(action, -self.clip, self.clip)
+        home = np.clip(self.joints.home, self.joints.lower, self.joints.upper)
+        step = Step(action, np.asarray(position, float), self.last.copy(), home)
+        for i, part in enumerate(self._parts):
+            part(np.split(step.action, self._splits)[i], step)
+        self.last = step.targets
+        return self.last.copy()
