@@ -31,12 +31,12 @@ FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late
 
 
 def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
-    """Qpos [steps, num_envs, nq] and goals [steps, num_envs, 7] of the shipped policy's episodes."""
+    """Qpos [steps, num_envs, nq] and scenery [steps, num_envs, ...] of the shipped policy's episodes."""
     shipped = policy.load_for(env, "nero_lift", None)
     run = rollout.runner(env, lambda params, obs, *_: shipped.act(obs), env.num_envs, record=env.num_envs)
     found = run(None, 1)
     print(f"{env.num_envs} episodes: success {found.summary()['success_rate']:.1%}")
-    return np.asarray(found.qpos), np.asarray(found.goals)
+    return np.asarray(found.qpos), found.scenery
 
 
 def write(path: pathlib.Path, frames: list[Image.Image], seconds: float, quality: int) -> None:
@@ -79,9 +79,8 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
     every = max(1, len(shown.qpos) // 40)
     with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
         for k in range(len(which)):
-            looks = {of: look[k] for of, look in shown.looks.items()}
             for t in range(0, len(shown.qpos), every):
-                frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.goals[t, k], looks))
+                frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.scenery[t, k]))
                 frames.append(frame.resize((320, 240), Image.Resampling.BOX))
     write(path, frames, every * played.env.dt, 35)
 
@@ -97,11 +96,11 @@ def main() -> None:
         robots, (width, height), every, quality = PICTURES[name]
         cfg = dataclasses.replace(mjx_nero.env_cfg("nero_lift"), corruption=False)
         env = mjx_nero.ManipulationEnv(cfg, impl="native", num_envs=robots)
-        qpos, goals = play(env)
+        qpos, scenery = play(env)
         how = {} if robots == 1 else {"camera": amid(env.mj_model), "samples": 0, "shadows": 0}
         with render.Renderer(env.mj_model, 2 * width, 2 * height, envs=robots, **how) as renderer:  # twice: edges become smooth
             shot = renderer.render_all if robots > 1 else lambda q, g: renderer.render(q[0], g[0])
-            drawn = (Image.fromarray(shot(qpos[t], goals[t])) for t in range(0, STEPS, every))
+            drawn = (Image.fromarray(shot(qpos[t], scenery[t])) for t in range(0, STEPS, every))
             frames = [frame.resize((width, height), Image.Resampling.BOX) for frame in drawn]
         write(HERE / f"{name}.webp", frames, every * env.dt, quality)
 

@@ -28,8 +28,8 @@ class Sim:
     time: Float[Array, ""]  # since the start of the episode [s]
     # The model's fields that differ from world to world, by MuJoCo's names; the others are the compiled model's.
     fields: dict[str, Array] = struct.field(default_factory=dict)
-    # What ``sim.touch`` measured in the last control step [N]; None: the scene does not ask for it.
-    touch: Float[Array, ""] | None = None
+    # What the scene's sensors measured in the last control step, by name; ``touch`` [N] is ``sim.touch``'s.
+    readings: dict[str, Array] = struct.field(default_factory=dict)
 
 
 @struct.dataclass
@@ -84,6 +84,28 @@ class ObstacleView:
 
 
 @struct.dataclass
+class ObjectLook:
+    """How an object is drawn, where that is not as the model says."""
+
+    size: Float[Array, "*n 3"]  # MuJoCo's, of its kind of shape [m]
+    rgba: Float[Array, "*n 4"]  # red, green, blue, alpha, each from 0 to 1
+
+
+@struct.dataclass
+class Scenery:
+    """What a picture shows beside ``qpos``; leading axes are steps and environments."""
+
+    goal_pos_w: Float[Array, "*n 3"]  # [m]
+    goal_quat_w: Float[Array, "*n 4"]
+    obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
+    objects: dict[str, ObjectLook] = struct.field(default_factory=dict)  # by name, those that differ from the model
+
+    def __getitem__(self, at: Any) -> "Scenery":
+        """That of some steps or environments."""
+        return jax.tree.map(lambda x: x[at], self)
+
+
+@struct.dataclass
 class View:
     """What a term may read: one environment, after the step, all poses consistent with ``qpos``.
 
@@ -110,8 +132,9 @@ class View:
     # What the encoders read beside ``joint_pos`` [rad, m]; None: nothing.
     encoder_bias: Float[Array, " nj"] | None = None
     obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
-    # The strongest contact with an obstacle, or of the robot with itself, in this step [N]; None: the scene does not ask for it.
-    touch: Float[Array, ""] | None = None
+    # What the scene's sensors measured in this step, by name. ``touch``: the strongest contact with an obstacle, or of the robot
+    # with itself [N].
+    readings: dict[str, Array] = struct.field(default_factory=dict)
     # Which of ``EnvCfg.targets`` is commanded; None: there are none.
     target: Int[Array, ""] | None = None
     max_steps: int = struct.field(pytree_node=False, default=0)

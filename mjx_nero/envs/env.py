@@ -28,7 +28,7 @@ from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import linkage, obstacles, scene, touch
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, TARGET, Carry, Key, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, TARGET, Carry, Key, ObjectLook, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
 # Folded into an episode's key: what draws apart changes no other draw.
@@ -168,7 +168,7 @@ class ManipulationEnv(Env):
             warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
             fields=fields,
-            touch=jnp.zeros(()) if touch.reader(self.physics_model) else None,
+            readings=dict.fromkeys(touch.readers(self.physics_model), jnp.zeros(())),
         )
         carry = Carry(
             rng=rng,
@@ -223,22 +223,15 @@ class ManipulationEnv(Env):
         view, recall = self.view(state), terms.Recall(state.info["carry"].memory)
         return {name: terms.by_name(group, view, recall, name) for name, group in self.cfg.observations.items()}
 
-    def goal(self, state: State) -> Float[Array, " n"]:
-        """What to draw of a state beside the joints' positions: see ``scenery``."""
-        return self.scenery(state.pipeline_state, state.info["carry"])
+    def scenery(self, state: State) -> Scenery:
+        """What a picture of a state shows beside the joints' positions."""
+        sim, carry = state.pipeline_state, state.info["carry"]
+        goal, _ = self._viewer.goal(carry)
+        return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._object_looks(sim, carry))
 
-    def scenery(self, sim: Sim, carry: Carry) -> Float[Array, " n"]:
-        """Where the goal is now, position [m] and orientation (wxyz) in the world frame; then of each obstacle position,
-        orientation and edges [m]."""
-        boxes = [x for box in self._obstacles.views(sim.fields).values() for x in (box.pos_w, box.quat_w, box.size)]
-        return jnp.concatenate([self._viewer.goal(carry)[0], carry.command_quat, *boxes])
-
-    def looks(self, state: State) -> dict[str, Float[Array, "7"]]:
-        """What a picture shows otherwise than ``mj_model``, by object: MuJoCo's size [m] and the colour, red to alpha.
-
-        Drawn fields, and of ``cfg.targets`` the commanded one in the goal's green.
-        """
-        fields, model = state.pipeline_state.fields, self.physics_model
+    def _object_looks(self, sim: Sim, carry: Carry) -> dict[str, ObjectLook]:
+        """Drawn sizes and colours; of ``cfg.targets`` the commanded one in the goal's green."""
+        fields, model = sim.fields, self.physics_model
         if not self.cfg.targets and not {"geom_size", "geom_rgba"} & set(fields):
             return {}
         out = {}
@@ -246,9 +239,9 @@ class ManipulationEnv(Env):
             geom = model.geom(name).id
             size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
             if name in self.cfg.targets:
-                commanded = state.info["carry"].memory[TARGET] == self.cfg.targets.index(name)
+                commanded = carry.memory[TARGET] == self.cfg.targets.index(name)
                 rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)
-            out[name] = jnp.concatenate([size, rgba])
+            out[name] = ObjectLook(size, rgba)
         return out
 
     @_precise

@@ -81,7 +81,7 @@ class Viewer:
             time=carry.step * self._dt,
             encoder_bias=self._encoder_bias(sim),
             obstacles=self._obstacles.views(sim.fields),
-            touch=sim.touch,
+            readings=sim.readings,
             target=target,
             max_steps=self._max_steps,
         )

@@ -209,8 +209,7 @@ def _to_jax(action: Any, device: jax.Device) -> jax.Array:
 
 def _frame(env: ManipulationEnv, renderer: Renderer, state: Any, index: int) -> np.ndarray:
     one = jax.tree.map(lambda x: x[index], state)
-    looks = jax.tree.map(np.asarray, env.looks(one))
-    return renderer.render(np.asarray(one.pipeline_state.qpos), np.asarray(env.goal(one)), looks)
+    return renderer.render(np.asarray(one.pipeline_state.qpos), jax.device_get(env.scenery(one)))
 
 
 def register() -> None:

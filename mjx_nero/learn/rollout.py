@@ -15,7 +15,7 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.types import Key
+from mjx_nero.types import Key, Scenery
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]
 Act = Callable[[Any, dict[str, jax.Array], Key], jax.Array]
@@ -65,21 +65,18 @@ class Episodes:
         returns: [n].
         lengths: [n] control steps.
         qpos: [steps, k, nq] of the first k environments, where asked for.
-        goals: [steps, k, 7 or more], position [m] and orientation (wxyz) of the goals in the world frame, then the obstacles'
-            (``ManipulationEnv.goal``).
+        scenery: [steps, k, ...], what else a picture of them shows (``ManipulationEnv.scenery``).
         distance: [steps, n], what the task's success is about [m]; an ended episode's stays.
         memory: the agent's, after the last step.
-        looks: [k, 7] by object, of the recorded environments (see ``ManipulationEnv.looks``).
     """
 
     metrics: dict[str, np.ndarray]
     returns: np.ndarray
     lengths: np.ndarray
     qpos: np.ndarray
-    goals: np.ndarray
+    scenery: Scenery
     distance: np.ndarray
     memory: Any
-    looks: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def summary(self) -> dict:
         """Figures for people and for JSON: distances in m, times in s. An episode whose physics or policy left the numbers is a
@@ -115,8 +112,7 @@ class Episodes:
 
     def recorded(self, which: np.ndarray) -> "Episodes":
         """The same episodes, with the records of those named alone; ``which``: int [any], below the number of recorded ones."""
-        looks = {name: look[which] for name, look in self.looks.items()}
-        return dataclasses.replace(self, qpos=self.qpos[:, which], goals=self.goals[:, which], looks=looks)
+        return dataclasses.replace(self, qpos=self.qpos[:, which], scenery=self.scenery[:, which])
 
     def _grasps(self) -> dict[str, float | None]:
         if not {"grasped", "grasp_time"} <= set(self.metrics):
@@ -177,9 +173,9 @@ def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
     return state, dict.fromkeys((*state.metrics, "return", "length"), zeros), jnp.ones_like(zeros)
 
 
-def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, Scenery, jax.Array]:
     first = jax.tree.map(lambda x: x[:record], state)
-    return first.pipeline_state.qpos, jax.vmap(env.goal)(first), state.metrics["distance"]
+    return first.pipeline_state.qpos, jax.vmap(env.scenery)(first), state.metrics["distance"]
 
 
 def runner(
@@ -192,7 +188,7 @@ def runner(
     """Plays ``episodes`` at once, on the environment's physics: one compiled program, reused from call to call.
 
     Args:
-        record: how many of the episodes to keep qpos and goals of.
+        record: how many of the episodes to keep qpos and scenery of.
         start: (parameters, states after the reset) -> the states to start from.
     """
     agent = act if isinstance(act, Agent) else policy_agent(act)
@@ -207,10 +203,9 @@ def runner(
 
         state, totals, active = _start(env, keys)
         state = start(params, state) if start else state
-        looks = jax.vmap(env.looks)(jax.tree.map(lambda x: x[:record], state))
         keys = jax.random.split(key, env.episode_length)
         ((_, totals, _), memory), frames = jax.lax.scan(step, ((state, totals, active), agent.init(state)), keys)
-        return totals, (*frames, looks), memory
+        return totals, frames, memory
 
     return Runner(run, episodes)
 
@@ -225,5 +220,5 @@ def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
 def _collect(totals: dict, frames: tuple, memory: Any) -> Episodes:
     totals = {name: np.asarray(value, np.float64) for name, value in totals.items()}
     returns, lengths = totals.pop("return"), totals.pop("length")
-    qpos, goals, distance, looks = jax.tree.map(np.asarray, frames)
-    return Episodes(totals, returns, lengths, qpos, goals, distance, memory, looks)
+    qpos, scenery, distance = jax.device_get(frames)
+    return Episodes(totals, returns, lengths, qpos, scenery, distance, memory)

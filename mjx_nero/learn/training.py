@@ -132,8 +132,8 @@ def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
     try:
         with console.drawing(screen, "video.mp4") as update:
             played = act(None, run.seed)
-            path, what = folder / "video.mp4", (played.qpos, played.goals)
-            render.write_episodes(path, env.mj_model, *what, env.dt, video, update, played.looks)
+            path, what = folder / "video.mp4", (played.qpos, played.scenery)
+            render.write_episodes(path, env.mj_model, *what, env.dt, video, update)
     except UserError as error:
         console.line(screen, str(error))
 

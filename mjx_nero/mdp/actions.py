@@ -1,9 +1,9 @@
 """Action terms: from the policy's output to the drives' position targets, one after another as a task lists them.
 
-A term is a class, made as ``Term(drives, **params)``. ``home`` holds the entries of the action that it reads, as they are at home;
-``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries. A term also describes
-itself as JSON, for programs that don't know this package (``deploy.executor`` runs that description in numpy), says within which
-bounds its entries matter, and inverts itself: from targets back to entries.
+A term is a class, made as ``Term(drives, **params)``. ``home`` holds the entries of the action that it reads, as they are at
+home; ``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries. A term also
+describes itself as JSON, which ``deploy.executor`` runs in numpy, tells the bounds of its entries, and inverts itself, from
+targets back to entries.
 """
 
 import dataclasses
@@ -109,7 +109,7 @@ class Plain:
         return -np.ones(len(self.home), np.float32), np.ones(len(self.home), np.float32)
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """The entries that give ``act.targets``, or come nearest to them, for actions that come up to ``late`` control steps late."""
+        """The entries that give ``act.targets``, or come nearest. Actions take effect up to ``late`` control steps late."""
         return jnp.zeros((*next(iter(act.targets.values())).shape[:-1], 0))
 
 
@@ -483,12 +483,15 @@ class Chain:
         Raises:
             UserError: a term that only this package knows.
         """
-        every = {name: getattr(term, "describe", lambda: None)() for name, term in self.terms.items()}
-        if unknown := [name for name, description in every.items() if description is None]:
-            kind = type(self.terms[unknown[0]]).__name__
-            raise UserError(f"the action term {unknown[0]} ({kind}) does not describe itself, so only this package knows it")
-        # A gripper's term of a robot without one reads nothing and does nothing.
-        return [{"name": name, **what} for name, what in every.items() if what.get("joints", True)]
+        out = []
+        for name, term in self.terms.items():
+            what = getattr(term, "describe", lambda: None)()  # a guest's term may not have it
+            if what is None:
+                kind = type(term).__name__
+                raise UserError(f"the action term {name} ({kind}) does not describe itself, so only this package knows it")
+            if what.get("joints", True):  # a gripper's term of a robot without one does nothing
+                out.append({"name": name, **what})
+        return out
 
     def bounds(self) -> Bounds:
         """The actions that take each joint to its limits; beyond them nothing more happens."""
@@ -502,7 +505,8 @@ class Chain:
             targets: [rad or m].
             joint_pos: where the joints are [rad or m].
         """
-        late = sum(term.steps[1] for term in self.terms.values() if isinstance(term, Delay))
+        delays: list[Any] = [term for term in self.terms.values() if isinstance(term, Delay)]
+        late = sum(term.steps[1] for term in delays)
         wanted, joints = self._by_group(targets), self._by_group(joint_pos)
         act = Act(jnp.zeros((*jnp.shape(targets)[:-1], len(self.home))), joints, joints, wanted)
         return jnp.concatenate([term.invert(act, late) for term in self.terms.values()], axis=-1)

@@ -50,7 +50,7 @@ class GraspTime:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Touched:
-    """Whether an obstacle has been touched, or the robot has touched itself, since the start (``View.touch``)."""
+    """Whether an obstacle has been touched, or the robot has touched itself, since the start (``View.readings``)."""
 
     def init(self, key: Key, view: View) -> Bool[Array, ""]:
         """Not yet."""

@@ -57,14 +57,14 @@ def touched(view: View) -> Bool[Array, ""]:
     Raises:
         UserError: the scene does not measure it.
     """
-    if view.touch is None:
+    if "touch" not in view.readings:
         raise UserError("terms of touch need scene.obstacles or scene.self_collision, and this task has neither")
-    return view.touch > 0
+    return view.readings["touch"] > 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AtGoalUntouched:
-    """At the goal, and nothing has been touched since the start (``View.touch``).
+    """At the goal, and nothing has been touched since the start (``View.readings``).
 
     Attributes:
         threshold: how near to the goal [m].

@@ -6,17 +6,17 @@ import math
 import pathlib
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import imageio.v2 as imageio
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from mjx_nero import files
 from mjx_nero.errors import UserError
-from mjx_nero.sim.touch import OBSTACLE
+from mjx_nero.types import Scenery
 
 NO_GL = (
     "no offscreen OpenGL here, so no pictures: install libegl1 (machines with a GPU) or libosmesa6 "
@@ -25,7 +25,6 @@ NO_GL = (
 _ENOUGH_S = 30.0  # for the drawing of a video
 # Width, height, samples a pixel and shadows' edge, the best first: OpenGL in software takes a tenth of a second and more a frame.
 _QUALITIES = ((1280, 720, 4, 4096), (960, 540, 0, 1024), (640, 360, 0, 1024))
-Looks = Mapping[str, np.ndarray]
 _APART = 1.5  # between robots that share a picture [m]
 
 
@@ -93,30 +92,29 @@ class Renderer:
     def __exit__(self, *_) -> None:
         self._renderer.close()
 
-    def render(self, qpos: np.ndarray, goal: np.ndarray, looks: Looks = MappingProxyType({})) -> np.ndarray:
+    def render(self, qpos: np.ndarray, scenery: Scenery) -> np.ndarray:
         """One frame, uint8 [height, width, 3].
 
         Args:
             qpos: [nq].
-            goal: where the goal marker stands in the world [m] and how it is turned (wxyz), [7]; or [3], unturned. What follows
-                is of each obstacle position, orientation and edges (``ManipulationEnv.scenery``).
-            looks: [7] by object, size and colour (``ManipulationEnv.looks``); of the others, the model's.
+            scenery: what else there is to see (``ManipulationEnv.scenery``).
         """
-        self._forward(qpos, goal, looks)
+        self._forward(qpos, scenery)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
 
-    def render_all(self, qpos: np.ndarray, goals: np.ndarray, looks: Looks = MappingProxyType({})) -> np.ndarray:
+    def render_all(self, qpos: np.ndarray, scenery: Scenery) -> np.ndarray:
         """One frame of several robots, each at its own table, in rows; uint8 [height, width, 3].
 
         Args:
-            qpos: [envs, nq]; goals: [envs, 3 or more]; looks: [envs, 7] by object.
+            qpos: [envs, nq].
+            scenery: [envs, ...].
         """
         columns = math.ceil(math.sqrt(len(qpos)))
         rows = math.ceil(len(qpos) / columns)
         scene = self._renderer.scene
-        for i, (at, goal) in enumerate(zip(qpos, goals, strict=True)):
-            self._forward(at, goal, {name: look[i] for name, look in looks.items()})
+        for i, at in enumerate(qpos):
+            self._forward(at, scenery[i])
             before = scene.ngeom if i else 0
             if i == 0:
                 free = isinstance(self._camera, mujoco.MjvCamera)
@@ -130,16 +128,15 @@ class Renderer:
             light.pos[:] -= _APART * (max(columns, rows) - 1) * light.dir
         return self._renderer.render()
 
-    def _forward(self, qpos: np.ndarray, goal: np.ndarray, looks: Looks) -> None:
-        for name, look in looks.items():
+    def _forward(self, qpos: np.ndarray, scenery: Scenery) -> None:
+        for name, look in scenery.objects.items():
             geom = self._model.geom(name)
-            geom.size[:], geom.rgba[:] = look[:3], look[3:]
+            geom.size[:], geom.rgba[:] = look.size, look.rgba
+        for name, box in scenery.obstacles.items():
+            geom = self._model.geom(name)
+            geom.pos[:], geom.quat[:], geom.size[:] = box.pos_w, box.quat_w, np.asarray(box.size) / 2
         self._data.qpos[:] = qpos
-        self._data.mocap_pos[0], self._data.mocap_quat[0] = goal[:3], goal[3:7] if len(goal) > 3 else (1, 0, 0, 0)
-        model = self._model
-        boxes = np.reshape(goal[7:], (-1, 10))
-        for geom, (x, y, z, *turn, a, b, c) in zip(np.flatnonzero(model.geom_contype & OBSTACLE), boxes, strict=False):
-            model.geom_pos[geom], model.geom_quat[geom], model.geom_size[geom] = (x, y, z), turn, (a / 2, b / 2, c / 2)
+        self._data.mocap_pos[0], self._data.mocap_quat[0] = scenery.goal_pos_w, scenery.goal_quat_w
         mujoco.mj_forward(self._model, self._data)
 
     def _overview(self, columns: int, rows: int) -> mujoco.MjvCamera:
@@ -152,43 +149,46 @@ class Renderer:
         return camera
 
 
-def frames(model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, every: int = 1, **kwargs) -> list[np.ndarray]:
+def unmarked(*shape: int) -> Scenery:
+    """The model alone, for as many steps and environments: the goal marker is under the table."""
+    return Scenery(jnp.tile(jnp.array([0.0, 0.0, -10.0]), (*shape, 1)), jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (*shape, 1)))
+
+
+def frames(model: mujoco.MjModel, qpos: np.ndarray, scenery: Scenery, every: int = 1, **kwargs) -> list[np.ndarray]:
     """Frames of recorded episodes, one after another.
 
     Args:
-        qpos: [steps, episodes, nq]; goals: [steps, episodes, 3 or more], as in ``rollout.Episodes``.
+        qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
         every: render each ``every``-th step.
         kwargs: of ``Renderer``.
     """
     with Renderer(model, **kwargs) as renderer:
         steps, episodes = qpos.shape[:2]
-        return [renderer.render(qpos[t, k], goals[t, k]) for k in range(episodes) for t in range(0, steps, every)]
+        return [renderer.render(qpos[t, k], scenery[t, k]) for k in range(episodes) for t in range(0, steps, every)]
 
 
 def write_episodes(
     path: pathlib.Path,
     model: mujoco.MjModel,
     qpos: np.ndarray,
-    goals: np.ndarray,
+    scenery: Scenery,
     dt: float,
     cfg: VideoCfg = VideoCfg(),
     update: Callable[[int, int], None] = lambda done, total: None,
-    looks: Looks = MappingProxyType({}),
 ) -> None:
     """Writes recorded episodes as an MP4 in real time.
 
     Args:
-        qpos: [steps, episodes, nq]; goals: [steps, episodes, 3 or more], as in ``rollout.Episodes``.
+        qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
         dt: between steps [s].
         update: called with frames drawn and frames in all.
-        looks: [episodes, 7] by object.
 
     Raises:
         UserError: the machine cannot draw, or the path cannot be written.
     """
     together = cfg.envs > 1
     shots = len(qpos) * (1 if together else qpos.shape[1])
-    width, height, samples, shadows, every = _quality(model, qpos, goals, dt, cfg, shots)
+    width, height, samples, shadows, every = _quality(model, qpos, scenery, dt, cfg, shots)
 
     def pictures() -> Iterator[np.ndarray]:
         total, done = math.ceil(len(qpos) / every) * shots // len(qpos), 0
@@ -196,9 +196,9 @@ def write_episodes(
             for k in range(1 if together else qpos.shape[1]):
                 for t in range(0, len(qpos), every):
                     if together:
-                        yield renderer.render_all(qpos[t], goals[t], looks)
+                        yield renderer.render_all(qpos[t], scenery[t])
                     else:
-                        yield renderer.render(qpos[t, k], goals[t, k], {name: look[k] for name, look in looks.items()})
+                        yield renderer.render(qpos[t, k], scenery[t, k])
                     done += 1
                     update(done, total)
 
@@ -220,7 +220,7 @@ def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) ->
 
 
 def _quality(
-    model: mujoco.MjModel, qpos: np.ndarray, goals: np.ndarray, dt: float, cfg: VideoCfg, shots: int
+    model: mujoco.MjModel, qpos: np.ndarray, scenery: Scenery, dt: float, cfg: VideoCfg, shots: int
 ) -> tuple[int, int, int, int, int]:
     """The best picture that the machine draws in time: width, height, samples, shadows, and each how many steps to draw one."""
     every = max(1, round(1 / ((cfg.fps or 25) * dt)))
@@ -229,7 +229,7 @@ def _quality(
         width, height = cfg.size or (width, height)
         with Renderer(model, width, height, samples=samples, shadows=shadows, envs=cfg.envs) as renderer:
             shot: Callable = renderer.render_all if cfg.envs > 1 else renderer.render
-            first = (qpos[0], goals[0]) if cfg.envs > 1 else (qpos[0, 0], goals[0, 0])
+            first = (qpos[0], scenery[0]) if cfg.envs > 1 else (qpos[0, 0], scenery[0, 0])
             shot(*first)  # loads textures and shaders
             begun = time.perf_counter()
             shot(*first)

@@ -19,7 +19,8 @@ from mjx_nero.types import UserError
 
 OBSTACLE = 8  # contact bit; robot shapes of this bit alone are left out where there is nothing of the kind
 COLLISION = 3  # geom group of the robots' collision shapes, those that meet nothing as yet included
-_PREFIX = "touch:"  # of the sensors' names
+NAME = "touch"  # of the reading
+_PREFIX = f"{NAME}:"  # of the sensors' names
 # Shapes that every backend can bring together with a box.
 _MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
 _SAMPLES = 1000  # postures in which links are looked at
@@ -119,13 +120,13 @@ class Reader:
         return (values[..., self.addresses[:, None] + np.arange(3)] ** 2).sum(-1).max(-1) ** 0.5
 
 
-def reader(model: mujoco.MjModel) -> Reader | None:
-    """Reads a model's sensors; None: the scene does not ask for it."""
+def readers(model: mujoco.MjModel) -> dict[str, Reader]:
+    """What reads a model's sensors, by the names of ``Sim.readings``; none if the scene does not ask for them."""
     ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(_PREFIX)]
     pairs = np.zeros((model.ngeom, model.ngeom), bool)
     for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
         pairs[first, second if second >= 0 else slice(None)] = True
-    return Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T) if ours else None
+    return {NAME: Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T)} if ours else {}
 
 
 @functools.cache

@@ -119,8 +119,8 @@ def draw(played: evaluation.Played, path: pathlib.Path, cfg: render.VideoCfg) ->
     screen, episodes = console.screen(), played.episodes
     try:
         with console.drawing(console.screen(stderr=True), path.name) as update:
-            model, what = played.env.mj_model, (episodes.qpos, episodes.goals)
-            render.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.looks)
+            model, what = played.env.mj_model, (episodes.qpos, episodes.scenery)
+            render.write_episodes(path, model, *what, played.env.dt, cfg, update)
         console.wrote(screen, "video", path)
     except UserError as error:
         console.line(screen, str(error))

@@ -152,6 +152,6 @@ def main(argv: Sequence[str]) -> None:
     _save_plot(motion, f"gripper of {env.cfg.robot.name}", args.out)
     console.wrote(screen, "plot", args.out)
     if args.video:
-        nowhere = np.broadcast_to([0.0, 0.0, -1.0], (len(motion.qpos), 1, 3))  # the goal marker: under the table
-        render.write_episodes(args.video, close_up(env), motion.qpos[:, None], nowhere, env.dt)
+        scenery = render.unmarked(len(motion.qpos), 1)
+        render.write_episodes(args.video, close_up(env), motion.qpos[:, None], scenery, env.dt)
         console.wrote(screen, "video", args.video)

@@ -88,8 +88,8 @@ def test_every_type_is_tried():
 @pytest.mark.parametrize("name", ["positions", "continuous", "targets"])
 def test_an_inverted_action_gives_its_targets(name):
     chain = actions.Chain({key: term for key, term in CHAINS[name].items() if key in ("arm", "gripper", "drives")}, GROUPS)
-    grip = GROUPS["gripper"]
-    wanted = np.concatenate([GROUPS["arm"].home + 0.1, grip.close + (0.0 if name == "positions" else 0.3) * (grip.open - grip.close)])
+    grip, share = GROUPS["gripper"], 0.0 if name == "positions" else 0.3
+    wanted = np.concatenate([GROUPS["arm"].home + 0.1, grip.close + share * (grip.open - grip.close)])
     if name == "continuous":  # velocities get there in time
         wanted[:3] = GROUPS["arm"].home
     action = chain.invert(jnp.asarray(wanted), jnp.asarray(JOINTS.home, jnp.float32))

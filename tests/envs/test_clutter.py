@@ -120,15 +120,16 @@ def test_what_counts_as_held_is_above_the_largest_of_its_kind(env, starts):
 
 
 def test_a_picture_shows_what_was_drawn_and_the_commanded_one_in_green(env, starts):
-    looks = jax.vmap(env.looks)(starts)
+    looks = jax.vmap(env.scenery)(starts).objects
     target = np.asarray(starts.info["carry"].memory["target"])
     for i, name in enumerate(NAMES):
-        size, rgba = np.split(np.asarray(looks[name]), [3], axis=1)
+        size, rgba = np.asarray(looks[name].size), np.asarray(looks[name].rgba)
         np.testing.assert_array_equal(size, starts.pipeline_state.fields["geom_size"][:, env.physics_model.geom(name).id])
         green = np.abs(rgba - [0.2, 0.8, 0.3, 1.0]).max(axis=1) < 1e-6
         np.testing.assert_array_equal(green, target == i)
     lift = make("nero_lift", impl="native")
-    assert lift.looks(jax.eval_shape(lift.reset, jax.random.PRNGKey(0))) == {}  # as it was: nothing differs
+    shown = jax.eval_shape(lambda key: lift.scenery(lift.reset(key)), jax.random.PRNGKey(0))
+    assert shown.objects == {}  # as it was: nothing differs
 
 
 def test_all_shapes_lie_still_in_the_c_library():

@@ -488,7 +488,7 @@ def test_goal_runs_round_its_circle(follow):
         np.testing.assert_allclose(view.goal_linvel_w, velocity, atol=1e-6)
         np.testing.assert_array_equal(view.goal_quat_w, [0, 0, 1, 0])
         np.testing.assert_array_equal(view.command, center)  # as drawn
-        np.testing.assert_allclose(follow.env.goal(at_step(state, step))[:3], view.goal_pos_w, atol=1e-7)
+        np.testing.assert_allclose(follow.env.scenery(at_step(state, step)).goal_pos_w, view.goal_pos_w, atol=1e-7)
         rounds.append(np.asarray(view.goal_pos_w))
     np.testing.assert_allclose(rounds[0], rounds[-1], atol=1e-6)
     after = follow.finish(state, sim.ctrl, sim, jnp.zeros(()))  # and with the steps of the episode

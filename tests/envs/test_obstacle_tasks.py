@@ -35,7 +35,7 @@ def played(env):
         sweep = still.copy()
         sweep[:, 0] += 2.4 * min(1.0, max(0, k - 25) / 50)  # by 1.2 rad
         runs = [step(state, jnp.asarray(action)) for state, action in zip(runs, (still, sweep), strict=True)]
-        touches.append([np.asarray(state.pipeline_state.touch) for state in runs])
+        touches.append([np.asarray(state.pipeline_state.readings["touch"]) for state in runs])
     return start, np.array(touches), runs
 
 
@@ -133,7 +133,7 @@ def test_a_touch_costs_a_beginner_a_tenth():
     touched, still = jnp.asarray(2.0), jnp.zeros(env.action_size)
     for level, price in ((0.0, -1.0), (0.5, -5.5), (1.0, -10.0), (None, -10.0)):
         state = env.reset(jax.random.PRNGKey(0), level)
-        after = env.advance(state, still, state.pipeline_state.replace(touch=touched), jnp.zeros(()))
+        after = env.advance(state, still, state.pipeline_state.replace(readings={"touch": touched}), jnp.zeros(()))
         assert float(after.metrics["reward/touching"]) == pytest.approx(price * env.dt)
 
 

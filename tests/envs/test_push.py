@@ -27,7 +27,8 @@ def functions(env):
 
 def placed(env, state, off=(0.0, 0.0, 0.0), degrees=0.0):
     """The state with the box at its goal but for an offset and a turn."""
-    goal, at = env.goal(state), env.physics_model.joint("box").qposadr[0]
+    shown, at = env.scenery(state), env.physics_model.joint("box").qposadr[0]
+    goal = jnp.concatenate([shown.goal_pos_w, shown.goal_quat_w])
     turn = jnp.array([math.cos(math.radians(degrees) / 2), 0.0, 0.0, math.sin(math.radians(degrees) / 2)])
     w, z = goal[3] * turn[0] - goal[6] * turn[3], goal[3] * turn[3] + goal[6] * turn[0]
     qpos = state.pipeline_state.qpos.at[at : at + 7].set(jnp.array([*(goal[:3] + jnp.array(off)), w, 0.0, 0.0, z]))
@@ -37,7 +38,8 @@ def placed(env, state, off=(0.0, 0.0, 0.0), degrees=0.0):
 def test_the_box_starts_and_ends_where_the_hand_can_point_down(env):
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 300))
     at = env.physics_model.joint("box").qposadr[0]
-    box, goal = np.asarray(state.pipeline_state.qpos[:, at : at + 7]), np.asarray(jax.vmap(env.goal)(state))
+    box, shown = np.asarray(state.pipeline_state.qpos[:, at : at + 7]), jax.vmap(env.scenery)(state)
+    goal = np.concatenate([shown.goal_pos_w, shown.goal_quat_w], axis=1)
     for pose in (box, goal):
         np.testing.assert_allclose([pose[:, :2].min(0), pose[:, :2].max(0)], [[0.3, -0.1], [0.4, 0.2]], atol=5e-3)
         yaw = np.degrees(2 * np.arctan2(pose[:, 6], pose[:, 3]))

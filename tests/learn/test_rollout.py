@@ -8,8 +8,10 @@ import pytest
 from mjx_nero import make
 from mjx_nero.learn import evaluation, rollout
 from mjx_nero.sim import physics
+from mjx_nero.types import Scenery
 
 N = 8
+NOTHING = Scenery(np.zeros((5, 0, 3)), np.zeros((5, 0, 4)))
 
 
 def idle(params, obs, key):
@@ -55,11 +57,11 @@ def test_what_a_backend_of_eval_means(backend, impl, played):
 
 
 def test_records(env, episodes):
-    assert episodes.qpos.shape == (250, 3, 16) and episodes.goals.shape == (250, 3, 7)
+    assert episodes.qpos.shape == (250, 3, 16) and episodes.scenery.goal_pos_w.shape == (250, 3, 3)
     assert np.isfinite(episodes.qpos).all()
-    assert (episodes.goals == episodes.goals[0]).all()
+    assert (episodes.scenery.goal_pos_w == episodes.scenery.goal_pos_w[0]).all()
     assert (np.abs(episodes.qpos[:, :, 11] - 0.015) < 1e-3).all()  # the cubes lie on the table
-    distance = np.linalg.norm(episodes.qpos[-1, :, 9:12] - episodes.goals[-1, :, :3], axis=1)
+    distance = np.linalg.norm(episodes.qpos[-1, :, 9:12] - episodes.scenery.goal_pos_w[-1], axis=1)
     np.testing.assert_allclose(episodes.metrics["final_distance"][:3], distance, rtol=1e-5)
     assert episodes.distance.shape == (250, N) and episodes.memory == ()
     np.testing.assert_allclose(episodes.distance[-1], episodes.metrics["final_distance"], rtol=1e-6)
@@ -85,7 +87,7 @@ def test_controllers_play_every_environment_of_a_batch_with_a_memory_of_their_ow
     np.testing.assert_array_equal(episodes.lengths, [10, 10, 10])
     np.testing.assert_allclose(episodes.qpos[:, :, :6], np.broadcast_to(env.cfg.robot.arm.home, (10, 3, 6)), atol=1e-4)
     home = np.array([0.5, 0.0, 0.54])  # of the flange, which follows
-    np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.goals[-1, :, :3] - home, axis=1), atol=1e-3)
+    np.testing.assert_allclose(episodes.distance[-1], np.linalg.norm(episodes.scenery.goal_pos_w[-1] - home, axis=1), atol=1e-3)
 
 
 def test_same_seed_same_episodes(play, episodes):
@@ -135,7 +137,7 @@ def test_summary_by_hand():
         "reward/a": np.array([1.0, 2, 3, 4]),
     }
     returns, lengths, qpos = np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250]), np.zeros((250, 0, 16))
-    summary = rollout.Episodes(metrics, returns, lengths, qpos, qpos[..., :3], np.zeros((250, 4)), memory=()).summary()
+    summary = rollout.Episodes(metrics, returns, lengths, qpos, NOTHING, np.zeros((250, 4)), memory=()).summary()
     assert summary["success_rate"] == 0.5 and summary["grasp_rate"] == 0.5 and summary["dropped_rate"] == 0.25
     assert summary["diverged"] == 1  # the second, a failure that is in no mean
     assert summary["time_to_grasp_mean"] == 2.0  # of those that grasped
@@ -151,7 +153,7 @@ def test_summary_of_nothing_but_divergence():
     metrics = dict.fromkeys(("success", "final_distance", "grasped", "grasp_time", "dropped", "overflow"), np.zeros(2))
     metrics |= {"nan": np.array([1.0, 0]), "reward/a": np.zeros(2)}
     returns, qpos = np.array([0.0, np.nan]), np.zeros((5, 0, 16))
-    summary = rollout.Episodes(metrics, returns, np.ones(2), qpos, qpos, np.zeros((5, 2)), memory=()).summary()
+    summary = rollout.Episodes(metrics, returns, np.ones(2), qpos, NOTHING, np.zeros((5, 2)), memory=()).summary()
     assert summary["diverged"] == 2 and summary["success_rate"] == 0
     assert summary["return_mean"] is None and summary["final_distance_median"] is None
     assert summary["return_by_term"] == {"a": None}

@@ -52,7 +52,7 @@ def beside(touch: float = 0.0, **changes) -> View:
     turned, far = np.float32([0.5**0.5, 0, 0, 0.5**0.5]), np.float32([9, 9, 9])
     one = ObstacleView(jnp.float32([1.13, 2.04, 3.2]), jnp.asarray(turned), jnp.float32([0.04, 0.1, 0.2]))
     two = ObstacleView(jnp.asarray(far), jnp.asarray(turned), jnp.float32([0.04, 0.1, 0.2]))
-    return view(**changes).replace(obstacles={"one": one, "two": two}, touch=jnp.float32(touch))
+    return view(**changes).replace(obstacles={"one": one, "two": two}, readings={"touch": jnp.float32(touch)})
 
 
 def at_height(z: float) -> View:

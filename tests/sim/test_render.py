@@ -8,8 +8,10 @@ from scipy import ndimage
 
 import mjx_nero
 from mjx_nero.sim import render
+from mjx_nero.types import Scenery
 
-QPOS, GOALS, DT = np.zeros((150, 3, 1)), np.zeros((150, 3, 7)), 0.02  # three episodes of 3 s: 225 pictures at 25 a second
+SCENERY = Scenery(np.zeros((150, 3, 3)), np.zeros((150, 3, 4)))
+QPOS, DT = np.zeros((150, 3, 1)), 0.02  # three episodes of 3 s: 225 pictures at 25 a second
 
 
 @pytest.fixture
@@ -28,7 +30,7 @@ def written(monkeypatch):
             def __exit__(self, *_):
                 pass
 
-            def render(self, qpos, goal, looks=None):
+            def render(self, qpos, scenery):
                 clock[0] += seconds * self.size[0] * self.size[1] / 1e6
                 return self.size
 
@@ -38,7 +40,7 @@ def written(monkeypatch):
         monkeypatch.setattr(render, "Renderer", Renderer)
         monkeypatch.setattr(render.time, "perf_counter", lambda: clock[0])
         monkeypatch.setattr(render, "write_video", lambda path, images, fps: found.extend([list(images), fps]))
-        render.write_episodes("x.mp4", None, QPOS, GOALS, DT, cfg, lambda *done: progress.append(done))
+        render.write_episodes("x.mp4", None, QPOS, SCENERY, DT, cfg, lambda *done: progress.append(done))
         images, fps = found
         return *images[0], len(images), fps, progress
 
@@ -72,6 +74,8 @@ def test_robots_side_by_side_in_one_picture():
         pytest.skip("no offscreen OpenGL")
     qpos = np.tile(env.physics_model.qpos0, (4, 1))
     with renderer:
-        picture = renderer.render_all(qpos, np.tile([0.3, 0.0, -1.0], (4, 1))).astype(int)
+        picture = renderer.render_all(qpos, Scenery(np.tile([0.3, 0.0, -1.0], (4, 1)), np.tile([1.0, 0, 0, 0], (4, 1)))).astype(
+            int
+        )
     cubes, count = ndimage.label((picture[:, :, 0] > 120) & (picture[:, :, 1:].max(axis=2) < 0.6 * picture[:, :, 0]))
     assert count == 4 and np.bincount(cubes.flat)[1:].min() > 20

@@ -85,7 +85,7 @@ def worlds(model) -> tuple[Sim, jax.Array]:
         warmstart=jnp.zeros((n, 3)),
         time=jnp.zeros(n),
         fields=jax.tree.map(lambda *x: jnp.stack(x), *fields),
-        touch=jnp.zeros(n),
+        readings={"touch": jnp.zeros(n)},
     )
     return sim, qpos.at[4, 0].set(-0.8)
 
@@ -95,7 +95,7 @@ def step(physics, sim: Sim, ctrl, times: int) -> tuple[Sim, np.ndarray]:
     for _ in range(times):
         sim, lost = forward(sim, ctrl)
         assert not np.any(lost)
-        forces.append(np.asarray(sim.touch))
+        forces.append(np.asarray(sim.readings["touch"]))
     return sim, np.array(forces)
 
 

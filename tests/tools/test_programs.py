@@ -161,14 +161,14 @@ def test_video_has_real_frames(call, tmp_path):
 def test_a_video_of_failures_shows_them_alone(call, tmp_path, monkeypatch):
     """Of the episodes that play, the second and the fourth fail."""
     drawn = []
-    monkeypatch.setattr(render, "write_episodes", lambda path, model, qpos, goals, *_: drawn.append((qpos, goals)))
+    monkeypatch.setattr(render, "write_episodes", lambda path, model, qpos, scenery, *_: drawn.append((qpos, scenery.goal_pos_w)))
     played = evaluation.play
     succeeds = np.array([True, False, True, False])
     monkeypatch.setattr(rollout.Episodes, "success", property(lambda self: succeeds))
 
     def play(cfg):
         result = played(cfg)
-        drawn.append((result.episodes.qpos, result.episodes.goals))
+        drawn.append((result.episodes.qpos, result.episodes.scenery.goal_pos_w))
         return result
 
     monkeypatch.setattr(evaluation, "play", play)

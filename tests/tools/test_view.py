@@ -51,25 +51,25 @@ def test_the_arm_follows_a_goal_that_the_user_moves(following):
     for _ in range(5):
         following.step()
     following.move_goal(0, to)
-    np.testing.assert_allclose(following.frame.goal[0, :3], to, atol=1e-6)
-    other = following.frame.goal[1, :3].copy()
+    np.testing.assert_allclose(following.frame.scenery.goal_pos_w[0], to, atol=1e-6)
+    other = following.frame.scenery.goal_pos_w[1].copy()
     for _ in range(50):
         following.step()
     assert following.frame.distance < 0.01
     for _ in range(15):
         following.step()
-    np.testing.assert_allclose(following.frame.goal[0, :3], to, atol=1e-6)  # still, in the next episode
+    np.testing.assert_allclose(following.frame.scenery.goal_pos_w[0], to, atol=1e-6)  # still, in the next episode
     assert following.frame.step == 10
-    assert np.abs(following.frame.goal[1, :3] - other).max() > 0.01  # the other environment's has been drawn anew
+    assert np.abs(following.frame.scenery.goal_pos_w[1] - other).max() > 0.01  # the other environment's has been drawn anew
     following.reset()
-    assert np.abs(following.frame.goal[0, :3] - to).max() > 0.01
+    assert np.abs(following.frame.scenery.goal_pos_w[0] - to).max() > 0.01
 
 
 def test_a_goal_on_a_path_goes_with_its_path():
     env = mjx_nero.make("nero_follow_target", impl="native")
     moving = Session(env, 1, agents.of_targets(env), jnp.array(env.cfg.robot.home))
     still = np.asarray(moving._state.info["carry"].command[0])
-    moving.move_goal(0, moving.frame.goal[0, :3] + [0.02, -0.03, 0.04])
+    moving.move_goal(0, moving.frame.scenery.goal_pos_w[0] + [0.02, -0.03, 0.04])
     np.testing.assert_allclose(moving._state.info["carry"].command[0], still + [0.02, -0.03, 0.04], atol=1e-6)
 
 
@@ -264,7 +264,7 @@ def test_in_a_browser(browser):
         picture = look()
         assert picture.std() > 20 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
 
-        x, y = on_screen(client, page.session.frame.goal[0, :3])
+        x, y = on_screen(client, page.session.frame.scenery.goal_pos_w[0])
         mouse = (
             ActionChains(browser, duration=100).move_to_element_with_offset(canvas, int(x), int(y)).pause(0.5).click_and_hold()
         )
@@ -272,13 +272,13 @@ def test_in_a_browser(browser):
             mouse = mouse.move_by_offset(0, -8).pause(0.2)
         mouse.pause(0.5).release().perform()
         time.sleep(2)  # its last messages
-        moved = page.session.frame.goal[0, :3]
+        moved = page.session.frame.scenery.goal_pos_w[0]
         assert moved[2] > 0.27 + 0.03 and abs(moved[1] - 0.1) < 0.03  # up, as the mouse
         arm = page.session.frame.qpos[0, :7].copy()
         assert page.session.frame.step == before + 1  # all else has stood still
         button("Run").click()
         wait(lambda: page.session.frame.step > before + 60 and page.session.frame.distance < 0.01)
-        np.testing.assert_allclose(page.session.frame.goal[0, :3], moved, atol=1e-6)
+        np.testing.assert_allclose(page.session.frame.scenery.goal_pos_w[0], moved, atol=1e-6)
         assert np.abs(page.session.frame.qpos[0, :7] - arm).max() > 0.02
         errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
         # What Chromium says of viser's own listener for the mouse wheel; the page scrolls all the same.

@@ -32,7 +32,7 @@ class JaxPhysics:
             self._template = mjx.make_data(self._mx)
         self._qpos_ids = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._dof_ids = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-        self._touch = touch.reader(model)
+        self._readers = touch.readers(model)
         self._touches = bool(model.geom_contype.any())
 
     def step(self, sim: Sim, ctrl: Float[Array, " nu"]) -> tuple[Sim, Float[Array, ""]]:
@@ -43,15 +43,13 @@ class JaxPhysics:
         def physics_step(_, sim: Sim) -> Sim:
             data = self._template.replace(qpos=sim.qpos, qvel=sim.qvel, ctrl=ctrl, qacc_warmstart=sim.warmstart, time=sim.time)
             data = mjx.step(mx if self._touches else self._saturated(mx, data), data)
-            if self._touch:
-                assert sim.touch is not None
-                sim = dataclasses.replace(sim, touch=jnp.maximum(sim.touch, self._touch(data.sensordata)))
-            return dataclasses.replace(sim, qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart, time=data.time)
+            readings = {name: jnp.maximum(sim.readings[name], read(data.sensordata)) for name, read in self._readers.items()}
+            after = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart, "time": data.time}
+            return dataclasses.replace(sim, readings=readings, **after)
 
-        if self._touch:
-            sim = dataclasses.replace(sim, touch=jnp.zeros(()))
+        sim = dataclasses.replace(sim, ctrl=ctrl, readings=dict.fromkeys(self._readers, jnp.zeros(())))
         # A loop, as two steps in a row would take twice as long to compile.
-        return jax.lax.fori_loop(0, self.decimation, physics_step, dataclasses.replace(sim, ctrl=ctrl)), jnp.zeros(())
+        return jax.lax.fori_loop(0, self.decimation, physics_step, sim), jnp.zeros(())
 
     @property
     def compiler_options(self) -> dict[str, str | bool]:

@@ -38,7 +38,7 @@ class WarpPhysics:
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
         # dof_M0 is of MuJoCo's C library alone.
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name != "dof_M0"}
-        self._touch = touch.reader(model)
+        self._touch = touch.readers(model).get(touch.NAME)
         self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
 
@@ -52,7 +52,7 @@ class WarpPhysics:
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
         if self._touch:
-            after = dataclasses.replace(after, touch=force)
+            after = dataclasses.replace(after, readings={touch.NAME: force})
         return after, ((overflow & _LOST) != 0).astype(jnp.float32)
 
     def _as_jax(self) -> Callable:

@@ -40,7 +40,7 @@ class NativePhysics:
         self._period = cfg.decimation * cfg.dt
         self._fields = {name: getattr(model, name).shape for name in fields}
         self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu])
-        self._touch = touch.reader(model)
+        self._readers = touch.readers(model)
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
@@ -50,20 +50,21 @@ class NativePhysics:
         """One control step; any leading axes are environments. Where MuJoCo gives up, the state is NaN."""
         drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
         packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
-        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + bool(self._touch)), jnp.float32)
+        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + len(self._readers)), jnp.float32)
         after = jax.pure_callback(self._step, shape, packed, vmap_method="broadcast_all")
-        qpos, qvel, warmstart, force = jnp.split(after, self._sizes[:3], axis=-1)
-        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=sim.time + self._period)
-        if self._touch:
-            after = dataclasses.replace(after, touch=force[..., 0])
-        return after, jnp.zeros(packed.shape[:-1])
+        qpos, qvel, warmstart, read = jnp.split(after, self._sizes[:3], axis=-1)
+        readings = {name: read[..., i] for i, name in enumerate(self._readers)}
+        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=readings)
+        return dataclasses.replace(after, time=sim.time + self._period), jnp.zeros(packed.shape[:-1])
 
     def _step(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
-        """(qpos, qvel, warmstart, ctrl, fields) -> the first three after the step, and the touch. No JAX in here: it would wait
-        for itself."""
+        """(qpos, qvel, warmstart, ctrl, fields) -> the first three after the step, and the readings.
+
+        No JAX in here: it would wait for itself.
+        """
         n, (nq, nqv, nqvv, end) = math.prod(packed.shape[:-1]), self._sizes
         given, fields = np.split(np.asarray(packed).reshape(n, -1), [end], axis=1)
-        after = np.empty((n, nqvv + bool(self._touch)), np.float32)
+        after = np.empty((n, nqvv + len(self._readers)), np.float32)
         with _lock, _quiet():
             if n not in self._made:
                 self._made[n] = self._make(n)
@@ -84,8 +85,8 @@ class NativePhysics:
             last, before = states[:, -1, 1:], states[:, -2, 1:] if self.decimation > 1 else start[:, 1:]
             after[:, :nqv] = last
             after[:, nqv:nqvv] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
-            if self._touch:
-                after[:, nqvv] = self._touch(sensors).max(axis=1)
+            for i, read in enumerate(self._readers.values()):
+                after[:, nqvv + i] = read(sensors).max(axis=1)
             # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time tells.
             after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
         return after.reshape(*packed.shape[:-1], -1)

@@ -4,7 +4,6 @@ import os
 import time
 
 import jax
-import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
@@ -16,15 +15,15 @@ def measure_render(env: ManipulationEnv, count: int, repeats: int, width: int = 
     """Draws the starts of ``count`` episodes, one after another, ``repeats`` times; without OpenGL the row says so."""
     row = {"what": "render", "gl": os.environ.get("MUJOCO_GL", "default"), "width": width, "height": height, "frames": count}
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
-    qpos, goals = (np.asarray(x) for x in (states.pipeline_state.qpos, jax.vmap(env.goal)(states)))
+    qpos, scenery = jax.device_get((states.pipeline_state.qpos, jax.vmap(env.scenery)(states)))
     rates = []
     try:
         with render.Renderer(env.mj_model, width, height) as renderer:
-            renderer.render(qpos[0], goals[0])  # loads textures and shaders
+            renderer.render(qpos[0], scenery[0])  # loads textures and shaders
             for _ in range(repeats):
                 begun = time.perf_counter()
-                for at, goal in zip(qpos, goals, strict=True):
-                    renderer.render(at, goal)
+                for i, at in enumerate(qpos):
+                    renderer.render(at, scenery[i])
                 rates.append(count / (time.perf_counter() - begun))
     except UserError as error:
         return {**row, "note": str(error)}

@@ -213,9 +213,9 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
     if cfg:
         env = ManipulationEnv(cfg, impl="jax")
         state = env.reset(jax.random.PRNGKey(0))
-        qpos, goal, looks = jax.tree.map(np.asarray, (state.pipeline_state.qpos, env.goal(state), env.looks(state)))
+        qpos, scenery = jax.device_get((state.pipeline_state.qpos, env.scenery(state)))
         with render.Renderer(env.mj_model, width, height) as renderer:
-            return renderer.render(qpos, goal, looks)
+            return renderer.render(qpos, scenery)
     low, high = _extent(robot)
     far = 1.5 * float(np.linalg.norm(high - low))
     objects = SceneCfg(objects={}, table_center=tuple((low + high)[:2] / 2))
@@ -224,7 +224,7 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
     qpos = model.qpos0.copy()
     qpos[[model.joint(j).qposadr[0] for j in robot.joints]] = robot.home
     with render.Renderer(model, width, height) as renderer:
-        return renderer.render(qpos, np.array([0.0, 0.0, -1e3]))  # the goal marker: out of sight
+        return renderer.render(qpos, render.unmarked())
 
 
 def _joints(model: mujoco.MjModel, robot: RobotCfg, where: SceneCfg) -> Iterator[Joint]:

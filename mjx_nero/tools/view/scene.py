@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import cast
 
+import jax
 import mujoco
 import numpy as np
 import trimesh
@@ -37,8 +38,7 @@ class Scene:
         server.initial_camera.position = tuple(middle + model.stat.center + (camera.pos - model.stat.center) * across)
         server.initial_camera.fov = float(np.radians(camera.fovy[0]))
         positions, quats = self._poses(session.frame)
-        self._standing = [int(geom) for geom in np.flatnonzero(model.geom_contype & OBSTACLE)]
-        self._stand: np.ndarray = np.empty(0)
+        self._stand: list[np.ndarray] = []
         self._place(session.frame)
         self._bodies = []
         for body, name, mesh, rgba in _meshes(model):
@@ -66,15 +66,16 @@ class Scene:
 
     def _place(self, frame: Frame) -> None:
         """Draws obstacles anew where an episode has others (see ``ManipulationEnv.scenery``)."""
-        boxes = frame.goal[:, 7:].reshape(len(frame.goal), -1, 10)
-        if np.array_equal(boxes, self._stand):
+        boxes = frame.scenery.obstacles
+        drawn = jax.tree.leaves(boxes)
+        if len(drawn) == len(self._stand) and all(map(np.array_equal, drawn, self._stand)):
             return
-        self._stand = boxes
-        for i, corner in enumerate(self._corners):
-            for geom, box in zip(self._standing, boxes[i], strict=False):
-                color = tuple(int(255 * c) for c in self._model.geom_rgba[geom][:3])
-                name = f"/obstacles/{i}/{self._model.geom(geom).name}"
-                self._server.scene.add_box(name, color, dimensions=box[7:], position=box[:3] + corner, wxyz=box[3:7])
+        self._stand = drawn
+        for name, box in boxes.items():
+            color = tuple(int(255 * c) for c in self._model.geom(name).rgba[:3])
+            for i, corner in enumerate(self._corners):
+                pose = {"position": box.pos_w[i] + corner, "wxyz": box.quat_w[i]}
+                self._server.scene.add_box(f"/obstacles/{i}/{name}", color, dimensions=box.size[i], **pose)
 
     def _poses(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         """Positions [bodies, n, 3] and orientations [bodies, n, 4] of all bodies."""
@@ -82,7 +83,7 @@ class Scene:
         positions, quats = np.empty((model.nbody, n, 3), np.float32), np.empty((model.nbody, n, 4), np.float32)
         for i in range(n):
             data.qpos[:] = frame.qpos[i]
-            data.mocap_pos[0], data.mocap_quat[0] = frame.goal[i, :3], frame.goal[i, 3:7]
+            data.mocap_pos[0], data.mocap_quat[0] = frame.scenery.goal_pos_w[i], frame.scenery.goal_quat_w[i]
             mujoco.mj_kinematics(model, data)
             positions[:, i], quats[:, i] = data.xpos + self._corners[i], data.xquat
         return positions, quats

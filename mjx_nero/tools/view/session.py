@@ -16,6 +16,7 @@ import numpy as np
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop.batch import Batch, where
 from mjx_nero.learn import rollout
+from mjx_nero.types import Scenery
 
 CURVE = 400  # control steps that the curves show
 EPISODES = 100  # the last ones, of which the success rate is told
@@ -27,13 +28,12 @@ class Frame:
 
     Attributes:
         qpos: [n, nq].
-        goal: [n, 7 or more], position [m] and orientation (wxyz) in the world frame, then the obstacles
-            (``ManipulationEnv.scenery``).
+        scenery: [n, ...], what else there is to see (``ManipulationEnv.scenery``).
         curves: name -> [size] of the first environment: rewards by term, actions, observations by term.
     """
 
     qpos: np.ndarray
-    goal: np.ndarray
+    scenery: Scenery
     step: int
     distance: float
     curves: dict[str, dict[str, np.ndarray]]
@@ -92,7 +92,7 @@ class Session:
         with self._lock:
             command = self._state.info["carry"].command
             # A moving goal keeps to its path about the command, so the command goes as far as the goal does.
-            self._command[index] = np.asarray(command[index]) + to - self.frame.goal[index, :3]
+            self._command[index] = np.asarray(command[index]) + to - self.frame.scenery.goal_pos_w[index]
             self._dragged[index] = True
             self._replace_goals()
             self._changed = True
@@ -152,23 +152,23 @@ class Session:
             carry = self._state.info["carry"]
             command = jnp.where(self._dragged[:, None], self._command, carry.command)
             self._state = self._state.replace(info={**self._state.info, "carry": carry.replace(command=command)})
-            self.frame = dataclasses.replace(self.frame, goal=np.asarray(self._goals(self._state)))
+            self.frame = dataclasses.replace(self.frame, scenery=jax.device_get(self._scenery(self._state)))
 
     @functools.cached_property
-    def _goals(self) -> Callable:
-        return jax.jit(jax.vmap(self.env.goal))
+    def _scenery(self) -> Callable:
+        return jax.jit(jax.vmap(self.env.scenery))
 
     def _see_all(self, state):
         first = jax.tree.map(lambda x: x[0], state)
-        return state.pipeline_state.qpos, jax.vmap(self.env.goal)(state), self.env.named_observations(first)["state"]
+        return state.pipeline_state.qpos, jax.vmap(self.env.scenery)(state), self.env.named_observations(first)["state"]
 
     def _look(self, action: jax.Array) -> Frame:
         state = self._state
-        (qpos, goal, observations), metrics = jax.device_get((self._see(state), state.metrics))
+        (qpos, scenery, observations), metrics = jax.device_get((self._see(state), state.metrics))
         rewards = {name.removeprefix("reward/"): value[:1] for name, value in metrics.items() if name.startswith("reward/")}
         return Frame(
             qpos=np.asarray(qpos, np.float64),
-            goal=np.asarray(goal, np.float64),
+            scenery=scenery,
             step=int(state.info["carry"].step[0]),
             distance=float(metrics["distance"][0]),
             curves={"rewards": rewards, "actions": {"action": np.asarray(action[0])}, "observations": observations},
