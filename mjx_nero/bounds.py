@@ -36,10 +36,26 @@ class Ascending:
         return "" if value[0] <= value[1] else "is a range and must run from low to high"
 
 
+@dataclasses.dataclass(frozen=True, init=False)
+class OneOf:
+    """One of some names."""
+
+    names: tuple[str, ...]
+
+    def __init__(self, *names: str):
+        object.__setattr__(self, "names", names)
+
+    def fault(self, value: str) -> str:
+        """See ``Bounds.fault``."""
+        return "" if value in self.names else f"must be one of {', '.join(self.names)}"
+
+
 Positive = Annotated[float, Bounds(0.0, above=True)]
 NonNegative = Annotated[float, Bounds(0.0)]
 Share = Annotated[float, Bounds(0.0, 1.0)]
 Count = Annotated[int, Bounds(1)]
+Whole = Annotated[int, Bounds(0)]
+Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # larger ones would repeat: a random key has 32 bits of it
 Range = Annotated[tuple[float, float], Ascending()]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]

@@ -7,7 +7,7 @@ import os
 import pathlib
 import stat
 from collections.abc import Iterator, Mapping
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NoReturn
 
 import yaml
 from lxml import etree
@@ -20,6 +20,8 @@ MAX_TAGS = 400_000  # of an XML file
 MAX_YAML = 200_000  # bytes
 MAX_NODES = 20_000  # of a YAML file, aliases written out
 MAX_DEPTH = 12  # of lists and entries within one another
+MAX_JSON = 4_000_000  # bytes
+MAX_JSON_DEPTH = 30
 
 
 @contextlib.contextmanager
@@ -61,6 +63,76 @@ def read_bytes(path: pathlib.Path, limit: int) -> bytes:
     if size > limit:
         raise UserError(f"{path} has {size / 1e6:.3g} MB: more than {limit / 1e6:.3g} MB are not read")
     return content
+
+
+def inside(folder: pathlib.Path, *names: str) -> pathlib.Path:
+    """A path below a folder that a stranger may have made: ``folder/name/name``, whether it is there or not.
+
+    Raises:
+        UserError: a link stands on the way, or what is there is neither a file nor a folder.
+    """
+    path = folder
+    for name in names:
+        path = path / name
+        try:
+            mode = os.lstat(path).st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except (OSError, ValueError) as error:
+            raise UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            what = "a link" if stat.S_ISLNK(mode) else "no file"
+            raise UserError(f"{path} is {what}, which is neither read nor written here: remove it, or copy {folder} without it")
+    return path
+
+
+def read_json(path: pathlib.Path, limit: int = MAX_JSON) -> Any:
+    """The content of a JSON file: plain values, no key twice, finite numbers.
+
+    Raises:
+        UserError: as ``read_bytes``; or it is no such JSON.
+    """
+    content = read_bytes(path, limit)
+    try:
+        return parse_json(content)
+    except (ValueError, RecursionError) as error:
+        what = "too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:160]
+        raise UserError(f"{path} is not JSON: {what}") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """JSON by the letter: no key twice, no numbers that are not finite.
+
+    Raises:
+        ValueError, RecursionError: it is none.
+    """
+    found = json.loads(text, object_pairs_hook=_once, parse_constant=_refuse, parse_float=_finite, parse_int=_whole_number)
+    level = [found]
+    for _ in range(MAX_JSON_DEPTH):
+        inner = (value.values() if isinstance(value, dict) else value for value in level if isinstance(value, dict | list))
+        level = [item for items in inner for item in items]
+    if level:
+        raise ValueError(f"deeper than {MAX_JSON_DEPTH} levels")
+    return found
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) != len(pairs):
+        raise ValueError("a key stands twice")
+    return out
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number")
+
+
+def _finite(text: str) -> float:
+    return float(text) if math.isfinite(float(text)) else _refuse(text[:40])
+
+
+def _whole_number(text: str) -> int:
+    return int(text) if len(text) <= 20 else _refuse(f"{text[:40]}...")
 
 
 def parse_xml(content: bytes, name: str) -> etree._Element:
@@ -196,6 +268,7 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     part = path.with_name(f".{path.stem}{PART}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        part.unlink(missing_ok=True)  # a link there would be written through
         yield part
         _sync(part)
         part.replace(path)

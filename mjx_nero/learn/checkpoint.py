@@ -87,7 +87,7 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
         raise UserError(f"no such file: {path}")
     _, texts = header.read(path)
     try:
-        meta = header.plain_json(texts["meta"])
+        meta = files.parse_json(texts["meta"])
     except (LookupError, ValueError, RecursionError):
         meta = None
     if not isinstance(meta, dict):

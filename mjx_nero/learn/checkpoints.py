@@ -3,11 +3,14 @@
 import concurrent.futures
 import contextlib
 import pathlib
+import re
 from typing import Any
 
+from mjx_nero import files
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint
 
+_NAME = re.compile(r"\d{12}\.safetensors")  # env steps
 FOLDER, POLICY, BEST = "checkpoints", "policy.safetensors", "best.safetensors"
 
 
@@ -16,8 +19,14 @@ class NotWritten(UserError):
 
 
 def saved(run_folder: pathlib.Path) -> list[pathlib.Path]:
-    """Checkpoints of a run, the newest first."""
-    return sorted((run_folder / FOLDER).glob("[0-9]*.safetensors"), reverse=True)
+    """Checkpoints of a run, the newest first. What the run has not named so itself is somebody else's, and left alone.
+
+    Raises:
+        UserError: a link stands in their place.
+    """
+    folder = files.inside(run_folder, FOLDER)
+    names = sorted((path.name for path in folder.glob("*.safetensors") if _NAME.fullmatch(path.name)), reverse=True)
+    return [files.inside(run_folder, FOLDER, name) for name in names]
 
 
 class Checkpoints:

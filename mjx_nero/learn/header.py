@@ -1,10 +1,9 @@
 """The head of a policy or checkpoint, which may be a stranger's: read with limits before a library sees the file."""
 
-import json
 import math
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 from mjx_nero import files
 from mjx_nero.errors import UserError
@@ -46,7 +45,7 @@ def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
             raise UserError(f"{path} has {size / 1e9:.0f} GB: more than {MAX_FILE / 1e9:.0f} GB are not read")
         head = file.read(length) if length <= min(MAX_HEAD, size - 8) else b""
     try:
-        found = plain_json(head)
+        found = files.parse_json(head)
         texts = found.pop("__metadata__")
         arrays = {name: _array(entry) for name, entry in found.items()}
         whole = sum(last - first for _, _, first, last in arrays.values()) == size - 8 - length
@@ -60,15 +59,6 @@ def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
 def damaged(path: pathlib.Path) -> UserError:
     """The error of a file that is not what was written."""
     return UserError(f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew")
-
-
-def plain_json(text: str | bytes) -> Any:
-    """JSON by the letter: no key twice, no numbers that are not finite.
-
-    Raises:
-        ValueError, RecursionError: it is none.
-    """
-    return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse, parse_float=_finite)
 
 
 def check(meta: Mapping[str, Any], path: pathlib.Path) -> None:
@@ -108,21 +98,6 @@ def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
     if not whole or len(shape) > 8 or math.prod(shape) * _BYTES[kind] != last - first:
         raise ValueError
     return DTYPES[kind], shape, first, last
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out = dict(pairs)
-    if len(out) != len(pairs):
-        raise ValueError("a key stands twice")
-    return out
-
-
-def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number")
-
-
-def _finite(text: str) -> float:
-    return float(text) if math.isfinite(float(text)) else _refuse(text)
 
 
 def _word(value: Any) -> bool:

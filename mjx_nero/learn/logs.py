@@ -11,6 +11,7 @@ from mjx_nero import files
 from mjx_nero.errors import UserError
 
 METRICS = "metrics.jsonl"
+MAX_METRICS = 200_000_000  # bytes
 Row = dict[str, Any]
 
 
@@ -115,14 +116,23 @@ def read(path: pathlib.Path) -> list[Row]:
     rows: list[Row] = []
     if not path.is_file():
         return rows
-    with path.open(errors="replace") as file:
-        for text in file:
-            with contextlib.suppress(ValueError, TypeError, KeyError):  # a line that a killed run left half-written
-                row = json.loads(text)
-                while rows and rows[-1]["steps"] >= row["steps"]:
-                    rows.pop()
-                rows.append(row)
+    for text in files.read_bytes(path, MAX_METRICS).splitlines():
+        row = _row(text)
+        if row:  # else a line that a killed run left half-written
+            while rows and rows[-1]["steps"] >= row["steps"]:
+                rows.pop()
+            rows.append(row)
     return rows
+
+
+def _row(text: bytes) -> Row | None:
+    """A row of metrics by name; None: it is none."""
+    try:
+        row = files.parse_json(text)
+    except (ValueError, RecursionError):
+        return None
+    numbers = isinstance(row, dict) and all(value is None or type(value) in (int, float) for value in row.values())
+    return row if numbers and row.get("steps") is not None else None
 
 
 def _append(path: pathlib.Path, text: str) -> None:

@@ -1,20 +1,23 @@
 """Going on: the same run from its newest whole checkpoint, or another from a checkpoint or a policy."""
 
 import dataclasses
-import json
 import pathlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 import jax
 
-from mjx_nero import config
+from mjx_nero import config, files, values
+from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, checkpoints, compiled, header
+from mjx_nero.learn import trust as trust_of
 from mjx_nero.learn.learner import Learner
-from mjx_nero.learn.run_cfg import RunCfg, resolve
+from mjx_nero.learn.run_cfg import Asked, RunCfg, resolve
 from mjx_nero.learn.run_folder import CONFIG
 
+# Fields of a run's environment that name files: another place than the folder of the run.
+_PATHS = ("identified", "robot.folder", "robot.name", "robot.mjcf")
 # What may change when a run goes on: how long, on what, and what it leaves behind.
 _FREE = ("impl", "eval_every", "checkpoint_every", "checkpoint_minutes", "keep", "on_nan", "max_minutes", "num_devices")
 _OWN = (*_FREE, "seed", "eval_episodes")
@@ -50,18 +53,22 @@ def find(restore: pathlib.Path, warn: Callable[[str], None]) -> Source:
     raise UserError(f"{restore} holds no checkpoint to restore: give a run folder or a .safetensors file")
 
 
-def same_run(folder: pathlib.Path, asked: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]]) -> RunCfg:
+def same_run(
+    folder: pathlib.Path, asked: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]], trust: bool = False
+) -> RunCfg:
     """The run of a folder, to go on as it was; what the user asks for beside that may only say how long and on what.
 
     Args:
         asked: the run that the command line describes.
         flags: names of the flags that it has.
         dotted: its dotted flags, by prefix.
+        trust: the user knows who made the run, so files that it names outside of its folder may be read.
 
     Raises:
-        UserError: a flag differs from the run's own; the config is damaged or of a version that this one cannot follow.
+        UserError: a flag differs from the run's own; the config is damaged, names files of a stranger's choice, or is of a
+            version that this one cannot follow.
     """
-    run = _rebuilt(folder)
+    run = _rebuilt(folder, trust)
     if run is None:  # of a version that did not say enough
         return dataclasses.replace(asked, restore=folder, out=folder)
 
@@ -92,40 +99,74 @@ def same_run(folder: pathlib.Path, asked: RunCfg, flags: Collection[str], dotted
 
 def overridden(folder: pathlib.Path, run: RunCfg) -> str:
     """What a run that goes on does otherwise than before, for people; empty if nothing."""
-    before = _rebuilt(folder)
+    before = _rebuilt(folder, trust=True)  # it has been asked for
     if before is None:
         return ""
     pairs = [(name, getattr(before, name), getattr(run, name)) for name in ("num_timesteps", *_FREE)]
     return ", ".join(f"{name} {new} in place of {old}" for name, old, new in pairs if old != new)
 
 
-def _rebuilt(folder: pathlib.Path) -> RunCfg | None:
-    """The run that ``config.json`` describes; None if it is one of a version that did not keep what it was made from."""
-    path = folder / CONFIG
+@dataclasses.dataclass(frozen=True)
+class _Stored:
+    """What ``config.json`` says, as far as a run is made of it once more."""
+
+    env_name: str
+    preset: str
+    learner: str
+    asked: Asked
+    env: Mapping[str, Any]
+    hyperparameters: Mapping[str, Any]
+    versions: Mapping[str, str]
+
+
+def _rebuilt(folder: pathlib.Path, trust: bool) -> RunCfg | None:
+    """The run that ``config.json`` describes; None if it is one of a version that did not keep what it was made from.
+
+    Raises:
+        UserError: see ``same_run``.
+    """
+    path = files.inside(folder, CONFIG)
+    found = files.read_json(path)
+    if isinstance(found, dict) and "asked" not in found:
+        return None
     try:
-        stored = json.loads(path.read_text())
-        if "asked" not in stored:
-            return None
-        asked, own = stored["asked"], {name: stored[name] for name in _OWN}
-        run = resolve(stored["env_name"], stored["preset"], asked["robot"], asked["env"], {}, learner=stored["learner"], **own)
-        run = dataclasses.replace(run, asked=dataclasses.replace(run.asked, learner=asked["learner"]))
-        fields = {"env": _as_stored(run.env, stored["env"])}
-        fields["hyperparameters"] = _as_stored(run.hyperparameters, stored["hyperparameters"])
+        named = {field.name for field in dataclasses.fields(_Stored)}
+        stored = values.read(_Stored, {k: v for k, v in found.items() if k in named}, "")
+        kinds = values.hints(RunCfg)
+        own = {name: values.read(kinds[name], found[name], name) for name in _OWN}
+    except (UserError, AttributeError, KeyError) as error:
+        why = error if isinstance(error, UserError) else "fields are missing"
+        raise UserError(
+            f"{path} is damaged ({why}): pass --restore with a checkpoint, all flags of the run and another --out"
+        ) from None
+    trust_of.ask(folder, _outside(stored.asked), trust)
+    try:
+        asked = stored.asked
+        run = resolve(stored.env_name, stored.preset, asked.robot, asked.env, {}, learner=stored.learner, **own)
+        run = dataclasses.replace(run, asked=dataclasses.replace(run.asked, learner=asked.learner))
+        fields = {"env": _as_stored(run.env, stored.env)}
+        fields["hyperparameters"] = _as_stored(run.hyperparameters, stored.hyperparameters)
         return dataclasses.replace(run, **fields)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
     except UserError as error:
-        version = stored["versions"].get("mjx-nero", "unknown")
+        version = values.short(stored.versions.get("mjx-nero", "unknown"))[1:-1]
         raise UserError(f"{path} is of a run of version {version}, which this version cannot go on with: {error}") from None
-    except (ValueError, TypeError, KeyError, AttributeError):
-        raise UserError(f"{path} is damaged: pass --restore with a checkpoint, all flags of the run and another --out") from None
+
+
+def _outside(asked: Asked) -> Iterator[str]:
+    """The files that a run names beside those of its folder."""
+    if asked.robot is not None and asked.robot not in registry.list_robots():
+        yield asked.robot
+    for name in _PATHS:
+        if asked.env.get(name):
+            yield str(asked.env[name])
 
 
 def _as_stored(cfg: Any, stored: Any) -> Any:
-    """The config with the numbers that a run was begun with, where this version has others."""
+    """The config with the numbers that a run was begun with, where this version has others; not which files it reads."""
     was = config.flatten(stored)
     now = config.flatten(config.to_dict(cfg))
-    return config.override(cfg, {name: was[name] for name in config.flatten(cfg) if was.get(name) != now.get(name)})
+    own = [name for name in config.flatten(cfg) if name in was and name not in _PATHS]
+    return config.override(cfg, {name: was[name] for name in own if was[name] != now.get(name)})
 
 
 def check(source: Source, meta: dict[str, Any]) -> None:

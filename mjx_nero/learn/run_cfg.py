@@ -3,11 +3,12 @@
 import dataclasses
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 
-from mjx_nero import config
+from mjx_nero import bounds, config
+from mjx_nero.bounds import Bounds, Count, NonNegative, OneOf, Seed, Whole
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
@@ -33,19 +34,22 @@ class RunCfg:
     learner: str = "ppo"
     asked: Asked = Asked()
     impl: str = "auto"
-    seed: int = 0
+    seed: Seed = 0
     out: pathlib.Path | None = None
     restore: pathlib.Path | None = None
-    eval_every: int = 0  # env steps; 0: twelve times a run
-    checkpoint_every: int = 0  # env steps; 0: five times a run
-    eval_episodes: int = 256
-    checkpoint_minutes: float = 10.0  # at most between checkpoints; 0: env steps alone decide
-    keep: int = 3  # checkpoints, the best apart
-    on_nan: str = "stop"  # or "rewind": once, to the last checkpoint, to learn more slowly from there
+    eval_every: Whole = 0  # env steps; 0: twelve times a run
+    checkpoint_every: Whole = 0  # env steps; 0: five times a run
+    eval_episodes: Annotated[int, Bounds(1, 100_000)] = 256
+    checkpoint_minutes: NonNegative = 10.0  # at most between checkpoints; 0: env steps alone decide
+    keep: Count = 3  # checkpoints, the best apart
+    on_nan: Annotated[str, OneOf("stop", "rewind")] = "stop"  # "rewind": once, to the last checkpoint, slower from there
     auto: bool = False  # go on if ``out`` holds a checkpoint, start if not
-    max_minutes: float = 0.0  # of training, compilation apart; 0: no limit
-    num_devices: int = 1  # GPUs to spread the environments over
+    max_minutes: NonNegative = 0.0  # of training, compilation apart; 0: no limit
+    num_devices: Annotated[int, Bounds(1, 4096)] = 1  # GPUs to spread the environments over
     track: str = ""  # who is told of the metrics beside the folder: "wandb"; empty: nobody
+
+    def __post_init__(self):
+        bounds.check(self)
 
     @property
     def num_envs(self) -> int:

@@ -6,6 +6,7 @@ import importlib.metadata as metadata
 import itertools
 import os
 import pathlib
+import re
 import shutil
 import sys
 import time
@@ -20,6 +21,9 @@ from mjx_nero.learn import machines
 
 CONFIG, SUMMARY = "config.json", "summary.json"
 _LOCK = ".lock"
+_WRITTEN = ("metrics.jsonl", "seeds.json", "policy.safetensors", "best.safetensors", "curve.png", "video.mp4")
+_FOLDERS = ("checkpoints", "tensorboard", "wandb")
+_RELINKED = re.compile(r"wandb/(latest-run|debug[\w-]*\.log)")  # links that wandb itself makes anew at every start
 _RUNS = pathlib.Path("runs")
 
 
@@ -42,6 +46,8 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
         yield path or _RUNS / name
         return
     made = path is None or not path.exists()
+    if not made:
+        check(pathlib.Path(path or ""))
     try:
         path = path or _new(name)
         path.mkdir(parents=True, exist_ok=True)
@@ -62,6 +68,23 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
                 path.rmdir()
                 if path.parent == _RUNS:
                     path.parent.rmdir()
+
+
+def check(folder: pathlib.Path) -> None:
+    """Nothing that a run reads or writes in its folder leads out of it: a stranger may have made the folder.
+
+    Raises:
+        UserError: a link, a pipe or a device stands in place of one of a run's files or folders.
+    """
+    for name in (_LOCK, CONFIG, SUMMARY, *_WRITTEN):
+        files.inside(folder, name)
+    for name in _FOLDERS:
+        path = files.inside(folder, name)
+        for entry in os.scandir(path) if path.is_dir() else ():
+            if not _RELINKED.fullmatch(f"{name}/{entry.name}"):
+                files.inside(folder, name, entry.name)
+    for part in folder.glob(f".*{files.PART}*"):
+        files.inside(folder, part.name)
 
 
 def begin(path: pathlib.Path, run: dict[str, Any]) -> None:
@@ -99,7 +122,7 @@ def _lock(folder: pathlib.Path) -> int:
     """A file that the system keeps locked for as long as this process lives."""
     path = folder / _LOCK
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -1,7 +1,6 @@
 """Several seeds, one after another in one process: one compiled program, and for each seed a run of its own."""
 
 import dataclasses
-import json
 import math
 import pathlib
 import statistics
@@ -10,7 +9,8 @@ from typing import Any
 
 from scipy import stats
 
-from mjx_nero import files
+from mjx_nero import files, values
+from mjx_nero.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
 from mjx_nero.learn import compiled, device_memory, machines, run_folder, stopping, training
 from mjx_nero.learn.loop import Diverged, Tally
@@ -19,6 +19,19 @@ from mjx_nero.learn.run_cfg import RunCfg, fit_machine
 
 SEEDS = "seeds.json"
 Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedRow:
+    """What ``seeds.json`` says of a seed."""
+
+    seed: Seed
+    success_rate: Share
+    success_rate_95: tuple[float, float] | None
+    seconds_to_95: NonNegative | None
+    env_steps: Whole
+    train_s: NonNegative
+    stopped: str
 
 
 def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple[list[Row], pathlib.Path, int]:
@@ -88,12 +101,13 @@ def _run(run: RunCfg, made: compiled.Compiled, meta: dict[str, Any], home: pathl
 
 def _earlier(path: pathlib.Path) -> list[Row]:
     """The rows of seeds that were trained in this folder before."""
-    try:
-        return json.loads(path.read_text())["rows"]
-    except FileNotFoundError:
+    if not path.exists():
         return []
-    except (ValueError, KeyError, TypeError):
+    try:
+        rows = values.read(tuple[SeedRow, ...], files.read_json(path)["rows"], "rows")
+    except (UserError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: move it away, or pass another --out") from None
+    return [dataclasses.asdict(row) for row in rows]
 
 
 def summary(rows: list[Row]) -> Row:

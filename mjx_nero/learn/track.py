@@ -3,11 +3,12 @@
 import importlib.util
 import os
 import pathlib
+import re
 import uuid
 from collections.abc import Callable
 from typing import Any
 
-from mjx_nero import config
+from mjx_nero import config, files
 from mjx_nero.errors import UserError
 from mjx_nero.learn.logs import Row, Tracker
 from mjx_nero.learn.run_cfg import RunCfg
@@ -23,15 +24,16 @@ class Wandb:
     def __init__(self, run: RunCfg, folder: pathlib.Path):
         import wandb
 
-        files = folder / "wandb"
-        files.mkdir(exist_ok=True)
-        own = files / "id"
+        own = files.inside(folder, "wandb", "id")
         if not own.exists():
-            own.write_text(uuid.uuid4().hex)
+            files.write(own, uuid.uuid4().hex.encode())
+        name = files.read_bytes(own, 100).decode(errors="replace")
+        if not re.fullmatch("[0-9a-f]{32}", name):
+            raise UserError(f"{own} does not hold the id of a run: remove it")
         self._run: Any = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx_nero"),
             name=folder.name,
-            id=own.read_text(),
+            id=name,
             dir=folder,
             config=config.to_dict(run),
             resume="allow",

@@ -3,17 +3,17 @@
 import dataclasses
 import functools
 import importlib
-import json
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 
-from mjx_nero import config, console, files
+from mjx_nero import config, console, files, values
+from mjx_nero.bounds import Share
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
-from mjx_nero.learn import compiled, device_memory, header, machines, policy, resume, rollout, run_folder, stopping, track
+from mjx_nero.learn import compiled, device_memory, header, machines, policy, resume, rollout, run_folder, stopping, track, trust
 from mjx_nero.learn.checkpoints import Checkpoints, NotWritten, saved
 from mjx_nero.learn.compiled import Compiled
 from mjx_nero.learn.learner import Learner
@@ -59,7 +59,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
                 raise UserError(f"{folder} {over}")
             say(f"{folder} {over}: nothing is left to do")
             if (folder / run_folder.SUMMARY).exists():
-                return {**json.loads((folder / run_folder.SUMMARY).read_text()), "folder": str(folder), "code": 0}
+                return {**_summary(folder), "folder": str(folder), "code": 0}
             return _finish(run, learner, tally, Ended("finished", 0, {}), folder)
         if note:
             say(note)
@@ -67,6 +67,25 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             say(f"{folder} goes on with {changes}")
         made = prepare(run, learner, lambda: resume.state(source, learner, run.seed), folder)
         return carry_out(run, made, tally, meta, folder, command)
+
+
+def _summary(folder: pathlib.Path) -> dict[str, Any]:
+    """What a run that has ended came to.
+
+    Raises:
+        UserError: its file is damaged.
+    """
+    path = files.inside(folder, run_folder.SUMMARY)
+    found = files.read_json(path)
+    kinds = {"env_steps": int, "train_s": float, "steps_per_s": float, "nan_count": int, "overflow_count": int}
+    try:
+        for name, kind in kinds.items():
+            values.read(kind, found[name], name)
+        values.read(Share, found["evaluation"]["success_rate"], "evaluation.success_rate")
+        values.read(Mapping[str, int], found["lost"], "lost")
+    except (UserError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged ({error}): remove it") from None
+    return found
 
 
 def speaker() -> Callable[[str], None]:
@@ -108,6 +127,7 @@ def carry_out(
     tally.steps = int(made.state.iteration) * made.learner.steps_per_iteration
     if machines.first():
         run_folder.begin(folder, config.to_dict(run))
+        trust.mark(folder)
     go_on = f"go on with: {command} --restore {folder}"
     try:
         ended = _loop(run, made, tally, meta, folder)

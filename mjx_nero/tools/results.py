@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import gc
-import json
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
@@ -80,9 +79,9 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
     if not path.exists():
         return {}
     try:
-        held = json.loads(path.read_text())
+        held = files.read_json(path)
         list(rows(held))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (UserError, ValueError, TypeError, KeyError, AttributeError):
         raise UserError(f"{path} holds no results: name another file") from None
     return held
 

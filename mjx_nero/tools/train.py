@@ -44,6 +44,9 @@ def _parser() -> cli.Parser:
     parser.add_impl()
     parser.add_argument("--out", type=cli.path(), help="run folder (default: runs/<env>_<time>)")
     parser.add_argument("--restore", type=cli.path(), help="run folder or checkpoint to go on from, or a policy to start from")
+    parser.add_argument(
+        "--trust", action="store_true", help="read files that the config of --restore names outside of that folder"
+    )
     parser.add_argument("--resume", choices=("auto",), help="go on with the run in --out, or start it if there is none yet")
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 12 a run)")
     parser.add_argument(

@@ -49,7 +49,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         num_devices=args.num_devices,
         track=args.track,
     )
-    run = going_on(run, flags, dotted)
+    run = going_on(run, flags, dotted, args.trust)
     cli.setup_jax()
     machines.join()
     if "num_devices" not in flags and machines.several():
@@ -70,7 +70,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         sys.exit(summary["code"])
 
 
-def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]]) -> RunCfg:
+def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]], trust: bool = False) -> RunCfg:
     """The run itself, or that of the folder which it is to go on with.
 
     Raises:
@@ -83,7 +83,7 @@ def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[s
         folder = run.out if saved(run.out) else None
     if folder is None or not (folder / CONFIG).is_file() or run.out not in (None, folder):
         return run
-    return dataclasses.replace(resume.same_run(folder, run, flags, dotted), auto=run.auto)
+    return dataclasses.replace(resume.same_run(folder, run, flags, dotted, trust), auto=run.auto)
 
 
 def report(summary: dict[str, Any], films: bool) -> None:

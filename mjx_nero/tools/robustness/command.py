@@ -1,7 +1,6 @@
 """The command ``robustness``."""
 
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Sequence
@@ -112,9 +111,8 @@ def read(path: pathlib.Path) -> dict[str, Any]:
     Raises:
         UserError: it holds none, or cannot be read.
     """
-    content = files.read_bytes(path, _LARGEST)
+    found = files.read_json(path, _LARGEST)
     try:
-        found = json.loads(content)
         return {
             **{name: str(found[name]) for name in ("env", "preset", "version")},
             "curves": {
@@ -125,7 +123,7 @@ def read(path: pathlib.Path) -> dict[str, Any]:
                 for name, curve in found["curves"].items()
             },
         }
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         raise UserError(f"{path} holds no figures of robustness: make them by --json") from None
 
 

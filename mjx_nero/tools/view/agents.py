@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from flax import struct
 
-from mjx_nero import control
+from mjx_nero import control, files
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import checkpoint, header, policy, rollout
+from mjx_nero.learn.checkpoints import POLICY, saved
 from mjx_nero.types import UserError
 
 SLIDERS = "joint sliders"
@@ -27,11 +28,11 @@ class _Trained:
     params: object
 
 
-def known(env: ManipulationEnv, env_name: str, files: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
+def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
     """Name -> how to make it: policy files and the policy that ships, controllers, sliders, and who knows nothing."""
     found: dict[str, Make] = {}
     shipped = policy.shipped(env_name, preset)
-    for path in [*files, *([shipped] if shipped.is_file() else [])]:
+    for path in [*policies, *([shipped] if shipped.is_file() else [])]:
         name = f"policy {path.stem}" if path == shipped else f"policy {path}"
         found[name] = lambda path=path: of_policy(load(env, env_name, path))  # type: ignore[misc]
     able: dict[str, Mapping[str, Any]] = dict(env.cfg.controllers)
@@ -107,5 +108,6 @@ def _always(draw: Callable) -> rollout.Agent:
 
 def newest(run: pathlib.Path) -> pathlib.Path | None:
     """The last policy or checkpoint that a training has written into its folder."""
-    files = [*run.glob("policy.safetensors"), *run.glob("checkpoints/*.safetensors")]
-    return max(files, key=lambda path: (path.stat().st_mtime, path.name), default=None)
+    last = files.inside(run, POLICY)
+    found = [*([last] if last.is_file() else []), *saved(run)]
+    return max(found, key=lambda path: (path.stat().st_mtime, path.name), default=None)

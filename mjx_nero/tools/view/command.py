@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import io
-import json
 import pathlib
 import threading
 from collections.abc import Mapping, Sequence
@@ -11,10 +10,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_nero import cli, config
+from mjx_nero import cli, config, files, values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
+from mjx_nero.learn.run_folder import CONFIG
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
 
@@ -183,7 +183,9 @@ def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
 
 
 def _described(run: pathlib.Path) -> dict[str, Any]:
-    try:
-        return json.loads((run / "config.json").read_text())
-    except (OSError, ValueError):
-        raise UserError(f"{run} is not the folder of a training: give what train.py wrote to (--out)") from None
+    path = files.inside(run, CONFIG)
+    if not path.exists():
+        raise UserError(f"{run} is not the folder of a training: give what train.py wrote to (--out)")
+    found = files.read_json(path)
+    names = {key: found[key] for key in ("env_name", "preset") if key in found} if isinstance(found, dict) else None
+    return values.read(Mapping[str, str], names, f"{path}:")

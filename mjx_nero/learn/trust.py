@@ -1,0 +1,51 @@
+"""Whose a run is: the config of a stranger's run may name any file, and reading it is asked for once.
+
+A run that this user began here, or has trusted once, is marked in the user's cache folder by the fingerprint of its config.
+"""
+
+import contextlib
+import hashlib
+import pathlib
+from collections.abc import Iterable
+
+from mjx_nero import cache, files
+from mjx_nero.errors import UserError
+from mjx_nero.learn.run_folder import CONFIG
+
+
+def mark(folder: pathlib.Path) -> None:
+    """The run of a folder is the user's, as its config stands now. Without a cache folder nothing is kept."""
+    place = _place(folder)
+    if place is not None:
+        with contextlib.suppress(UserError):
+            files.write(place, b"")
+
+
+def ask(folder: pathlib.Path, named: Iterable[str], trust: bool) -> None:
+    """May the files that a run's config names be read?
+
+    Args:
+        named: their paths.
+        trust: the user says so.
+
+    Raises:
+        UserError: the run is not known as the user's own.
+    """
+    named = list(named)
+    if not named:
+        return
+    if trust:
+        mark(folder)
+        return
+    place = _place(folder)
+    if place is None or not place.is_file():
+        raise UserError(
+            f"{folder / CONFIG} names {named[0]!r}, outside of the run, and this user has not begun it here: "
+            "pass --trust if you know who made the run"
+        )
+
+
+def _place(folder: pathlib.Path) -> pathlib.Path | None:
+    cached = cache.folder()
+    content = files.read_bytes(files.inside(folder, CONFIG), files.MAX_JSON)
+    return cached / "runs" / hashlib.sha256(content).hexdigest() if cached else None
