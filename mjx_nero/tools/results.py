@@ -29,8 +29,8 @@ Success of the bundled policies, and what training took, one table a task. This 
 ```
 python -m mjx_nero results --json docs/{json} --markdown docs/{page} --what none
 ```
-Without `--what none` the command first measures everything that the machine can, which takes hours on a GPU; `--what policies --envs
-nero_lift` measures one environment's policy. Times count only if the program is alone on the GPU.
+Without `--what none` the command first measures everything that the machine can, which takes hours on a GPU; `--what policies
+--envs nero_lift` measures one environment's policy. Times count only if the program is alone on the GPU.
 
 - **policy**: success rate of the bundled policy, with its 95% Wilson interval.
 - **seeds**: how many seeds of the default training reached the target; **seconds** (with evaluations, without compilation) and
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_load()
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="the figures; what it holds already is kept")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write a page with a table a task of all that the JSON file holds")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write all that the JSON file holds as a page, a table a task")
     parser.add_argument(
         "--what", help=f"list of {', '.join(WHATS)}; none: only the table (default: all)", default=",".join(WHATS)
     )
