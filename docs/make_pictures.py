@@ -27,7 +27,7 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
     "thousand": (1000, (640, 360), 5, 45),
 }
 
-FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/results.md
+FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
 def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:

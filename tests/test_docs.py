@@ -21,7 +21,8 @@ from mjx_nero.sim import robot_file
 
 ROOT = pathlib.Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted(DOCS.glob("*.md"))]
+WRITTEN = sorted(page for page in DOCS.rglob("*.md") if "generated" not in page.parts)
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *WRITTEN]
 README = (ROOT / "README.md").read_text()
 # Pages with Python, and who runs it. CONTRIBUTING's is parts of files; performance.md's measured a GPU of its time.
 RUN = {
@@ -44,18 +45,18 @@ def commands(text: str) -> list[list[str]]:
     return [words for words in found if words[1] in ("train.py", "eval.py") or words[2:3] == ["mjx_nero"] and words[3:]]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files(page):
     links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
     assert not [link for link in links if "://" not in link and not (page.parent / link).exists()]
 
 
-def test_the_readme_is_short_and_shows_one_lift_and_a_thousand():
-    assert len(README.splitlines()) <= 110
+def test_the_readme_is_a_page_and_shows_one_lift_and_a_thousand():
+    assert len(README.splitlines()) <= 80
     assert re.findall(r"!\[.+\]\((docs/\w+\.webp)\)", README) == ["docs/lift.webp", "docs/thousand.webp"]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_and_their_flags_exist(page, monkeypatch):
     """Every flag is one of the command's own, or a dotted one."""
 
@@ -82,11 +83,13 @@ def test_commands_and_their_flags_exist(page, monkeypatch):
         assert not [flag for flag in wrong if flag != "--help"], words
 
 
-def test_the_readmes_commands_leave_a_clone_clean():
-    """What they write in the root folder is ignored there."""
+def test_the_first_commands_leave_a_clone_clean():
+    """What those of the README and of the pages to start with write in the root folder is ignored there."""
     ignored = [line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines() if line and not line.startswith("#")]
     outputs = ("--video", "--json", "--out", "--render", "--plot")
-    written = [word for words in commands(README) for flag, word in zip(words, words[1:], strict=False) if flag in outputs]
+    first = [README, *(page.read_text() for page in (DOCS / "start").glob("*.md") if page.stem != "gallery")]
+    found = [words for text in first for words in commands(text)]
+    written = [word for words in found for flag, word in zip(words, words[1:], strict=False) if flag in outputs]
     assert len(written) >= 9
     assert not [name for name in written if not any(fnmatch.fnmatch(pathlib.Path(name).parts[0], rule) for rule in ignored)]
 
@@ -127,28 +130,35 @@ def test_every_page_with_python_has_a_test_that_runs_it():
 
 
 def test_adding_an_arm_shows_the_module():
-    (snippet,) = re.findall(r"^```python\n(.*?)^```", (DOCS / "adding_an_arm.md").read_text(), re.MULTILINE | re.DOTALL)
+    page = (DOCS / "guides" / "adding_an_arm.md").read_text()
+    (snippet,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     module = (ROOT / "mjx_nero" / "envs" / "arms" / "so_arm101.py").read_text()
     shown, there = ([line for line in re.sub(r" *#.*", "", text).splitlines() if line] for text in (snippet, module))
     assert there[-len(shown) :] == shown
 
 
 def test_every_page_is_in_the_site():
-    listed = set(re.findall(r"^(\w+)$", (DOCS / "index.md").read_text(), re.MULTILINE))
-    assert {page.stem for page in DOCS.glob("*.md")} == listed | {"index"}
+    """All but the laboratory's are in its table of contents."""
+    listed = set(re.findall(r"^([\w/]+)$", (DOCS / "index.md").read_text(), re.MULTILINE))
+    pages = {page.relative_to(DOCS).with_suffix("").as_posix() for page in WRITTEN}
+    kept = {page for page in pages if page.startswith("lab/")}
+    assert {page for page in listed if not page.startswith("generated/")} == pages - kept - {"index"}
+    index = (DOCS / "lab" / "index.md").read_text()
+    assert all(f"({page.removeprefix('lab/')}.md)" in index for page in kept - {"lab/index"})
 
 
 def test_the_gallery_has_every_environment():
-    rows = re.findall(r"^\| !\[(\w+)\]\((\S+)\) .*`python eval.py --env (\w+) ", (DOCS / "gallery.md").read_text(), re.MULTILINE)
+    page = DOCS / "start" / "gallery.md"
+    rows = re.findall(r"^\| !\[(\w+)\]\((\S+)\) .*`python eval.py --env (\w+) ", page.read_text(), re.MULTILINE)
     assert {name for name, _, _ in rows} == {env for env in mjx_nero.list_envs() if registry.robot_of(env)}
     for name, picture, played in rows:
-        assert played == name and (DOCS / picture).stat().st_size < 80_000
-        with Image.open(DOCS / picture) as moving:
+        assert played == name and (page.parent / picture).stat().st_size < 80_000
+        with Image.open(page.parent / picture) as moving:
             assert moving.n_frames > 10  # the format joins those that are alike
 
 
 def test_the_file_formats_are_those_that_are_read():
-    page = (DOCS / "files.md").read_text()
+    page = (DOCS / "reference" / "files.md").read_text()
     for title, fields in (("robot.yaml", {*robot_file._PLAIN, "arm", "gripper"}), ("policy.safetensors", set(header._FIELDS))):
         section = page.split(f"## {title}")[1].split("\n## ")[0]
         named = {name for row in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
@@ -178,10 +188,11 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     site = tmp_path / "site"
     assert "Ctrl-C saves and says how to go on" in (site / "index.html").read_text()
+    assert "lab/learning.html" not in (site / "guides" / "runs.html").read_text()  # out of the table of contents
     reference = (site / "generated" / "commands.html").read_text()
     assert all(f'id="{name}"' in reference for name in COMMANDS) and "--num-timesteps" in reference
     assert "actions.arm.params.ahead" in (site / "generated" / "config.html").read_text()
-    assert "object_ee_distance" in (site / "python.html").read_text()
+    assert "object_ee_distance" in (site / "reference" / "python.html").read_text()
     assert "cell_type" not in (site / "generated" / "01_nero_lift.html").read_text()
 
 

@@ -15,7 +15,7 @@ from mjx_nero.sim import physics
 from mjx_nero.sim.physics import Footprint
 from mjx_nero.types import Sim
 
-PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "your_own_task.md"
+PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "guides" / "your_own_task.md"
 EXAMPLE = re.search(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL).group(1)
 
 

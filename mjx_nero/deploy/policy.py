@@ -17,7 +17,7 @@ class Policy:
         path: of the file.
 
     Attributes:
-        metadata: what the file says: see ``docs/deploy_onnx.md``.
+        metadata: what the file says: see ``docs/guides/deploy_onnx.md``.
         names: of the observations that ``act`` takes.
     """
 

@@ -478,7 +478,7 @@ class Chain:
         return after, jnp.concatenate(list(act.targets.values()))
 
     def describe(self) -> list[Description]:
-        """How the action becomes position targets of the drives, as JSON: see ``docs/deploy_onnx.md``.
+        """How the action becomes position targets of the drives, as JSON: see ``docs/guides/deploy_onnx.md``.
 
         Raises:
             UserError: a term that only this package knows.

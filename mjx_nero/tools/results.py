@@ -1,4 +1,4 @@
-"""The table of results, made by one command for all environments: python -m mjx_nero results --json results.json. See --help."""
+"""The tables of results, made by one command for all environments: python -m mjx_nero results --json results.json. See --help."""
 
 import argparse
 import dataclasses
@@ -17,10 +17,24 @@ from mjx_nero.sim.physics import warp_available
 from mjx_nero.tools.benchmark import learning, machine
 
 Row = dict[str, Any]
-WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the policies that ship"}
+WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
 TARGETS = {"lift": 0.95, "reach": 0.98}  # success that a seed is trained to
 EVALUATIONS = 48  # of a seed, if it needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
+_PAGE = """# Benchmarks
+
+Success of the bundled policies, and what training took, one table a task. This page is written by one command from the figures in
+[{json}]({json}), and by nothing else:
+```
+python -m mjx_nero results --json docs/{json} --markdown docs/{page} --what none
+```
+Without `--what none` the command first measures everything that the machine can, which takes hours on a GPU; `--what policies
+--envs nero_lift` measures one environment's policy. Times count only if the program is alone on the GPU.
+
+- **policy**: success rate of the bundled policy, with its 95% Wilson interval.
+- **seeds**: how many seeds of the default training reached the target; **seconds** (with evaluations, without compilation) and
+  **env steps** until they did. A column is missing where nothing of it has been measured yet.
+"""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -28,12 +42,12 @@ def main(argv: Sequence[str]) -> None:
     lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
     parser = cli.Parser(
         prog=cli.called_as("results"),
-        description="Measures how every environment learns and what the policies that ship achieve, and makes the table of it.",
+        description="Measures how every environment learns and what the bundled policies achieve, and writes the tables.",
         epilog=f"what can be measured:\n{lines}",
     )
     parser.add_load()
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="the figures; what it holds already is kept")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write the table of all that the JSON file holds")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write all that the JSON file holds as a page, a table a task")
     parser.add_argument(
         "--what", help=f"list of {', '.join(WHATS)}; none: only the table (default: all)", default=",".join(WHATS)
     )
@@ -61,7 +75,7 @@ def main(argv: Sequence[str]) -> None:
     console.screen().print(table)
     if args.markdown:
         with files.whole(args.markdown) as part:
-            part.write_text(markdown(cells))
+            part.write_text(page(cells, args.json.name, args.markdown.name))
 
 
 def learnable() -> list[str]:
@@ -95,7 +109,7 @@ def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """The policy that ships, in MuJoCo's C library and, where there is a GPU, on Warp."""
+    """The bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
     if not policy.shipped(env).exists():
         return
     backends = {"native": "mujoco"} | ({"warp": "mjx"} if warp_available() else {})
@@ -121,10 +135,26 @@ def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
         yield (env, *spread, _success(native), _success(warp), "; ".join(of))
 
 
-def markdown(cells: Sequence[tuple[str, ...]]) -> str:
-    """The table as Markdown."""
-    lines = [_COLUMNS, tuple("---" for _ in _COLUMNS), *cells]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+def page(cells: Sequence[tuple[str, ...]], json_name: str, page_name: str) -> str:
+    """A page of Markdown: what the columns mean, then a table a task."""
+    tasks: dict[str, list[tuple[str, ...]]] = {}
+    for line in cells:
+        tasks.setdefault(task_of(line[0]), []).append(line)
+    parts = [f"\n## {task}\n{_table(lines)}" for task, lines in tasks.items()]
+    return _PAGE.format(json=json_name, page=page_name) + "".join(parts)
+
+
+def task_of(env: str) -> str:
+    """The task's name: an environment's name without the arm's, as ``nero_lift_obstacles`` is ``lift_obstacles``."""
+    names = [name for name in registry.list_envs() if registry.robot_of(name) is None and env.endswith(f"_{name}")]
+    return max(names, key=len, default=env)
+
+
+def _table(lines: Sequence[tuple[str, ...]]) -> str:
+    """Without the columns in which nothing stands."""
+    shown = [i for i in range(len(_COLUMNS)) if any(line[i] for line in lines)]
+    rows = [_COLUMNS, ("---",) * len(_COLUMNS), *lines]
+    return "".join(f"| {' | '.join(row[i] for i in shown)} |\n" for row in rows)
 
 
 def _seeds(row: Row) -> str:

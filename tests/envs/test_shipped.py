@@ -1,4 +1,4 @@
-"""The policies that ship, in MuJoCo's C library. Figures over 1,000 episodes: docs/results.md."""
+"""The policies that ship, in MuJoCo's C library. Figures over 1,000 episodes: docs/benchmarks.md."""
 
 import pytest
 

@@ -178,7 +178,7 @@ def test_frames(reach):
 
 @pytest.mark.slow
 def test_the_pages_snippets_run():
-    page = (pathlib.Path(__file__).resolve().parents[2] / "docs" / "gymnasium.md").read_text()
+    page = (pathlib.Path(__file__).resolve().parents[2] / "docs" / "guides" / "gymnasium.md").read_text()
     names = {}
     for snippet in re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
         exec(snippet, names)

@@ -23,7 +23,7 @@ from mjx_nero.mdp import actions
 from mjx_nero.mdp.terms import Term
 from mjx_nero.types import UserError
 
-PAGE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "deploy_onnx.md"
+PAGE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "guides" / "deploy_onnx.md"
 # What a robot's computer has not: the program fails if it imports any of these.
 ABSENT = ("jax", "brax", "flax", "mujoco", "onnx", "yaml", "lxml")
 

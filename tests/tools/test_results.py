@@ -1,9 +1,11 @@
 """The table of results: what is measured is kept, and shown as it was measured."""
 
 import json
+import pathlib
 
 import pytest
 
+from mjx_nero.envs import registry
 from mjx_nero.tools import results
 
 LEARNT = {"target": 0.95, "seeds": 8, "reached": 7, "seconds_median": 10.04, "seconds_worst": None}
@@ -21,9 +23,32 @@ def test_cells():
     ]
 
 
-def test_markdown():
-    lines = results.markdown([("a",) * 8]).splitlines()
-    assert len(lines) == 3 and all(line.count("|") == 9 for line in lines)
+def test_the_page_has_a_table_for_each_task():
+    """Arms of one task share a table, in which no column is empty; a task may have its name in that of another."""
+    cells = [("nero_lift", "95%", "8 of 8", "", "", "99%", "", "9.9"), ("nero_lift_obstacles", *[""] * 4, "97%", "", "9.9")]
+    page = results.page([*cells, ("so101_lift", *[""] * 4, "98%", "", "9.9")], "r.json", "r.md")
+    lift, obstacles = page.split("\n## ")[1:]
+    assert lift.splitlines() == [
+        "lift",
+        "| environment | target | seeds | policy in MuJoCo C | measured with |",
+        "| --- | --- | --- | --- | --- |",
+        "| nero_lift | 95% | 8 of 8 | 99% | 9.9 |",
+        "| so101_lift |  |  | 98% | 9.9 |",
+    ]
+    assert obstacles.splitlines()[0] == "lift_obstacles" and obstacles.splitlines()[3] == "| nero_lift_obstacles | 97% | 9.9 |"
+    assert "--json docs/r.json --markdown docs/r.md" in page
+
+
+def test_every_environment_has_a_task():
+    """Those that are to be learnt belong to tasks of any robot."""
+    assert {results.task_of(name) for name in results.learnable()} <= set(registry.list_envs())
+    assert results.task_of("drag") == "drag"  # a guest's
+
+
+def test_the_page_of_the_documentation_is_what_its_figures_give():
+    docs = pathlib.Path(__file__).parents[2] / "docs"
+    cells = list(results.rows(results.read(docs / "benchmarks.json")))
+    assert (docs / "benchmarks.md").read_text() == results.page(cells, "benchmarks.json", "benchmarks.md")
 
 
 def test_environments_to_learn():

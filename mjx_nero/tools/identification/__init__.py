@@ -1,6 +1,6 @@
 """What a real arm's drives are, from a log of what they were told and where they went.
 
-``record`` writes such a log of the simulated arm, ``identify`` fits the drives to one (docs/identification.md).
+``record`` writes such a log of the simulated arm, ``identify`` fits the drives to one (docs/guides/identification.md).
 """
 
 from mjx_nero.tools.identification.command import identify_main, record_main

@@ -22,7 +22,7 @@ def record_main(argv: Sequence[str]) -> None:
     )
     _add_robot(parser)
     parser.add_argument(
-        "--out", type=cli.path(".csv"), required=True, help="the log: a table with commas (docs/identification.md)"
+        "--out", type=cli.path(".csv"), required=True, help="the log: a table with commas (docs/guides/identification.md)"
     )
     about = config.describe(RecordCfg())
     for field in dataclasses.fields(RecordCfg):
@@ -46,7 +46,7 @@ def identify_main(argv: Sequence[str]) -> None:
         prog=cli.called_as("identify"),
         description="Fits gains, armature, friction, delay and encoder offsets of an arm's drives to a log.",
     )
-    parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/identification.md)")
+    parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/guides/identification.md)")
     _add_robot(parser)
     parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML for make(identified=...) and --env.identified")
     parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of what remains unexplained")
