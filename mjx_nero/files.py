@@ -103,14 +103,8 @@ def read_yaml(path: pathlib.Path, loader: type["YamlLoader"] | None = None) -> A
     content = read_bytes(path, MAX_YAML)
     try:
         return (loader or YamlLoader)(content).get_single_data()
-    except (
-        yaml.YAMLError,
-        ValueError,
-        LookupError,
-        TypeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:  # constructors fail in their own ways
+    # Constructors fail in their own ways.
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         what = " ".join((getattr(error, "problem", None) or str(error)).split())[:160]

@@ -134,9 +134,7 @@ class SimCfg:
     dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
     decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps a control step
     iterations: Iterations = 10  # of the constraint solver, at most
-    ls_iterations: Iterations = (
-        50  # of its line search, at most (MJX-JAX 20); cut at 20, MuJoCo's C library throws a cube at times
-    )
+    ls_iterations: Iterations = 50  # of its line search, at most (MJX-JAX 20); at 20, MuJoCo's C library throws a cube at times
     impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
     elliptic: bool = True  # friction cones; else pyramids
     contacts_per_env: Slots = 24  # Warp: contact slots, times the number of environments
