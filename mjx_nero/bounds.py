@@ -23,8 +23,13 @@ class Bounds:
         """What is wrong with a value; empty if nothing is."""
         if self.low < value <= self.high or value == self.low and not self.above:
             return ""
-        low = f"above {self.low:g}" if self.above else f"at least {self.low:g}"
-        return f"must be {low}" + (f" and at most {self.high:g}" if self.high < math.inf else "")
+        low = f"above {_text(self.low)}" if self.above else f"at least {_text(self.low)}"
+        return f"must be {low}" + (f" and at most {_text(self.high)}" if self.high < math.inf else "")
+
+
+def _text(bound: float) -> str:
+    """A bound for a message: whole numbers in full."""
+    return f"{bound}" if isinstance(bound, int) else f"{bound:g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +65,12 @@ Range = Annotated[tuple[float, float], Ascending()]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]
 Counts = Annotated[tuple[Count, Count], Ascending()]  # a range of whole numbers from 1 on
-Steps = Annotated[tuple[Annotated[int, Bounds(0)], Annotated[int, Bounds(0)]], Ascending()]  # a range of whole steps
+LATEST = 256  # control steps that a delay or a history may hold: buffers of every environment are that long
+Step = Annotated[int, Bounds(0, LATEST)]
+Steps = Annotated[tuple[Step, Step], Ascending()]  # a range of whole steps
+Past = Annotated[int, Bounds(1, LATEST)]  # so many last values
+Worlds = Annotated[int, Bounds(1, 2**20)]  # environments stepped together
+Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # all that JAX's generators take: beyond, seeds would repeat
 
 
 def check(value: Any, hint: Any = Any, name: str = "") -> None:

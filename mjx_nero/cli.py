@@ -239,7 +239,7 @@ positive = number(bounds.Count)  # a whole number from 1; 1e6 is one, 1_000 is n
 positive_float = number(bounds.Positive)
 non_negative = number(bounds.NonNegative)
 share = number(Annotated[float, bounds.Bounds(0.0, 1.0, above=True)])
-seed = number(Annotated[int, bounds.Bounds(0)])  # below 2^63, like every whole number
+seed = number(bounds.Seed)
 
 
 def choices(text: str, what: str, valid: Collection[str]) -> list[str]:

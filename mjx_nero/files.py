@@ -175,7 +175,8 @@ def read_yaml(path: pathlib.Path, loader: type["YamlLoader"] | None = None) -> A
     content = read_bytes(path, MAX_YAML)
     try:
         return (loader or YamlLoader)(content).get_single_data()
-    except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:  # constructors fail in their own ways
+    # Constructors fail in their own ways.
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         what = " ".join((getattr(error, "problem", None) or str(error)).split())[:160]
@@ -220,6 +221,15 @@ class YamlLoader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem="a whole number of more than 64 bits", problem_mark=node.start_mark)
         return value
 
+    def real(self, node: Any) -> float:
+        try:
+            value = self.construct_yaml_float(node) if len(node.value) < 100 else math.nan
+        except OverflowError:
+            value = math.nan
+        if math.isnan(value) and node.value.lower() != ".nan":
+            raise yaml.MarkedYAMLError(problem="a number too long or too large to read", problem_mark=node.start_mark)
+        return value
+
     def refuse(self, node: Any) -> Any:
         raise yaml.MarkedYAMLError(problem=f"the tag {node.tag[:60]!r} is not read", problem_mark=node.start_mark)
 
@@ -234,7 +244,7 @@ YamlLoader.yaml_constructors = {
         "null": YamlLoader.construct_yaml_null,
         "bool": YamlLoader.construct_yaml_bool,
         "int": YamlLoader.integer,
-        "float": YamlLoader.construct_yaml_float,
+        "float": YamlLoader.real,
         "str": YamlLoader.construct_yaml_str,
         "seq": lambda loader, node: loader.construct_sequence(node, deep=True),
         "map": YamlLoader.mapping,

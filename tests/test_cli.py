@@ -25,7 +25,7 @@ ROOT = pathlib.Path(__file__).parents[1]
         (cli.positive, "1e6", 1_000_000),
         (cli.positive, "8000000000", 8_000_000_000),
         (cli.seed, "0", 0),
-        (cli.seed, "999999999999999999", 999_999_999_999_999_999),
+        (cli.seed, "4294967295", 2**32 - 1),
         (cli.positive_float, ".5", 0.5),
         (cli.non_negative, "0", 0.0),
         (cli.share, "1", 1.0),
@@ -47,7 +47,8 @@ def test_numbers_of_flags(kind, text, value):
         (cli.positive, "1e999", "takes a whole number, got '1e999'"),
         (cli.positive, "9" * 400, "takes a whole number, got '9{20,30}\\.\\.\\.9{20,30}'"),
         (cli.positive, "", "takes a whole number, got ''"),
-        (cli.seed, "-1", "must be at least 0, got '-1'"),
+        (cli.seed, "4294967296", "must be at least 0 and at most 4294967295, got '4294967296'"),
+        (cli.seed, "-1", "must be at least 0 and at most 4294967295, got '-1'"),
         (cli.seed, "18446744073709551616", "takes a whole number, got '18446744073709551616'"),
         (cli.non_negative, "nan", "takes a finite number, got 'nan'"),
         (cli.non_negative, "-0.1", "must be at least 0, got '-0.1'"),
@@ -72,7 +73,7 @@ def test_a_flag_and_its_fault_read_as_one_sentence():
     parser.add_argument("--seed", type=cli.seed)
     with pytest.raises(mjx_nero.UserError, match=r"^--seed takes a whole number, got '1e99' \(see --help\)$"):
         parser.parse(["--seed", "1e99"])
-    with pytest.raises(mjx_nero.UserError, match=r"^--seed must be at least 0, got '-1' \(see --help\)$"):
+    with pytest.raises(mjx_nero.UserError, match=r"^--seed must be at least 0 and at most 4294967295, got '-1' \(see --help\)$"):
         parser.parse(["--seed=-1"])
 
 

@@ -7,6 +7,16 @@ import pytest
 from mjx_nero import UserError, files
 
 
+@pytest.mark.parametrize("text", ["1:" * 30_000 + "0.5", "1:" * 30_000 + "1", "1" * 400 + ".0", ":".join(["59"] * 40) + ".5"])
+def test_a_yaml_number_beyond_reading_is_one_line_or_a_finite_number(tmp_path, text):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"a: {text}")
+    try:
+        assert abs(files.read_yaml(path)["a"]) < 1e300
+    except UserError as error:
+        assert str(error).startswith(f"{path} is not YAML in line 1: a ")
+
+
 def test_read_bytes(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"12345")

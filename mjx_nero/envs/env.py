@@ -18,6 +18,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float
 
+from mjx_nero import bounds, values
 from mjx_nero.envs import identified
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
@@ -31,6 +32,7 @@ from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
 from mjx_nero.types import LEVEL, TARGET, Carry, Key, ObjectLook, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
+_LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key: what draws apart changes no other draw.
 _FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E
 
@@ -68,8 +70,12 @@ class ManipulationEnv(Env):
 
     def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
         cfg = identified.applied(cfg)
-        self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), num_envs
+        self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), values.read(bounds.Worlds, num_envs, "num_envs")
         self.dt = cfg.sim.dt * cfg.sim.decimation
+        if cfg.episode_length_s / self.dt > _LONGEST:
+            raise UserError(
+                f"episode_length_s is at most {_LONGEST:,} control steps of {self.dt:g} s, got {cfg.episode_length_s:g} s"
+            )
         self.episode_length = round(cfg.episode_length_s / self.dt)
         if not self.episode_length:
             raise UserError(f"episode_length_s must be a control step ({self.dt:g} s) or more, got {cfg.episode_length_s:g}")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero import files, values
-from mjx_nero.bounds import Positive
+from mjx_nero.bounds import LATEST, Positive
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.mdp.terms import Term
@@ -105,6 +105,10 @@ def _late(cfg: EnvCfg, delay: Numbers) -> dict[str, Term]:
     dt, terms = cfg.sim.dt * cfg.sim.decimation, dict(cfg.actions)
     # To the nearest step, or both where the interval lies between two.
     steps = max(0, math.floor(delay.low / dt + 0.25)), max(0, math.ceil(delay.high / dt - 0.25))
+    if steps[1] > LATEST:
+        raise UserError(
+            f"{cfg.identified}: delay is up to {delay.high:g} s, {steps[1]:,} control steps: at most {LATEST} are simulated"
+        )
     mine = next((name for name, term in terms.items() if term.func is actions.Delay), None)
     if mine is None:
         return {"delay": Term(actions.Delay, params={"steps": steps}), **terms} if steps[1] else terms

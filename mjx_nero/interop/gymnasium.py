@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mjx_nero
+from mjx_nero import bounds, values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import missing, need
@@ -63,6 +64,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         num_rendered: int = 1,
         **kwargs: Any,
     ):
+        num_envs = values.read(bounds.Worlds, num_envs, "num_envs")
         self.env = mjx_nero.make(env, num_envs=num_envs, **kwargs) if isinstance(env, str) else env
         self.num_envs, self.render_mode, self._group, self._num_rendered = num_envs, render_mode, group, num_rendered
         self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
@@ -77,6 +79,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Fresh episodes everywhere: observations and an empty info. A seed makes all that follows reproducible."""
+        seed = _checked(seed, options)
         super().reset(seed=seed)
         self._state, self._key = self._reset(_key(self.np_random, seed))
         return jax.tree.map(self._out, _group(self._state.obs, self._group)), {}
@@ -85,6 +88,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """One control step: observations, rewards, terminated, truncated, info."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
+        _check_shape(actions, self.action_space.shape)
         self._state, self._key, out = self._step(self._state, self._key, _to_jax(actions, self._device))
         *given, done, results = jax.tree.map(self._out, out)
         results = dict(zip(_results(self._state), results, strict=True))
@@ -97,6 +101,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             UserError: the machine cannot draw offscreen.
         """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
         self._renderer = self._renderer or Renderer(self.env.mj_model)
         return tuple(_frame(self.env, self._renderer, self._state, i) for i in range(min(self._num_rendered, self.num_envs)))
 
@@ -140,6 +146,7 @@ class Env(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """A fresh episode: observation and an empty info."""
+        seed = _checked(seed, options)
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random, seed))
         return jax.tree.map(np.asarray, _group(self._state.obs, self._group)), {}
@@ -148,6 +155,7 @@ class Env(gymnasium.Env):
         """One control step: observation, reward, terminated, truncated, info."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
+        _check_shape(action, self.action_space.shape)
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
         done, truncated = bool(state.done), bool(state.info["truncation"])
         info = {name: float(state.metrics[name]) for name in _results(state) if done}
@@ -160,6 +168,8 @@ class Env(gymnasium.Env):
         Raises:
             UserError: the machine cannot draw offscreen.
         """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
         self._renderer = self._renderer or Renderer(self.env.mj_model)
         return _frame(self.env, self._renderer, jax.tree.map(lambda x: x[None], self._state), 0)
 
@@ -185,6 +195,27 @@ def _group(obs: Any, group: str | None) -> Any:
 
 def _results(state: Any) -> list[str]:
     return [name for name in RESULTS if name in state.metrics]
+
+
+def _checked(seed: Any, options: Any) -> int | None:
+    """The seed of a reset.
+
+    Raises:
+        gymnasium.error.Error: it is no single one that JAX takes, or options ask for what is not done.
+    """
+    if options:
+        raise gymnasium.error.Error(f"reset takes no options here, got {', '.join(map(str, options))}: all episodes start anew")
+    try:
+        return None if seed is None else values.read(bounds.Seed, seed, "seed")
+    except UserError as error:
+        raise gymnasium.error.Error(f"{error}: one seed is for all environments") from None
+
+
+def _check_shape(action: Any, shape: tuple[int, ...]) -> None:
+    """Raises ``gymnasium.error.InvalidAction`` where actions have another shape; their values stay where they are."""
+    given = tuple(np.shape(action))
+    if given != shape:
+        raise gymnasium.error.InvalidAction(f"actions take the shape {shape}, got {given}")
 
 
 def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:

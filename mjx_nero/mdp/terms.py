@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import bounds, config
-from mjx_nero.bounds import Count, NonNegative, Positive, Share, Steps
+from mjx_nero.bounds import NonNegative, Past, Positive, Share, Steps
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History
 from mjx_nero.types import LEVEL, Key, UserError, View
@@ -89,7 +89,7 @@ class ObservationTerm(Term):
     noise: NonNegative = dataclasses.field(default=0.0, kw_only=True)
     delay: Steps = dataclasses.field(default=(0, 0), kw_only=True)
     hold: Share = dataclasses.field(default=1.0, kw_only=True)
-    history: Count = dataclasses.field(default=1, kw_only=True)
+    history: Past = dataclasses.field(default=1, kw_only=True)
 
     @property
     def lines(self) -> tuple[Delay | History, ...]:

@@ -3,12 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
 from mjx_nero import config
-from mjx_nero.bounds import Count, NonNegative, Positive
+from mjx_nero.bounds import Bounds, NonNegative, Positive
 from mjx_nero.sim import robot_file, touch
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
@@ -122,18 +123,22 @@ class SceneCfg:
         config.freeze(self)
 
 
+Iterations = Annotated[int, Bounds(1, 10_000)]
+Slots = Annotated[int, Bounds(1, 100_000)]
+
+
 @dataclasses.dataclass(frozen=True)
 class SimCfg:
     """Physics options, and the buffers that MJX-Warp needs (overflows are counted, see ``Physics``)."""
 
-    dt: Positive = 0.01  # physics step [s]
-    decimation: Count = 2  # physics steps a control step
-    iterations: Count = 10  # of the constraint solver, at most
-    ls_iterations: Count = 50  # of its line search, at most (MJX-JAX 20); cut at 20, MuJoCo's C library throws a cube at times
+    dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
+    decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps a control step
+    iterations: Iterations = 10  # of the constraint solver, at most
+    ls_iterations: Iterations = 50  # of its line search, at most (MJX-JAX 20); at 20, MuJoCo's C library throws a cube at times
     impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
     elliptic: bool = True  # friction cones; else pyramids
-    contacts_per_env: Count = 24  # Warp: contact slots, times the number of environments
-    constraints_per_env: Count = 128  # Warp: constraint rows of one environment
+    contacts_per_env: Slots = 24  # Warp: contact slots, times the number of environments
+    constraints_per_env: Slots = 128  # Warp: constraint rows of one environment
 
     def finer(self, max_step: float) -> "SimCfg":
         """With so many more and shorter physics steps a control step that none is longer than ``max_step`` [s]; 0: as it is."""

@@ -168,6 +168,26 @@ def test_mistakes(reach):
         VectorEnv(reach, N).step(np.zeros((N, 7)))
 
 
+def test_misuse_is_refused_in_gymnasiums_words(reach):
+    for env, shape in ((Env(reach), (7,)), (VectorEnv(reach, N), (N, 7))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before render"):
+            env.render()
+        for seed in ([1, 2], -1, 2**32, "x", 0.5):
+            with pytest.raises(gymnasium.error.Error, match="^seed "):
+                env.reset(seed=seed)
+        with pytest.raises(gymnasium.error.Error, match="no options here, got reset_mask"):
+            env.reset(options={"reset_mask": np.ones(N, bool)})
+        env.reset(seed=2**32 - 1, options={})
+        for wrong in ((), (6,), (N + 1, 7)):
+            with pytest.raises(gymnasium.error.InvalidAction, match="^actions take the shape"):
+                env.step(np.zeros(wrong, np.float32))
+        assert env.step(np.zeros(shape, np.float32))[0].shape[-1] == 47
+        env.close(), env.close()
+    for count in (0, -1, 2**21, "x"):
+        with pytest.raises(UserError, match="^num_envs "):
+            VectorEnv(reach, count)
+
+
 def test_frames(reach):
     env = VectorEnv(reach, N, render_mode="rgb_array", num_rendered=2)
     env.reset(seed=0)
