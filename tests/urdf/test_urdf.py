@@ -309,6 +309,30 @@ def test_mimic_becomes_an_equality(tmp_path):
     assert robot.down in ((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
+@pytest.mark.parametrize("limit", ["0 0.04", "0 0.01", "-0.01 0"], ids=["wrong sign", "wrong sign, short", "short"])
+def test_followers_limits_do_not_stop_their_driver(tmp_path, limit):
+    """A follower that mirrors its driver, -0.04 to 0 m, whose own limits would end that way or forbid it."""
+    lower, upper = limit.split()
+    slide = {"type": "prismatic", "xyz": "0 0 0.2", "axis": "0 1 0"}
+    driver = 'lower="0" upper="0.04" effort="20" velocity="0.2"'
+    text = hand(
+        tmp_path,
+        make.joint("f1", "l3", "left", limit=driver, **slide),
+        make.joint(
+            "f2", "l3", "right", limit=f'lower="{lower}" upper="{upper}"', inner='<mimic joint="f1" multiplier="-1"/>', **slide
+        ),
+    )
+    model, _ = imported(tmp_path, text)
+    model.opt.gravity[:] = 0.0
+    np.testing.assert_allclose(model.joint("f2").range, [-0.04, 0.0])
+    data = mujoco.MjData(model)
+    for force, end in ((20.0, 0.04), (-20.0, 0.0), (20.0, 0.04)):
+        data.joint("f1").qfrc_applied = force
+        mujoco.mj_step(model, data, 1000)
+        assert data.joint("f1").qpos[0] == pytest.approx(end, abs=2e-3)
+        assert data.joint("f2").qpos[0] == pytest.approx(-end, abs=3e-3)
+
+
 def test_fingers_press_no_harder_than_their_cube_bears(tmp_path):
     """250 N a kilogram, where the file allows 500 N; a cube of 30 to 40 mm weighs 27 to 64 g."""
     slide = {"type": "prismatic", "xyz": "0 0 0.2", "limit": 'lower="0" upper="0.04" effort="500" velocity="0.2"'}
