@@ -66,7 +66,6 @@ class Roots:
         """
         scheme, _, rest = name.replace("\\", "/").rpartition("://")
         scheme = re.split(r"[/:]+", scheme)[-1]  # file://$(find NAME)/... is file://package://NAME/...
-        rest = urllib.parse.unquote(rest) if scheme == "file" else rest
         if "\0" in rest or not rest.strip("/ "):
             raise Missing("names no file")
         if scheme in ("package", "model"):
@@ -85,9 +84,10 @@ class Roots:
         else:
             raise Missing(f"{scheme}:// is not fetched")
         for place in dict.fromkeys(places):
-            path = self._inside(place / rest, name)
-            if path is not None:
-                return path
+            for text in dict.fromkeys((rest, urllib.parse.unquote(rest))):  # as it is written, then with %20 as a space
+                path = self._inside(place / text, name)
+                if path is not None:
+                    return path
         raise Absent(f"there is no such file{lacking}")
 
     def _look_beside(self, package: str) -> None:

@@ -149,6 +149,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
         raise UserError(f"joint {name!r} has the axis 0 0 0: give its direction")
     if abs(length - 1) > 1e-6:
         notes.add("repaired", "joint", name, f"the axis had length {length:g}, now 1")
+    kind = "revolute" if _bounded(joint) else joint.type
     lower, upper = _limits(joint, name, notes)
     effort, velocity = (_positive(joint.limit, field, name, notes) for field in ("effort", "velocity"))
     losses = {}
@@ -160,7 +161,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
             value = 0.0
         losses[field] = value
     axis, damping, friction = joint.axis / length, losses["damping"], losses["friction"]
-    return Joint(name, joint.type, parent, child, origin, axis, lower, upper, effort, velocity, damping, friction)
+    return Joint(name, kind, parent, child, origin, axis, lower, upper, effort, velocity, damping, friction)
 
 
 def _positive(limit: yourdfpy.urdf.Limit | None, field: str, name: str, notes: Notes) -> float | None:
@@ -171,8 +172,18 @@ def _positive(limit: yourdfpy.urdf.Limit | None, field: str, name: str, notes: N
     return None
 
 
+def _bounded(joint: yourdfpy.Joint) -> bool:
+    """Whether a continuous joint gives usable limits all the same, of less than a turn either way."""
+    if joint.type != "continuous" or joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
+        return False
+    return joint.limit.lower < joint.limit.upper and max(abs(joint.limit.lower), abs(joint.limit.upper)) < math.tau
+
+
 def _limits(joint: yourdfpy.Joint, name: str, notes: Notes) -> tuple[float, float]:
-    if joint.type == "continuous":
+    if _bounded(joint):
+        text = f"continuous, but with limits {joint.limit.lower:g} .. {joint.limit.upper:g}: they are used"
+        notes.add("warning", "joint", name, text)
+    elif joint.type == "continuous":
         notes.add("note", "joint", name, "continuous: no limits; drive targets within two turns either way")
         return -2 * math.tau, 2 * math.tau
     limit = joint.limit

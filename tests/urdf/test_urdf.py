@@ -526,6 +526,33 @@ def test_where_meshes_are_found(tmp_path, name):
     assert not any("mesh" in w for w in report.warnings) and report.links["end"]["meshes"] == ["m"]
 
 
+@pytest.mark.parametrize("name", ["package://mine/a%20b.stl", "a%20b.stl", "file://{}/a%20b.stl"])
+@pytest.mark.parametrize("written", ["a b.stl", "a%20b.stl"])
+def test_percent_signs_in_mesh_names(tmp_path, name, written):
+    make.box(tmp_path / written, (0, 0, 0), (0.1, 0.1, 0.1))
+    body = make.link("end", make.inertial(0.1), make.mesh(name.format(tmp_path)))
+    path = make.write(tmp_path, make.arm(2, body, make.joint("j", "l2", "end")))
+    report = import_urdf(path, tmp_path / "out", {"mine": tmp_path})
+    assert not any("mesh" in w for w in report.warnings) and len(report.links["end"]["meshes"]) == 1
+
+
+@pytest.mark.parametrize(
+    "limit, expected",
+    [('lower="-1.9" upper="1.9"', (-1.9, 1.9)), ('lower="0" upper="0"', None), ('lower="-9" upper="9"', None), ("", None)],
+)
+def test_limits_of_continuous_joints(tmp_path, limit, expected):
+    text = make.robot(
+        make.link("base"),
+        make.link("a", make.inertial()),
+        make.joint("j1", "base", "a", "continuous", limit=f'{limit} effort="5" velocity="1"'),
+    )
+    model, report = imported(tmp_path, text)
+    assert bool(model.jnt_limited[0]) == (expected is not None)
+    if expected:
+        assert tuple(model.joint("j1").range) == expected
+    assert any("limits -1.9 .. 1.9" in w for w in report.warnings) == (expected is not None)
+
+
 @pytest.mark.parametrize("limits", [{"MAX_FACES": 10_000}, {"MAX_DRAWN": 10_000}], ids=lambda limits: next(iter(limits)))
 def test_large_meshes_are_made_coarser(tmp_path, monkeypatch, limits):
     for name, value in limits.items():
