@@ -95,7 +95,8 @@ def home(
     low = [(link, shape) for link, shape, meets in shapes if meets]
     if not len(homes.q):
         return _clear(hand, cloud, start, given, low, name, notes)
-    best = int(np.argmax(_reached(homes.q, cloud, low, *pick))) if pick[0] else 0
+    box, along, lean = pick
+    best = int(np.argmax(_reached(homes.q, cloud, low, box, along, lean))) if box else 0
     notes.add("guessed", "robot", name, "home: amid the workspace (--home changes it)")
     return homes.pose(best, start, cloud)
 
