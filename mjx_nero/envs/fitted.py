@@ -88,17 +88,12 @@ def _ready(robot: RobotCfg) -> RobotCfg:
 def _pick_place(robot: RobotCfg) -> EnvCfg:
     """By inverse kinematics: RMPflow needs files a robot."""
     cfg, offset = pick_place.default(robot, pick_place_setup(robot)), regions.of(robot).offset
-    fields = {**cfg.controllers["pick_place"], "end_effector_offset": offset, "motion": "ik", **_turned(robot, "ik.")}
+    fields = {**cfg.controllers["pick_place"], "end_effector_offset": offset, "motion": "ik", **regions.ik(robot, "ik.")}
     return dataclasses.replace(cfg, controllers={"pick_place": fields})
 
 
 def _follow_target(robot: RobotCfg, factory: Callable[[RobotCfg, follow_target.Setup], EnvCfg]) -> EnvCfg:
-    return dataclasses.replace(factory(robot, follow_target_setup(robot)), controllers={"ik": _turned(robot)})
-
-
-def _turned(robot: RobotCfg, prefix: str = "") -> dict[str, bool]:
-    """What inverse kinematics has to know of an arm of few joints."""
-    return {} if regions.turns(robot) else {f"{prefix}free_turn": True}
+    return dataclasses.replace(factory(robot, follow_target_setup(robot)), controllers={"ik": regions.ik(robot)})
 
 
 def _presets(fit: Callable, **factories: Callable) -> Presets:

@@ -15,6 +15,7 @@ from mjx_nero.types import UserError
 HELD = 0.03  # [m] from where the cube is in a good grasp it may be so far off and still count as held
 TURNS = 5  # joints of an arm that can turn its hand at will while that points down
 TRAVEL = 0.1  # [m] a carried cube is this high above the table, if the hand can still point down there
+UPRIGHT = 0.005  # [m/rad] a hand that leans is as upright as its arm allows, but where it has to be
 LEFT = 0.06  # [m] the grasp point travels at least this far over the middle of a cube on the table, which it has left then
 
 
@@ -75,6 +76,13 @@ def of(robot: RobotCfg) -> Regions:
 def turns(robot: RobotCfg) -> bool:
     """Whether the arm can turn its hand at will while that points down."""
     return len(robot.arm.joints) >= TURNS
+
+
+def ik(robot: RobotCfg, prefix: str = "") -> dict[str, bool | float]:
+    """What inverse kinematics has to know of an arm of few joints, and of a hand that cannot point straight down."""
+    few = {} if turns(robot) else {"free_turn": True}
+    leaning = {"orientation_weight": UPRIGHT} if robot.lean else {}
+    return {f"{prefix}{name}": value for name, value in {**few, **leaning}.items()}
 
 
 def span(low: float, high: float) -> Range:

@@ -81,6 +81,7 @@ class RobotCfg:
         grip: where the middle of a cube is that the gripper holds, in the frame of ``ee_site`` [m].
         pick: box of the unturned frame over the table in which ``ee_site`` gets everywhere with the gripper pointing down, as far
             as the arm can; its lowest height is the one to grasp a cube of the gripper's size at (``sim.grasp``) [m].
+        lean: how far from straight down the gripper has to lean somewhere in ``pick`` [rad]; 0: it points down everywhere.
         hold: box of the unturned frame above, to which the gripper can bring what it holds [m]; ``pick`` and ``hold`` are what
             lift commands unless it is told otherwise.
         folder: of an imported robot, holding ``model.xml``; empty: one of the package's.
@@ -103,6 +104,7 @@ class RobotCfg:
     pad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grip: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pick: Box | None = None
+    lean: NonNegative = 0.0
     hold: Box | None = None
     folder: str = ""
     mjcf: str = ""

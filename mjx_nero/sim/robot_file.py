@@ -42,6 +42,7 @@ _PLAIN = (
     "pad",
     "grip",
     "pick",
+    "lean",
     "hold",
 )
 _HEAD = """\
@@ -51,7 +52,7 @@ _HEAD = """\
 # when the gripper points straight down. floor: height of what a robot beside the table stands on. opening: between the pads when
 # open; pad: size of one along the approach, across and along the opening; 0: unknown. grip: where the middle of what it holds is,
 # in ee_site's frame. pick, hold: boxes of lift tasks, in the frame of workspace: pick over the table, where the gripper can point
-# down, from the height at which it grasps; hold: for goals.
+# down, from the height at which it grasps; lean: how far it leans there where it cannot; hold: for goals.
 """
 
 

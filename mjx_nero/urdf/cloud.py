@@ -48,7 +48,7 @@ class Cloud:
         self._parts, self._hand, self._turn = parts, hand, mount.copy()
         self.height, self._turn[:3, 3] = float(mount[2, 3]), 0.0
         self.poses = {name: self._turn @ p for name, p in body_poses(parts, self.q, SAMPLES).items()}
-        self.site = self._sites(self.poses)
+        self.site = self.sites(self.poses)
 
     @property
     def shoulder(self) -> Vec:
@@ -63,15 +63,16 @@ class Cloud:
 
     def grasp_point(self, q: Mapping[str, float]) -> Pose:
         """Its pose [4, 4] with the arm's joints at ``q``, the gripper open."""
-        return self._sites(self.at(np.array([[q[j] for j in self.arm]])))[0]
+        return self.sites(self.at(np.array([[q[j] for j in self.arm]])))[0]
 
-    def _sites(self, poses: Mapping[str, Poses]) -> Poses:
+    def sites(self, poses: Mapping[str, Poses]) -> Poses:
+        """The grasp point's [n, 4, 4] in poses of the bodies."""
         body = body_of(self._parts, self._hand.link)
         return poses[body.name] @ body.links[self._hand.link] @ self._hand.site
 
     def jacobian(self, poses: Mapping[str, Poses]) -> Float[np.ndarray, "n 6 k"]:
         """How the grasp point moves and turns with each of the arm's joints, and with those that follow it by mimic."""
-        site, body = self._sites(poses)[:, :3, 3], body_of(self._parts, self._hand.link)
+        site, body = self.sites(poses)[:, :3, 3], body_of(self._parts, self._hand.link)
         out = np.zeros((len(site), 6, len(self.arm)))
         while body.joint is not None:
             joint, pose = body.joint, poses[body.name]
@@ -137,17 +138,22 @@ class Cloud:
             left, error, jacobian = left[~met], error[~met], jacobian[~met]
             if not len(left):
                 break
-            transposed = np.moveaxis(jacobian, 1, 2)
-            square = jacobian @ transposed + 1e-4 * np.eye(jacobian.shape[1])
-            move = (transposed @ np.linalg.solve(square, error[:, :, None]))[:, :, 0]
-            q[left] = np.clip(q[left] + np.clip(move, -0.3, 0.3), lower, upper)
+            q[left] = np.clip(q[left] + _move(error, jacobian), lower, upper)
         return found.reshape(len(goals), starts, -1)
+
+    def followed(
+        self, q: Float[np.ndarray, "n k"], goals: Points, steps: int, tilt: float, along: Vec | None
+    ) -> Float[np.ndarray, "n k"]:
+        """``q`` after a few steps towards goals [n, 3] with the hand pointing down; ``tilt`` and ``along`` as in ``solve``."""
+        for _ in range(steps):
+            q = np.clip(q + _move(*self._error(self.at(q), goals, True, tilt, along)), self.lower, self.upper)
+        return q
 
     def _error(
         self, poses: Mapping[str, Poses], wanted: Points, down: bool, tilt: float, along: Vec | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """What lacks to the goals [n, 3 or 6], and its Jacobian; without ``along`` turns about the approach do not count."""
-        sites, jacobian = self._sites(poses), self.jacobian(poses)
+        sites, jacobian = self.sites(poses), self.jacobian(poses)
         away = wanted - sites[:, :3, 3]
         if not down:
             return away, jacobian[:, :3]
@@ -171,6 +177,13 @@ class Cloud:
         """Height [n] of the shape's lowest point above the table; in the random poses unless others are given."""
         body = body_of(self._parts, link)
         return shape.lowest((self.poses if poses is None else poses)[body.name][:, 2] @ body.links[link]) + self.height
+
+
+def _move(error: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """A damped step of the joints [n, k]."""
+    transposed = np.moveaxis(jacobian, 1, 2)
+    square = jacobian @ transposed + 1e-4 * np.eye(jacobian.shape[1])
+    return np.clip((transposed @ np.linalg.solve(square, error[:, :, None]))[:, :, 0], -0.3, 0.3)
 
 
 def _smallest(values: Values, count: int) -> Int[np.ndarray, " count"]:

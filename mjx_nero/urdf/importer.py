@@ -14,6 +14,7 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf import chain as chain_of
 from mjx_nero.urdf import collide, drives, files, folder, inertia, meshes, mjcf, regions, rest, workspace
 from mjx_nero.urdf import hand as hands
+from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
 from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.geometry import Drawn, Looks
@@ -55,7 +56,7 @@ def import_urdf(
         fix: joint -> position to hold it at [rad, m]; None: the one nearest to 0.
         gripper: joints that drive the gripper, in place of the guess (``hand.choose``); empty for none.
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
-        home: positions of some joints [rad, m], in place of the guess (``rest.home``).
+        home: positions of some joints [rad, m], in place of the guess (``home.home``).
         strict: warnings become an error.
 
     Raises:
@@ -78,13 +79,15 @@ def import_urdf(
     collisions = collide.collisions(tree, parts, looks, hand, cloud, notes)
     work = workspace.workspace(cloud, tree.name, notes)
     shapes = [(link, shape, bits > 0) for link, items in collisions.items() for _, shape, bits in items]
-    at_home = rest.home(parts, looks.of, hand, cloud, start, home or {}, shapes, work, tree.name, notes)
-    down = workspace.down(cloud, hand, work[0], at_home)
+    homes = homing.candidates(parts, looks.of, hand, cloud, start, home or {}, shapes, work)
+    down = workspace.down(cloud, hand, work[0], homes.pose(0, start, cloud) if len(homes.q) else start)
     low = [(link, shape) for link, shape, meets in shapes if meets]
-    pick, hold, down = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
+    pick, hold, down, lean = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
+    way = pick, None if lean or len(cloud.arm) < regions.TURNS else regions.opening(down), lean
+    at_home = homing.home(homes, hand, cloud, start, home or {}, shapes, way, tree.name, notes)
     made = _Model(tree, parts, hand, collisions, at_home, notes)
     rotors, rows = _drives(made, gains, notes)
-    robot = _robot(made, stand, rows, down, (work[0], pick, hold), out)
+    robot = dataclasses.replace(_robot(made, stand, rows, down, (work[0], pick, hold), out), lean=lean)
     text = made.xml({name: look.drawn for name, look in looks.of.items()}, rotors)
     report = Report(
         source=path.name,

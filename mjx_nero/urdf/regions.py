@@ -67,8 +67,9 @@ def _above(cloud: Cloud, shapes: Shapes, poses: Mapping[str, Poses]) -> Bool[np.
 
 def find(
     cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes, name: str, notes: Notes
-) -> tuple[Box | None, Box | None, Quat]:
-    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, None where there are none; and ``down``, or half a turn from it.
+) -> tuple[Box | None, Box | None, Quat, float]:
+    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, None where there are none; ``down``, or half a turn from it; and how far
+    the hand leans [rad], 0 where it points down.
 
     The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
     which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
@@ -84,10 +85,8 @@ def find(
         shapes: what must not get below the table.
     """
     if not hand.joints or hand.gap <= 0 or work is None:
-        return None, None, down
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, np.array(down))
-    along = turn.reshape(3, 3).T @ np.array([0.0, 1.0, 0.0])
+        return None, None, down, 0.0
+    along = opening(down)
     low = grasp.height(hand.gap, hand.pad) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
     w, x, y, z = down
@@ -99,15 +98,22 @@ def find(
         ("pointing down", 0.0, None, down),
         ("leaning", LEAN, None, down),
     ]
-    for how, tilt, opening, turned in ways if len(cloud.arm) >= TURNS else ways[2:]:
-        pick = _pick(Reaching(cloud, shapes, shun, tilt, opening), work, low)
+    for how, tilt, opened, turned in ways if len(cloud.arm) >= TURNS else ways[2:]:
+        pick = _pick(Reaching(cloud, shapes, shun, tilt, opened), work, low)
         if pick is not None:
             hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
             notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
             notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
-            return pick, hold, turned
+            return pick, hold, turned, round(float(tilt), 4)
     notes.add("warning", "robot", name, "no place found to grasp at on the table: lift needs pick and hold in robot.yaml")
-    return None, None, down
+    return None, None, down, 0.0
+
+
+def opening(down: Quat) -> Vec:
+    """The direction of the grasp point's frame that lies along y where the hand is turned so."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.array(down))
+    return turn.reshape(3, 3).T @ np.array([0.0, 1.0, 0.0])
 
 
 def _text(box: Box) -> str:

@@ -180,6 +180,6 @@ class Tower:
             "end_effector_offset": there.offset,
             "motion": "ik",
             "turn": self.angle < math.pi,
-            **({} if regions.turns(self.robot) else {"ik.free_turn": True}),
+            **regions.ik(self.robot, "ik."),
         }
         return {"pick_place": fields}

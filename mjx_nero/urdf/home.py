@@ -1,0 +1,222 @@
+"""The home pose: over the middle of the workspace, hand down, away from limits and singularities, with ``pick`` in reach."""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_nero.urdf.cloud import Cloud
+from mjx_nero.urdf.fingers import Hand
+from mjx_nero.urdf.geometry import Look
+from mjx_nero.urdf.primitives import Primitive
+from mjx_nero.urdf.report import Notes
+from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
+from mjx_nero.urdf.workspace import Box
+
+STARTS = 48  # descents to the middle of the workspace
+CALM = 0.5  # [m/rad] of its starts
+CLEAR = 0.01  # [m] above the table
+MARGIN = 0.15  # of a joint's range: further from its limits is no better
+AGILE = 0.15  # smallest singular value of the Jacobian (lengths in arm's lengths) that is as good as any
+HIGH = 0.15  # of the reach: further above the table is no better
+POINTS = 60  # of a link's surface, that are tested for lying within another link
+RANDOM = 200  # poses: links that touch in all of them are shaped so
+TRAVEL = 0.1  # [m] above its lowest height the hand comes to a place of ``pick``
+ACROSS, DOWNWARD, STEPS = 12, 5, 4  # points of the way there, and steps of inverse kinematics for each
+NEAR = 0.005  # [m] from its end it has got there
+
+
+@dataclasses.dataclass(frozen=True)
+class Homes:
+    """The poses that would do for a home, best first [n, k], and the joints that are free to take them."""
+
+    q: Float[np.ndarray, "n k"]
+    free: tuple[str, ...]
+
+    def pose(self, index: int, start: Mapping[str, float], cloud: Cloud) -> dict[str, float]:
+        """Joint -> home position [rad, m]; the joints that are not free stay at ``start``."""
+        return {**start, **{j: float(v) + 0.0 for j, v in zip(cloud.arm, self.q[index], strict=True) if j in self.free}}
+
+
+def candidates(
+    parts: dict[str, Body],
+    looks: Mapping[str, Look],
+    hand: Hand,
+    cloud: Cloud,
+    start: Mapping[str, float],
+    given: Mapping[str, float],
+    shapes: list[tuple[str, Primitive, bool]],
+    work: tuple[Box | None, bool],
+) -> Homes:
+    """The poses that inverse kinematics finds with the grasp point amid the workspace, hand down if it can, its links clear of
+    the table and of one another; those that are farthest from joint limits and singularities first.
+
+    Args:
+        given: joints whose position is the user's.
+        shapes: link, shape in its frame, whether it meets the table.
+    """
+    free = tuple(j for j in start if j not in given and j not in hand.joints)
+    box, down = work
+    if box is None or not free:
+        return Homes(np.zeros((0, len(cloud.arm))), free)
+    found = cloud.solve(np.mean(box, axis=1)[None], down, STARTS, given, CALM)[0]
+    found = np.round(_unwound(found[~np.isnan(found[:, 0])], cloud), 3)
+    if not len(found):
+        return Homes(found, free)
+    poses = cloud.at(found)
+    above = np.min([cloud.lowest(link, s, poses) for link, s, meets in shapes if meets] or [np.ones(len(found))], axis=0)
+    clear = above > CLEAR
+    apart = clear & ~_touching(parts, looks, cloud, poses, shapes)
+    fits = apart if apart.any() else clear
+    order = np.argsort(-_comfort(cloud, found, poses, above), kind="stable")
+    return Homes(found[order[fits[order]]], free)
+
+
+def home(
+    homes: Homes,
+    hand: Hand,
+    cloud: Cloud,
+    start: dict[str, float],
+    given: Mapping[str, float],
+    shapes: list[tuple[str, Primitive, bool]],
+    pick: tuple[Box | None, Vec | None, float],
+    name: str,
+    notes: Notes,
+) -> dict[str, float]:
+    """Joint -> home position [rad, m]: of the candidates one from which the hand gets to the most of ``pick``.
+
+    Without a candidate it is ``start``; if a shape is below the table there, the nearest of the random poses in which none is.
+
+    Args:
+        pick: where to grasp, the direction of the grasp point's frame that then lies along y, and how far the hand may lean.
+    """
+    low = [(link, shape) for link, shape, meets in shapes if meets]
+    if not len(homes.q):
+        return _clear(hand, cloud, start, given, low, name, notes)
+    box, along, lean = pick
+    best = int(np.argmax(_reached(homes.q, cloud, low, box, along, lean))) if box else 0
+    notes.add("guessed", "robot", name, "home: amid the workspace (--home changes it)")
+    return homes.pose(best, start, cloud)
+
+
+def _reached(
+    q: Float[np.ndarray, "n k"], cloud: Cloud, low: list[tuple[str, Primitive]], pick: Box, along: Vec | None, tilt: float
+) -> Values:
+    """To what share of the corners and the middle of ``pick`` each pose leads, by a way that a controller without a plan
+    takes: around the base at the height of its travel, then straight down. No shape may go below the table."""
+    x, y, (bottom, top) = pick
+    places = np.array([*itertools.product(x, y), (np.mean(x), np.mean(y))])
+    at = np.repeat(q, len(places), axis=0)
+    ends = np.tile(places, (len(q), 1))
+    first = cloud.sites(cloud.at(at))[:, :3, 3]
+    over, fine = min(top, bottom + TRAVEL), np.ones(len(at), bool)
+    radius, angle = np.hypot(first[:, 0], first[:, 1]), np.arctan2(first[:, 1], first[:, 0])
+    far, turn = np.hypot(*ends.T) - radius, (np.arctan2(ends[:, 1], ends[:, 0]) - angle + np.pi) % (2 * np.pi) - np.pi
+    shares = [(s, 0.0) for s in np.linspace(0, 1, ACROSS + 1)[1:]] + [(1.0, s) for s in np.linspace(0, 1, DOWNWARD + 1)[1:]]
+    goal = first
+    for across, down in shares:
+        r, a = radius + across * far, angle + across * turn
+        height = first[:, 2] + across * (over - first[:, 2]) + down * (bottom - over)
+        goal = np.column_stack([r * np.cos(a), r * np.sin(a), height])
+        at = cloud.followed(at, goal, STEPS, tilt, along)
+        poses = cloud.at(at)
+        fine &= np.min([cloud.lowest(link, shape, poses) for link, shape in low] or [np.ones(len(at))], axis=0) > 0
+    fine &= np.linalg.norm(cloud.sites(cloud.at(at))[:, :3, 3] - goal, axis=1) < NEAR
+    return fine.reshape(len(q), -1).mean(1)
+
+
+def _clear(
+    hand: Hand,
+    cloud: Cloud,
+    start: dict[str, float],
+    given: Mapping[str, float],
+    shapes: list[tuple[str, Primitive]],
+    name: str,
+    notes: Notes,
+) -> dict[str, float]:
+    guessed = [j for j in start if j not in given and j not in hand.joints]
+    clear = np.min([cloud.lowest(link, s) for link, s in shapes], axis=0) > CLEAR if shapes else np.ones(len(cloud.site), bool)
+    if clear[0] or not guessed:
+        if guessed:
+            notes.add("guessed", "robot", name, "home: 0 where limits allow, else the middle (--home changes it)")
+        if not clear[0]:
+            notes.add("warning", "robot", name, "at home it reaches below the table: change --home or base_pos")
+        return start
+    fits = clear & np.all([np.abs(cloud.q[j] - v) < 1e-9 for j, v in given.items() if j not in hand.joints] or [clear], axis=0)
+    if not fits.any():
+        notes.add("warning", "robot", name, "at home it reaches below the table: change --home or base_pos")
+        return start
+    away = np.sum([(cloud.q[j] - start[j]) ** 2 for j in guessed], axis=0)
+    best = int(np.argmin(np.where(fits, away, np.inf)))
+    notes.add("guessed", "robot", name, "home: near 0, moved until nothing is below the table (--home changes it)")
+    return {**start, **{j: float(round(cloud.q[j][best], 3)) for j in guessed}}
+
+
+def _unwound(q: Float[np.ndarray, "n k"], cloud: Cloud) -> Float[np.ndarray, "n k"]:
+    """Joints that have room for a whole turn as near to 0 as they get."""
+    turned = q - 2 * np.pi * np.round(q / (2 * np.pi))
+    room = cloud.upper - cloud.lower >= 2 * np.pi - 1e-6
+    return np.where(room & (turned >= cloud.lower) & (turned <= cloud.upper), turned, q)
+
+
+def _comfort(cloud: Cloud, q: Float[np.ndarray, "n k"], poses: Mapping[str, Poses], above: Values) -> Values:
+    """How good a pose is to start from: limits, singularities and table far, joints turned little, links high."""
+    spare = np.minimum(q - cloud.lower, cloud.upper - q) / (cloud.upper - cloud.lower)
+    spare = np.where(cloud.endless, 1.0, spare).min(1)
+    reach = float(np.quantile(np.linalg.norm(cloud.site[1:, :3, 3] - cloud.shoulder, axis=1), 0.99))
+    jacobian = cloud.jacobian(poses)
+    jacobian[:, :3] /= reach
+    agile = np.linalg.svd(jacobian, compute_uv=False)[:, min(jacobian.shape[1:]) - 1]
+    turned = np.abs(q - np.array([cloud.q[j][0] for j in cloud.arm])).mean(1) / np.pi
+    height = np.mean([p[:, 2, 3] for p in poses.values()], axis=0) / reach
+    far = [np.minimum(spare / MARGIN, 1), np.minimum(agile / AGILE, 1), np.minimum(above / (HIGH * reach), 1)]
+    return np.sum(far, axis=0) - 1.5 * turned + 1.5 * height
+
+
+def _touching(
+    parts: dict[str, Body],
+    looks: Mapping[str, Look],
+    cloud: Cloud,
+    poses: Mapping[str, Poses],
+    shapes: list[tuple[str, Primitive, bool]],
+) -> Bool[np.ndarray, " n"]:
+    """Whether links that are no neighbours lie within one another, by points of one in a shape of the other.
+
+    Pairs that do so in every random pose, as the links of a gripper's linkage, say nothing of a pose and are left out.
+    """
+    n = len(next(iter(poses.values())))
+    poses = {name: np.concatenate([p, cloud.poses[name][1 : RANDOM + 1]]) for name, p in poses.items()}
+    out = np.zeros(n, bool)
+    surfaces: dict[str, Points] = {}
+    for body in parts.values():
+        found = [look.points @ at[:3, :3].T + at[:3, 3] for link, at in body.links.items() if (look := _seen(looks[link]))]
+        if found:
+            points = np.concatenate(found)
+            surfaces[body.name] = points[:: 1 + len(points) // POINTS]
+    for link, shape, _ in shapes:
+        body = body_of(parts, link)
+        inverse = np.linalg.inv(poses[body.name] @ body.links[link])
+        for other, points in surfaces.items():
+            if _apart(parts, other, body.name) <= 2:  # what their joints' limits take care of
+                continue
+            local = inverse @ poses[other]
+            places = points @ np.moveaxis(local[:, :3, :3], 1, 2) + local[:, None, :3, 3]
+            within = shape.contains(places.reshape(-1, 3)).reshape(len(local), -1).mean(1) > 0.05
+            if not within[n:].all():
+                out |= within[:n]
+    return out
+
+
+def _apart(parts: dict[str, Body], a: str, b: str) -> int:
+    """How many joints lie between two bodies."""
+    return len(set(_line(parts, a)) ^ set(_line(parts, b)))
+
+
+def _line(parts: dict[str, Body], name: str) -> list[str]:
+    return [name, *_line(parts, parts[name].parent)] if name else []
+
+
+def _seen(look: Look) -> Look | None:
+    return look if look.points is not None and not look.guessed else None
