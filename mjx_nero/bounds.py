@@ -60,7 +60,6 @@ NonNegative = Annotated[float, Bounds(0.0)]
 Share = Annotated[float, Bounds(0.0, 1.0)]
 Count = Annotated[int, Bounds(1)]
 Whole = Annotated[int, Bounds(0)]
-Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # larger ones would repeat: a random key has 32 bits of it
 Range = Annotated[tuple[float, float], Ascending()]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]

@@ -211,7 +211,7 @@ def _checked(seed: Any, options: Any) -> int | None:
         raise gymnasium.error.Error(f"{error}: one seed is for all environments") from None
 
 
-def _check_shape(action: Any, shape: tuple[int, ...]) -> None:
+def _check_shape(action: Any, shape: tuple[int, ...] | None) -> None:
     """Raises ``gymnasium.error.InvalidAction`` where actions have another shape; their values stay where they are."""
     given = tuple(np.shape(action))
     if given != shape:
