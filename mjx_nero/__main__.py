@@ -16,6 +16,7 @@ COMMANDS = {
     "robustness": ("mjx_nero.tools.robustness", "main", "a policy's success over the range of each parameter of the world"),
     "benchmark": ("mjx_nero.tools.benchmark", "main", "what this machine does in a second"),
     "results": ("mjx_nero.tools.results", "main", "how every environment learns, and what the policies that ship achieve"),
+    "public-robots": ("mjx_nero.tools.public_robots", "main", "public descriptions imported and tried: their table"),
     "list-envs": ("mjx_nero.tools.inspection.command", "list_envs_main", "the environments: task, robot, sizes"),
     "inspect": (
         "mjx_nero.tools.inspection.command",

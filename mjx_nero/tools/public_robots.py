@@ -1,0 +1,147 @@
+"""The table of public robots: each of a list imported and tried with the script. See --help."""
+
+import pathlib
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mjx_nero import cli, files, values
+from mjx_nero.errors import UserError
+
+EPISODES = 16
+ENOUGH = 14  # of them succeed
+_LONGEST = 300  # seconds for an import or its episodes
+_COLUMNS = ("robot", "repository, commit", "file", "flags", "gripper", "opening", "`pick_place`", "seconds to import", "remarks")
+
+
+@dataclass(frozen=True)
+class Public:
+    """A robot's description in a public repository."""
+
+    repository: str
+    """OWNER/NAME."""
+    file: str
+    """Path in the repository."""
+    flags: str = ""
+    """What import-urdf takes besides."""
+    packages: tuple[str, ...] = ()
+    """Folders OWNER+NAME/... of packages that it mentions."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    parser = cli.Parser(
+        prog=cli.called_as("public-robots"),
+        description="Imports the robots of a list, lets the script pick and place with each, and makes the table of it.",
+    )
+    parser.add_argument("list", type=cli.path(".yaml"), help="repositories with their commits, and robots")
+    parser.add_argument("--folder", type=cli.path(), required=True, help="where the repositories lie, as OWNER+NAME")
+    parser.add_argument("--json", type=cli.path(".json"), required=True, help="the figures; what it holds already is kept")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write the table of all that the JSON file holds")
+    parser.add_argument("--robots", help="list (default: all that the JSON file lacks); none: only the table")
+    args, _ = parser.parse(argv)
+    commits, robots = read(args.list)
+    files.check_writable(args.json)
+    held: dict[str, Any] = files.read_yaml(args.json) if args.json.exists() else {}
+    if args.robots == "none":
+        names = []
+    else:
+        names = cli.choices(args.robots, "robot", robots) if args.robots else [n for n in robots if n not in held]
+    for name in names:
+        held[name] = trial(robots[name], args.folder)
+        files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
+        print(f"{name}: {_result(held[name])}", file=sys.stderr)
+    if args.markdown:
+        with files.whole(args.markdown) as part:
+            part.write_text(markdown(commits, robots, held))
+
+
+def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
+    """Commits by repository, and robots by name.
+
+    Raises:
+        UserError: the file is no such list.
+    """
+    held = files.read_yaml(path)
+    if (
+        not isinstance(held, dict)
+        or set(held) != {"repositories", "robots"}
+        or not all(isinstance(v, dict) for v in held.values())
+    ):
+        raise UserError(f"{path} is no list of robots: give it the mappings 'repositories' and 'robots'")
+    commits = {name: values.read(str, commit, name) for name, commit in held["repositories"].items()}
+    robots = {name: values.read(Public, robot, f"robots.{name}") for name, robot in held["robots"].items()}
+    for name, robot in robots.items():
+        if robot.repository not in commits:
+            raise UserError(f"{path}: {name}: {values.unknown('repository', robot.repository, commits)}")
+    return commits, robots
+
+
+def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
+    """A robot imported and tried, or the line that says why not."""
+    source = folder / robot.repository.replace("/", "+") / robot.file
+    packages = [word for name in robot.packages for word in ("--package", str(folder / name))]
+    with tempfile.TemporaryDirectory() as scratch:
+        out, result = pathlib.Path(scratch, "robot"), pathlib.Path(scratch, "result.json")
+        begun = time.monotonic()
+        failed = _failure("import-urdf", source, "--out", out, *packages, *shlex.split(robot.flags))
+        if failed:
+            return {"failed": "import", "reason": failed}
+        row: dict[str, Any] = {"seconds": round(time.monotonic() - begun, 1), **_imported(out)}
+        play = ("--controller", "expert", "--backend", "mujoco", "--episodes", EPISODES, "--json", result)
+        failed = _failure("eval", "--env", "pick_place", "--robot", out, *play)
+        if failed:
+            return row | {"failed": "episodes", "reason": failed}
+        figures = files.read_yaml(result)
+        return row | {name: figures[name] for name in ("success_rate", "grasp_rate", "dropped_rate", "episodes")}
+
+
+def _failure(command: str, *words: object) -> str:
+    """The line in which a command ends that fails, else nothing."""
+    line = [sys.executable, "-m", "mjx_nero", command, *map(str, words)]
+    try:
+        done = subprocess.run(line, capture_output=True, text=True, timeout=_LONGEST, check=False)
+    except subprocess.TimeoutExpired:
+        return f"takes more than {_LONGEST} s"
+    lines = done.stderr.strip().splitlines() or [f"exit {done.returncode}"]
+    return lines[-1].removeprefix("error: ") if done.returncode else ""
+
+
+def _imported(out: pathlib.Path) -> dict[str, Any]:
+    """What an import says of the gripper, and what it warns of."""
+    robot, report = files.read_yaml(out / "robot.yaml"), files.read_yaml(out / "report.json")
+    return {
+        "gripper": list(robot["gripper"] or ()),
+        "opening": robot["opening"],
+        "warnings": report["warnings"],
+    }
+
+
+def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Mapping[str, dict[str, Any]]) -> str:
+    """The table as Markdown, a row a robot that was tried."""
+    good = sum(_success(row) >= ENOUGH for row in held.values())
+    lines = [_COLUMNS, tuple("---" for _ in _COLUMNS)]
+    for name, robot in robots.items():
+        if row := held.get(name):
+            where = f"{robot.repository} {commits[robot.repository]}"
+            flags = " ".join([robot.flags, *(f"--package {package}" for package in robot.packages)]).strip()
+            opening = f"{1000 * row['opening']:.0f} mm" if row.get("opening") else ""
+            said = row.get("reason") or "; ".join(row["warnings"])
+            result = "" if "failed" in row else _result(row)
+            cells = name, where, robot.file, flags and f"`{flags}`", ", ".join(row.get("gripper", [])), opening, result
+            lines.append((*cells, str(row.get("seconds", "")), said.replace("|", "\\|")))
+    table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return f"{good} of {len(held)} robots succeed in at least {ENOUGH} of {EPISODES} episodes.\n\n{table}"
+
+
+def _success(row: Mapping[str, Any]) -> int:
+    return round(row.get("success_rate", 0) * row.get("episodes", 0))
+
+
+def _result(row: Mapping[str, Any]) -> str:
+    return f"{row['failed']}: {row['reason']}" if "failed" in row else f"{_success(row)} of {row['episodes']}"
