@@ -1,5 +1,6 @@
 """The table of public robots: each of a list imported and tried with the script. See --help."""
 
+import json
 import pathlib
 import shlex
 import subprocess
@@ -47,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
     args, _ = parser.parse(argv)
     commits, robots = read(args.list)
     files.check_writable(args.json)
-    held: dict[str, Any] = files.read_yaml(args.json) if args.json.exists() else {}
+    held = figures(args.json) if args.json.exists() else {}
     if args.robots == "none":
         names = []
     else:
@@ -82,6 +83,21 @@ def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
     return commits, robots
 
 
+def figures(path: pathlib.Path) -> dict[str, Any]:
+    """What a JSON file holds.
+
+    Raises:
+        UserError: it is none, or no mapping.
+    """
+    try:
+        held = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
+        held = None
+    if not isinstance(held, dict):
+        raise UserError(f"{path} holds no figures: name another file")
+    return held
+
+
 def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
     """A robot imported and tried, or the line that says why not."""
     source = folder / robot.repository.replace("/", "+") / robot.file
@@ -91,14 +107,14 @@ def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
         begun = time.monotonic()
         failed = _failure("import-urdf", source, "--out", out, *packages, *shlex.split(robot.flags))
         if failed:
-            return {"failed": "import", "reason": failed}
+            return {"failed": "import", "reason": failed.replace(f"{folder}/", "")}
         row: dict[str, Any] = {"seconds": round(time.monotonic() - begun, 1), **_imported(out)}
         play = ("--controller", "expert", "--backend", "mujoco", "--episodes", EPISODES, "--json", result)
         failed = _failure("eval", "--env", "pick_place", "--robot", out, *play)
         if failed:
             return row | {"failed": "episodes", "reason": failed}
-        figures = files.read_yaml(result)
-        return row | {name: figures[name] for name in ("success_rate", "grasp_rate", "dropped_rate", "episodes")}
+        played = figures(result)
+        return row | {name: played[name] for name in ("success_rate", "grasp_rate", "dropped_rate", "episodes")}
 
 
 def _failure(command: str, *words: object) -> str:
@@ -114,7 +130,7 @@ def _failure(command: str, *words: object) -> str:
 
 def _imported(out: pathlib.Path) -> dict[str, Any]:
     """What an import says of the gripper, and what it warns of."""
-    robot, report = files.read_yaml(out / "robot.yaml"), files.read_yaml(out / "report.json")
+    robot, report = files.read_yaml(out / "robot.yaml"), figures(out / "report.json")
     return {
         "gripper": list(robot["gripper"] or ()),
         "opening": robot["opening"],

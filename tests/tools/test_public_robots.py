@@ -1,0 +1,75 @@
+"""The table of public robots: its list, what it says of a robot, and of one that it cannot import or play with."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mjx_nero.tools import public_robots
+from mjx_nero.types import UserError
+from tests import urdf_files
+
+LIST = Path(__file__).parents[2] / "docs" / "public_robots.yaml"
+
+
+def listed(folder: Path, text: str) -> Path:
+    path = folder / "list.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_projects_own_list_names_arms_enough():
+    commits, robots = public_robots.read(LIST)
+    assert len(robots) >= 40 and {robot.repository for robot in robots.values()} <= set(commits)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "is no list of robots"),
+        ("repositories: {}", "is no list of robots"),
+        ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/c, file: r.urdf}}", "no repository 'a/c'"),
+        ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/b}}", "file"),
+        ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/b, file: r.urdf, flag: x}}", "'flag'"),
+    ],
+)
+def test_a_list_with_a_mistake_ends_in_one_line(tmp_path, text, message):
+    with pytest.raises(UserError, match=message):
+        public_robots.read(listed(tmp_path, text))
+
+
+def test_figures_that_are_none_are_refused(tmp_path):
+    for text in ("[" * 100_000, "[]", "3", "{"):
+        (tmp_path / "held.json").write_text(text)
+        with pytest.raises(UserError, match="holds no figures"):
+            public_robots.figures(tmp_path / "held.json")
+
+
+@pytest.mark.slow
+def test_a_robot_that_fails_stands_in_the_table_with_its_reason(tmp_path):
+    urdf_files.write(tmp_path / "a+b", urdf_files.robot(urdf_files.base()), "box.urdf")
+    path = listed(
+        tmp_path,
+        "repositories: {a/b: abc1234}\nrobots: {Box: {repository: a/b, file: box.urdf}, Other: {repository: a/b, file: x.urdf}}",
+    )
+    held, table = tmp_path / "held.json", tmp_path / "table.md"
+    public_robots.main([str(path), "--folder", str(tmp_path), "--json", str(held), "--markdown", str(table)])
+    rows = json.loads(held.read_text())
+    assert {name: row["failed"] for name, row in rows.items()} == {"Box": "import", "Other": "import"}
+    assert "no joint that moves" in rows["Box"]["reason"] and rows["Other"]["reason"] == "there is no file a+b/x.urdf"
+    text = table.read_text()
+    assert (
+        text.startswith("0 of 2 robots succeed") and "| Box | a/b abc1234 | box.urdf |" in text and rows["Box"]["reason"] in text
+    )
+
+
+def test_the_table_counts_robots_that_mostly_succeed():
+    robots = {"A": public_robots.Public("a/b", "a.urdf", "--arg x:=1", ("c+d/e",)), "B": public_robots.Public("a/b", "b.urdf")}
+    row = {"episodes": 16, "seconds": 9.5, "gripper": ["jaw"], "opening": 0.08, "warnings": ["B: a|b"]}
+    held = {"A": row | {"success_rate": 14 / 16}, "B": row | {"success_rate": 13 / 16}}
+    text = public_robots.markdown({"a/b": "abc1234"}, robots, held)
+    assert (
+        text.startswith("1 of 2 robots")
+        and "`--arg x:=1 --package c+d/e` | jaw | 80 mm | 14 of 16 | 9.5" in text
+        and "a\\|b" in text
+    )
