@@ -108,7 +108,7 @@ def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
         failed = _failure("import-urdf", source, "--out", out, *packages, *shlex.split(robot.flags))
         if failed:
             return {"failed": "import", "reason": failed.replace(f"{folder}/", "")}
-        row: dict[str, Any] = {"seconds": round(time.monotonic() - begun, 1), **_imported(out)}
+        row: dict[str, Any] = {"seconds": round(time.monotonic() - begun, 1), **_imported(out, folder)}
         play = ("--controller", "expert", "--backend", "mujoco", "--episodes", EPISODES, "--json", result)
         failed = _failure("eval", "--env", "pick_place", "--robot", out, *play)
         if failed:
@@ -128,13 +128,13 @@ def _failure(command: str, *words: object) -> str:
     return lines[-1].removeprefix("error: ") if done.returncode else ""
 
 
-def _imported(out: pathlib.Path) -> dict[str, Any]:
+def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
     """What an import says of the gripper, and what it warns of."""
     robot, report = files.read_yaml(out / "robot.yaml"), figures(out / "report.json")
     return {
         "gripper": list(robot["gripper"] or ()),
         "opening": robot["opening"],
-        "warnings": report["warnings"],
+        "warnings": [text.replace(f"{folder}/", "") for text in report["warnings"]],
     }
 
 
