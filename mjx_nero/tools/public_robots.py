@@ -1,6 +1,5 @@
 """The table of public robots: each of a list imported and tried with the script. See --help."""
 
-import json
 import pathlib
 import shlex
 import subprocess
@@ -89,10 +88,7 @@ def figures(path: pathlib.Path) -> dict[str, Any]:
     Raises:
         UserError: it is none, or no mapping.
     """
-    try:
-        held = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        held = None
+    held = files.read_json(path)
     if not isinstance(held, dict):
         raise UserError(f"{path} holds no figures: name another file")
     return held

@@ -41,7 +41,7 @@ def test_a_list_with_a_mistake_ends_in_one_line(tmp_path, text, message):
 def test_figures_that_are_none_are_refused(tmp_path):
     for text in ("[" * 100_000, "[]", "3", "{"):
         (tmp_path / "held.json").write_text(text)
-        with pytest.raises(UserError, match="holds no figures"):
+        with pytest.raises(UserError, match="held.json"):
             public_robots.figures(tmp_path / "held.json")
 
 
