@@ -416,6 +416,82 @@ def test_packages_that_are_none(tmp_path):
         roots.find("package://hand/no.stl")
 
 
+@pytest.mark.parametrize(
+    "urdf, there, name, found",
+    [
+        # name of the URDF's folder, files that exist (a package.xml with its name), name in the URDF, the file found
+        ("other", ["other/m.stl"], "package://pkg/m.stl", None),
+        ("other/urdf", ["other/m.stl"], "package://pkg/m.stl", None),
+        ("other", ["other/m.stl"], "package://pkg/../m.stl", None),
+        ("a pkg/urdf", ["a pkg/m.stl"], "package://a pkg/m.stl", "a pkg/m.stl"),
+        ("other", ["other/m.stl", "other/package.xml:third"], "package://pkg/m.stl", None),
+        ("other", ["other/m.stl", "beside/m.stl"], "package://pkg/m.stl", None),
+        ("other", ["other/m.stl", "other/package.xml:pkg"], "package://pkg/m.stl", "other/m.stl"),
+        ("other/urdf", ["other/m.stl", "other/package.xml:pkg"], "package://pkg/m.stl", "other/m.stl"),
+        ("other", ["other/inner/m.stl", "other/inner/package.xml:pkg"], "package://pkg/m.stl", "other/inner/m.stl"),
+        ("pkg/urdf", ["pkg/m.stl"], "package://pkg/m.stl", "pkg/m.stl"),
+        ("pkg", ["pkg/m.stl"], "package://pkg/m.stl", "pkg/m.stl"),
+        ("other", ["other/pkg/m.stl"], "package://pkg/m.stl", "other/pkg/m.stl"),
+        ("other", ["other/meshes/m.stl"], "package://meshes/m.stl", "other/meshes/m.stl"),
+        ("other/urdf", ["other/meshes/m.stl"], "package://meshes/m.stl", "other/meshes/m.stl"),
+        # the nearest, and of several the one that holds the file
+        ("a/b/pkg/urdf", ["pkg/m.stl", "pkg/package.xml:pkg", "a/b/pkg/m.stl"], "package://pkg/m.stl", "a/b/pkg/m.stl"),
+        ("a/b/pkg/urdf", ["pkg/m.stl", "pkg/package.xml:pkg", "a/b/pkg/n.stl"], "package://pkg/m.stl", "pkg/m.stl"),
+        ("a/b", ["pkg/m.stl", "pkg/package.xml:pkg", "a/pkg/package.xml:pkg"], "package://pkg/m.stl", "pkg/m.stl"),
+        # paths of another machine
+        ("pkg/urdf", ["pkg/s/m.stl"], "file:///home/no/share/pkg/s/m.stl", "pkg/s/m.stl"),
+        ("pkg/urdf", ["pkg/s/m.stl"], "/home/no/pkg/s/m.stl", "pkg/s/m.stl"),
+        ("pkg/urdf", ["pkg/s/a b.stl"], "file:///home/no/pkg/s/a%20b.stl", "pkg/s/a b.stl"),
+        ("pkg/urdf", ["pkg/s/m.stl"], "C:\\no\\pkg\\s\\m.stl", "pkg/s/m.stl"),
+        ("a/b", ["pkg/m.stl", "pkg/package.xml:pkg"], "/home/no/pkg/m.stl", "pkg/m.stl"),
+        ("other", ["other/pkg/m.stl"], "file:///home/no/share/pkg/m.stl", "other/pkg/m.stl"),
+        ("other", ["other/meshes/m.stl", "other/m.stl"], "/home/no/pkg/meshes/m.stl", UserError),
+        ("other/urdf", ["other/urdf/m.stl"], "/home/no/pkg/urdf/m.stl", UserError),
+        ("pkg", ["secret/m.stl", "pkg/n.stl"], "/home/no/pkg/../secret/m.stl", UserError),
+        ("pkg", ["secret/m.stl", "pkg/m.stl>secret/m.stl"], "/home/no/pkg/m.stl", UserError),
+        ("other", ["secret/m.stl", "other/pkg>secret"], "package://pkg/m.stl", UserError),
+        ("a/b", ["secret/m.stl", "secret/package.xml:pkg", "pkg>secret"], "package://pkg/m.stl", None),
+        ("other", ["secret/m.stl", "secret/package.xml:pkg", "other/in>secret"], "package://pkg/m.stl", None),
+    ],
+)
+def test_what_is_a_package(tmp_path, urdf, there, name, found):
+    (tmp_path / urdf).mkdir(parents=True)
+    for file in there:
+        path, sign, more = re.fullmatch(r"([^:>]*)([:>]?)(.*)", file).groups()
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        if sign == ">":
+            (tmp_path / path).symlink_to(tmp_path / more)
+        else:
+            (tmp_path / path).write_text(PACKAGE.format(more) if sign else "")
+    roots = files.Roots(tmp_path / urdf / "robot.urdf", {})
+    if found is None:
+        with pytest.raises(files.Absent, match="no folder here is package 'pkg': pass --package pkg=DIR"):
+            roots.find(name)
+    elif found is UserError:
+        with pytest.raises(UserError, match="lies outside.*--package NAME=DIR"):
+            roots.find(name)
+    else:
+        assert roots.find(name) == tmp_path / found
+
+
+@pytest.mark.parametrize("package", ["", ".", "..", "a" * 5000])
+def test_what_no_package_is_called(tmp_path, package):
+    make.box(tmp_path / "pkg" / "m.stl", (0, 0, 0), (1, 1, 1))
+    with pytest.raises(files.Absent):
+        files.Roots(tmp_path / "pkg" / "urdf" / "robot.urdf", {}).find(f"package://{package}/m.stl")
+
+
+@pytest.mark.parametrize("name", ["package://pkg/m.stl", "/home/no/pkg/m.stl", "file:///home/no/share/pkg/m.stl"])
+def test_a_given_package_is_the_only_one(tmp_path, name):
+    for folder in ("pkg", "given"):
+        make.box(tmp_path / folder / "m.stl", (0, 0, 0), (1, 1, 1))
+    roots = files.Roots(tmp_path / "pkg" / "robot.urdf", {"pkg": tmp_path / "given"})
+    assert roots.find(name) == tmp_path / "given" / "m.stl"
+    (tmp_path / "given" / "m.stl").unlink()
+    with pytest.raises((files.Absent, UserError)):
+        roots.find(name)
+
+
 def test_a_home_is_no_package(tmp_path, monkeypatch):
     make.write(tmp_path, PACKAGE.format("me"), "package.xml")
     make.box(tmp_path / "m.stl", (0, 0, 0), (1, 1, 1))
