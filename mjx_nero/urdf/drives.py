@@ -25,6 +25,7 @@ SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
 FORCE = 60.0  # [N] most that a finger gives
 PRESS = 250.0  # [N/kg] and most for the mass of what the gripper can lift: pads sink into it by a millimetre then
+HOLD = 20.0  # [N/kg] and the least: two pads then hold twice the weight of that at a friction of 0.5
 PLACEHOLDER = 1.0  # [N m, N] exporters write it where nobody gave an effort
 FINGER = 0.3  # [kg] rotor inertia of a sliding finger, or at the end of a turning one (why: assets/nero/nero.xml)
 Rows = dict[str, dict[str, float]]
@@ -97,12 +98,13 @@ def rows(
     moves its joint, is none. An arm's drive has the natural frequency ``FREQUENCY`` with the most inertia that the joint moves,
     more if the joint's own damping would make it creep or its friction stop it more than ``STUCK`` away, less if it would reach
     its full effort within ``STRETCH``; a finger's gives its full effort (at most ``FORCE`` at its end, and ``PRESS`` for each
-    kilogram of the cube that it can lift) at ``SQUEEZE``. Damping is what the joint lacks to critical, at the package's longest
-    physics step too.
+    kilogram of the cube that it can lift) at ``SQUEEZE``, with a warning if it is less than ``HOLD`` for each. Damping is what
+    the joint lacks to critical, at the package's longest physics step too.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
-    force = min(FORCE, PRESS * grasp.DENSITY * grasp.edge(hand.gap, hand.pad) ** 3) if hand.gap > 0 else FORCE
+    cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad) ** 3 if hand.gap > 0 else 0.0
+    force = min(FORCE, PRESS * cube) if cube else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
     followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic]
     for joint in driven:
@@ -135,5 +137,15 @@ def rows(
             notes.add(
                 "guessed", "joint", joint.name, f"stiffness {stiffness:.4g} and damping {row['damping']:.4g}, by its inertia"
             )
+        if finger and row["effort"] < HOLD * cube * lever:
+            notes.add("warning", "joint", joint.name, _weak(row["effort"], lever, cube))
         out[joint.name] = {column: float(f"{value:.6g}") for column, value in row.items()}
     return out
+
+
+def _weak(effort: float, lever: float, cube: float) -> str:
+    """What to say of a finger's effort that does not hold ``cube`` [kg] at ``lever`` [m], 1 of a slide."""
+    return (
+        f"effort {effort:.3g} grips with {effort / lever:.2g} N, too little for a cube of {1000 * cube:.3g} g: "
+        f"give its motor's, at least {1.01 * HOLD * cube * lever:.3g}, with --gains"
+    )

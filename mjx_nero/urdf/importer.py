@@ -108,13 +108,17 @@ def import_urdf(
 
 
 def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
-    """With inertia tensors from the links' shapes where the URDF has none, and masses where no link has any."""
+    """With what shapes tell: tensors where the URDF has none, masses where no link, or none of a moving body, has any."""
     seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
     masses = {n: link.mass for n, link in tree.links.items()}
+    shown = {n: points if looks.of[n].drawn else None for n, points in seen.items()}
     if sum(m.mass for m in masses.values()) < inertia.LIGHTEST * len(masses):
-        masses = {n: inertia.weighed(m, seen[n] if looks.of[n].drawn else None) for n, m in masses.items()}
+        masses = {n: inertia.weighed(m, shown[n]) for n, m in masses.items()}
         total = sum(m.mass for m in masses.values())
         notes.add("guessed", "robot", tree.name, f"no link has a mass: now {total:.3g} kg, the shapes filled with water")
+    for body in bodies(tree).values():
+        if body.joint and sum(masses[n].mass for n in body.links) < inertia.PLACEHOLDER:
+            masses |= {n: inertia.guessed(masses[n], shown[n], n, notes) for n in body.links}
     links = {n: dataclasses.replace(tree.links[n], mass=inertia.filled(m, seen[n], n, notes)) for n, m in masses.items()}
     return dataclasses.replace(tree, links=links)
 

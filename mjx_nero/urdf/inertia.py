@@ -12,14 +12,15 @@ LIGHTEST = 1e-3  # [kg] what a moving body is given at least: little enough to l
 LIGHTEST_RADIUS = 0.01  # [m] ... spread like a ball of this size at least
 DENSITY = 1000.0  # [kg/m3]
 MAX_MASS = 1e6  # [kg]
+EXACT, ROUNDED = 1e-6, 0.02  # of the largest second moment: what floats lose, and what figures rounded to two digits can
 
 
 def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
     """Mass and tensor of a link, in the link's frame, with the tensor turned from the inertial frame to the link's.
 
-    What is no number, negative or beyond reason becomes 0, and is repaired as ``repaired`` does. A tensor that no mass
-    distribution can have (one of its second moments ``tr(I)/2 - I`` negative) gets the nearest that one can: the negative
-    moments are set to 1% of the largest.
+    What is no number, negative or beyond reason becomes 0. Moments of inertia that only have the wrong sign get the right one.
+    What no mass distribution can have (one of the second moments ``tr(I)/2 - I`` is negative) stays for ``filled`` if it is
+    more than rounding.
     """
     origin = np.eye(4) if inertial.origin is None else inertial.origin
     mass = 0.0 if inertial.mass is None else float(inertial.mass)
@@ -34,26 +35,16 @@ def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
         notes.add("warning", "link", name, "an inertia without mass: left out")
         tensor = np.zeros((3, 3))
     if tensor.any():
-        values, axes = np.linalg.eigh(tensor)
-        moments = values.sum() / 2 - values
-        largest = moments.max()
-        if largest <= 0:
-            notes.add("repaired", "link", name, f"principal inertias {_list(values)} are not positive: taken as 0")
-            tensor = np.zeros((3, 3))
-        elif moments.min() < -1e-6 * largest:
-            moments = np.maximum(moments, 0.01 * largest)
-            tensor = axes @ np.diag(moments.sum() - moments) @ axes.T
-            notes.add(
-                "repaired",
-                "link",
-                name,
-                f"no body has the principal inertias {_list(values)}: now {_list(np.linalg.eigvalsh(tensor))}",
-            )
+        tensor = _signed(tensor, name, notes)
+        if EXACT < _lack(tensor) <= ROUNDED:
+            read, tensor = tensor, _nearest(tensor)
+            notes.add("repaired", "link", name, f"{_impossible(read)}, by rounding: now {_principal(tensor)}")
     return Mass(mass, np.zeros(3), tensor).moved(origin)
 
 
 def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
-    """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero.
+    """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero or such
+    as no body has (without a shape, the nearest that one can have).
 
     Also notes what is suspicious and leaves it alone: a placeholder's mass, mass that would have to lie outside the shape.
     """
@@ -61,23 +52,40 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
         return mass
     if mass.mass < PLACEHOLDER:
         notes.add("note", "link", name, f"{mass.mass:g} kg looks like a placeholder")
-    if mass.inertia.any():
+    lack = _lack(mass.inertia)
+    if mass.inertia.any() and lack <= ROUNDED:
         if points is not None and mass.mass >= PLACEHOLDER:
             _compare(mass, points, name, notes)
         return mass
-    if points is None:
-        tensor = _ball(mass.mass, max(LIGHTEST_RADIUS, (mass.mass / DENSITY / 4.19) ** (1 / 3)))
-        what = f"a ball of {DENSITY:g} kg/m3"
-    else:
+    if points is not None:
         moments = np.maximum(np.ptp(points, axis=0), 1e-3) ** 2 * mass.mass / 12
-        tensor, what = np.diag(moments.sum() - moments), "a box around its shape"
-    if mass.mass >= PLACEHOLDER:
-        notes.add("repaired", "link", name, f"the inertia was zero: now that of {what}")
+        tensor, what = np.diag(moments.sum() - moments), "that of a box around its shape"
+    elif ROUNDED < lack < np.inf:
+        tensor, what = _nearest(mass.inertia), "the nearest that one has"
+    else:
+        tensor = _ball(mass.mass, max(LIGHTEST_RADIUS, (mass.mass / DENSITY / 4.19) ** (1 / 3)))
+        what = f"that of a ball of {DENSITY:g} kg/m3"
+    if lack > ROUNDED:
+        text = f"{_impossible(mass.inertia)}: now {_principal(tensor)}, {what}; correct its <inertia>"
+        notes.add("warning", "link", name, text)
+    elif mass.mass >= PLACEHOLDER:
+        notes.add("repaired", "link", name, f"the inertia was zero: now {what}")
     return Mass(mass.mass, mass.com, tensor)
 
 
+def guessed(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
+    """Of a link of a moving body that weighs nothing, where others have masses: as ``weighed``, if that is more."""
+    out = weighed(mass, points)
+    if out.mass <= max(mass.mass, PLACEHOLDER):
+        return mass
+    notes.add(
+        "guessed", "link", name, f"moves with {mass.mass:g} kg: now {out.mass:.3g} kg, its shape filled with water; weigh it"
+    )
+    return out
+
+
 def weighed(mass: Mass, points: Points | None) -> Mass:
-    """Of a link of a robot that says no masses: that of the convex hull of its shape's ``points`` [n, 3], as heavy as water."""
+    """Of a link whose mass nobody says: that of the convex hull of its shape's ``points`` [n, 3], as heavy as water."""
     if points is None:
         return mass
     return Mass(DENSITY * primitives.hull(points), points.mean(0), np.zeros((3, 3)))
@@ -114,6 +122,44 @@ def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
     if ratio > 1:
         text = f"the inertia needs mass outside the link: {ratio:.1f} times the most that fits its shape (kept)"
         notes.add("note", "link", name, text)
+
+
+def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
+    """With positive moments of inertia, if they make it one that a body can have: all signs turned, or those of negative ones."""
+    diagonal = np.diag(tensor)
+    if not (diagonal < 0).any():
+        return tensor
+    turned = -tensor if (diagonal <= 0).all() else tensor - np.diag(diagonal) + np.diag(np.abs(diagonal))
+    if _lack(turned) > ROUNDED:
+        return tensor
+    text = f"the moments of inertia {_list(diagonal)} have a wrong sign: now {_list(np.diag(turned))}; correct its <inertia>"
+    notes.add("warning", "link", name, text)
+    return turned
+
+
+def _lack(tensor: Matrix) -> float:
+    """What the least second moment lacks to 0, as a share of the largest; infinite where none is positive, 0 of no tensor."""
+    values = np.linalg.eigvalsh(tensor)
+    moments = values.sum() / 2 - values
+    if moments.max() <= 0:
+        return np.inf if tensor.any() else 0.0
+    return float(max(-moments.min() / moments.max(), 0.0))
+
+
+def _nearest(tensor: Matrix) -> Matrix:
+    """With second moments of at least 1% of the largest."""
+    values, axes = np.linalg.eigh(tensor)
+    moments = values.sum() / 2 - values
+    moments = np.maximum(moments, 0.01 * moments.max())
+    return axes @ np.diag(moments.sum() - moments) @ axes.T
+
+
+def _impossible(tensor: Matrix) -> str:
+    return f"no body has the principal inertias {_principal(tensor)}"
+
+
+def _principal(tensor: Matrix) -> str:
+    return _list(np.linalg.eigvalsh(tensor))
 
 
 def _list(values: Vec) -> str:
