@@ -239,7 +239,7 @@ def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
     if kind == "sphere":
         return trimesh.creation.icosphere(3, size[0])
     if kind == "cylinder":
-        return trimesh.creation.cylinder(*size)
+        return trimesh.creation.cylinder(size[0], size[1])
     capsule = trimesh.creation.capsule(height=size[1], radius=size[0])
     return capsule.apply_translation(-capsule.bounds.mean(0))
 
