@@ -50,6 +50,9 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point, in metres (default: amid the fingers' ends)")
     parser.add_argument("--home", metavar="J=VALUE,...", help="home positions of some joints [rad, m] (default: guessed)")
+    parser.add_argument(
+        "--degrees", action="store_true", help="the URDF gives the limits and velocities of its hinges in degrees"
+    )
     parser.add_argument("--strict", action="store_true", help="a warning is an error")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
     args, rest = parser.parse_known_args(argv)
@@ -67,6 +70,7 @@ def main(argv: Sequence[str]) -> None:
         gripper=gripper,
         ee=args.ee,
         home=_positions(args.home),
+        degrees=args.degrees,
         strict=args.strict,
         force=args.force,
     )

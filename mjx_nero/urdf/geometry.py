@@ -23,6 +23,8 @@ MAX_SHAPES = 4_000  # visuals and collisions of a robot
 MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once for every scale
 MAX_FILES = model_file.MAX_MESHES  # that are drawn
 MAX_SECONDS = 60.0  # [s] of processor time
+MAX_SPAN = 10.0  # [m] of a mesh and its link's origin, and ...
+MAX_SPANS = 50.0  # ... of the longest joint offset: one beyond both is in millimetres
 MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
 GREY = (0.75, 0.76, 0.78, 1.0)
 STAND_IN = (0.9, 0.6, 0.2, 1.0)
@@ -64,7 +66,8 @@ class Looks:
         of: link -> its ``Look``.
 
     Raises:
-        UserError: a mesh lies outside the folders or is too large, or the robot has more shapes than the limits above allow.
+        UserError: a mesh lies outside the folders, is too large or looks to be in millimetres, or the robot has more shapes than
+            the limits above allow.
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], loader: meshes.Meshes, notes: Notes):
@@ -78,10 +81,12 @@ class Looks:
             raise UserError(f"the URDF has {shapes:,} visuals and collisions: more than {MAX_SHAPES:,} are not read")
         drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
         self._share = MAX_DRAWN // max(len(drawn), 1)
+        self._spans: dict[tuple[str, tuple[float, ...]], float] = {}  # file and scale of a mesh -> its largest extent [m]
         self._absent: dict[str, str] = {}  # name of a mesh -> where it was looked for
         seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
         self._beside = {n for links in seen for n in links}  # links whose body has looks: what has none of its own is hidden
         self.of = {name: self._look(link) for name, link in tree.links.items()}
+        _check_units(self._spans, max(float(np.linalg.norm(j.origin[:3, 3])) for j in tree.joints.values()))
         if self._absent:
             notes.add("warning", "robot", tree.name, _told(self._absent))
         for body in parts.values():
@@ -155,14 +160,18 @@ class Looks:
             )
 
     def _load(self, shape: Shape) -> tuple[str, list[meshes.Part]]:
-        return self._meshes.load(shape.file) if shape.kind == "mesh" else ("", [(_solid(shape.kind, shape.size), None)])
+        if shape.kind != "mesh":
+            return "", [(_solid(shape.kind, shape.size), None)]
+        stem, parts = self._meshes.load(shape.file)
+        corners = np.concatenate([np.zeros((1, 3)), *(mesh.bounds for mesh, _ in parts)]) * shape.size
+        self._spans[shape.file, shape.size] = float(np.ptp(corners, axis=0).max())
+        return stem, parts
 
     def _draw(self, item: tuple[Shape, str, list[meshes.Part]], link: str) -> list[Drawn]:
         shape, stem, parts = item
-        if shape.kind == "box":
-            return [Drawn("box", tuple(s / 2 for s in shape.size), shape.origin, shape.rgba or GREY)]
-        if shape.kind == "sphere":
-            return [Drawn("sphere", shape.size, shape.origin, shape.rgba or GREY)]
+        exact = _exact(shape)
+        if exact is not None:
+            return [Drawn(exact.kind, exact.size, exact.pose, shape.rgba or GREY)]
         if shape.kind == "cylinder":
             return [Drawn("cylinder", (shape.size[0], shape.size[1] / 2), shape.origin, shape.rgba or GREY)]
         key = (shape.file, shape.size)
@@ -224,10 +233,30 @@ class Looks:
 
 @functools.lru_cache(maxsize=100)
 def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
-    """The surface of a URDF's box, sphere or cylinder."""
+    """The surface of a URDF's box, sphere, capsule or cylinder."""
     if kind == "box":
         return trimesh.creation.box(size)
-    return trimesh.creation.icosphere(3, size[0]) if kind == "sphere" else trimesh.creation.cylinder(size[0], size[1])
+    if kind == "sphere":
+        return trimesh.creation.icosphere(3, size[0])
+    if kind == "cylinder":
+        return trimesh.creation.cylinder(size[0], size[1])
+    capsule = trimesh.creation.capsule(height=size[1], radius=size[0])
+    return capsule.apply_translation(-capsule.bounds.mean(0))
+
+
+def _check_units(spans: Mapping[tuple[str, tuple[float, ...]], float], offset: float) -> None:
+    """Compares the meshes' extents with the longest joint offset [m].
+
+    Raises:
+        UserError: the largest mesh looks to be in millimetres.
+    """
+    (file, scale), span = max(spans.items(), key=lambda item: item[1], default=(("", ()), 0.0))
+    if span > max(MAX_SPAN, MAX_SPANS * offset):
+        wanted = " ".join(f"{s / 1000:g}" for s in scale)
+        raise UserError(
+            f"mesh {file!r} is {span:.3g} m large, but no joint is offset by more than {offset:.3g} m: the mesh looks to be in "
+            f'millimetres; give it scale="{wanted}" in the URDF'
+        )
 
 
 def _told(absent: Mapping[str, str]) -> str:
@@ -256,6 +285,8 @@ def _along(z: Vec) -> Matrix:
 def _exact(shape: Shape) -> primitives.Primitive | None:
     if shape.kind == "box":
         return primitives.Primitive("box", tuple(s / 2 for s in shape.size), shape.origin)
+    if shape.kind == "capsule":
+        return primitives.Primitive("capsule", (shape.size[0], shape.size[1] / 2), shape.origin)
     return primitives.Primitive("sphere", shape.size, shape.origin) if shape.kind == "sphere" else None
 
 
@@ -266,10 +297,9 @@ def _scaled(mesh: trimesh.Trimesh, scale: tuple[float, ...]) -> trimesh.Trimesh:
 
 def _volume(shape: Shape) -> float | None:
     """Of a primitive [m3]."""
-    if shape.kind == "box":
-        return float(np.prod(shape.size))
-    if shape.kind == "sphere":
-        return float(4 / 3 * np.pi * shape.size[0] ** 3)
+    exact = _exact(shape)
+    if exact is not None:
+        return exact.volume
     return float(np.pi * shape.size[0] ** 2 * shape.size[1]) if shape.kind == "cylinder" else None
 
 

@@ -35,6 +35,7 @@ def import_urdf(
     gripper: Sequence[str] | None = None,
     ee: str | None = None,
     home: Mapping[str, float] | None = None,
+    degrees: bool = False,
     strict: bool = False,
     force: bool = False,
 ) -> Report:
@@ -57,6 +58,7 @@ def import_urdf(
         gripper: joints that drive the gripper, in place of the guess (``hand.choose``); empty for none.
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
         home: positions of some joints [rad, m], in place of the guess (``home.home``).
+        degrees: limits and velocities of hinges are in degrees; slides, mimics and what is given here stay in metres and radians.
         strict: warnings become an error.
 
     Raises:
@@ -66,7 +68,7 @@ def import_urdf(
     folder.check(out, force)
     notes = Notes()
     roots = files.Roots(path, packages or {})
-    tree, mount = reader.read(path, roots, notes, args or {})
+    tree, mount = reader.read(path, roots, notes, args or {}, degrees=degrees)
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)

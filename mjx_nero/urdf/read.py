@@ -18,16 +18,24 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import MOVING, Joint, Link, Mass, Pose, Shape, Tree
 
 MAX_MOVING = 100  # MuJoCo's XML reader nests no deeper than a few hundred bodies
+MAX_TURNS = 4  # limits of a hinge beyond that look like degrees
+HINGES = ("revolute", "continuous")
 RESERVED = {"link": ("world", "cube", "goal"), "joint": ("cube",)}  # names that scenes use
 logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
 
 
 def read(
-    path: pathlib.Path, roots: files.Roots, notes: Notes, args: Mapping[str, str] = MappingProxyType({})
+    path: pathlib.Path,
+    roots: files.Roots,
+    notes: Notes,
+    args: Mapping[str, str] = MappingProxyType({}),
+    *,
+    degrees: bool = False,
 ) -> tuple[Tree, Pose]:
     """The robot that the file describes, and where its root stands in the world [4, 4].
 
     An empty root link ``world`` with one fixed joint is that joint's pose; it is left out of the tree.
+    With ``degrees`` the limits and velocities of hinges are read in degrees, not radians.
 
     Raises:
         UserError: the file is missing, too large, malformed, or describes no tree of links with fixed, revolute, continuous and
@@ -53,7 +61,27 @@ def read(
         )
     except Exception as error:  # what the checks above let through fails in yourdfpy in ways of its own
         raise UserError(f"{path} cannot be read as a URDF: {type(error).__name__}: {' '.join(str(error).split())}") from None
-    return _tree(urdf.robot, notes)
+    if degrees:
+        _to_radians(urdf.robot)
+    tree, mount = _tree(urdf.robot, notes)
+    if not degrees:
+        _suspect_degrees(tree, notes)
+    return tree, mount
+
+
+def _to_radians(robot: yourdfpy.Robot) -> None:
+    """Takes the limits and velocities of hinges for degrees."""
+    for limit in (j.limit for j in robot.joints if j.type in HINGES and j.limit is not None):
+        for field in ("lower", "upper", "velocity"):
+            value = getattr(limit, field)
+            setattr(limit, field, None if value is None else math.radians(value))
+
+
+def _suspect_degrees(tree: Tree, notes: Notes) -> None:
+    for joint in tree.joints.values():
+        if joint.type == "revolute" and max(abs(joint.lower), abs(joint.upper)) > MAX_TURNS * math.tau:
+            text = f"limits {joint.lower:g} .. {joint.upper:g} rad lie beyond {MAX_TURNS} turns, which looks like degrees"
+            notes.add("warning", "joint", joint.name, f"{text}: if they are, import with --degrees")
 
 
 def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
@@ -267,7 +295,10 @@ def _shape(entry: yourdfpy.Visual | yourdfpy.Collision, rgba: tuple[float, ...] 
     elif g.sphere is not None:
         kind, size = "sphere", (g.sphere.radius,)
     else:
-        kind, size = "cylinder", (g.cylinder.radius, g.cylinder.length)
+        kind = "capsule" if entry.name == validate.CAPSULE else "cylinder"
+        size = g.cylinder.radius, g.cylinder.length
+        if kind == "capsule" and 0 <= g.cylinder.length <= 1e-6:
+            kind, size = "sphere", size[:1]
     if min(size) <= 1e-6:
         raise ValueError(f"its {kind} has the size {' '.join(f'{s:g}' for s in size)}")
     return Shape(kind, size, origin, rgba=rgba)

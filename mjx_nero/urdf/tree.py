@@ -20,8 +20,8 @@ class Shape:
     """A visual or a collision.
 
     Attributes:
-        kind: ``box``, ``sphere``, ``cylinder`` or ``mesh``.
-        size: full extents, (radius,) or (radius, length) [m]; of a mesh the scale along x, y and z.
+        kind: ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``mesh``.
+        size: full extents, (radius,) or (radius, length without a capsule's ends) [m]; of a mesh the scale along x, y and z.
         origin: pose in the link [4, 4].
         file: of a mesh, as the URDF names it.
         rgba: colour, if the URDF gives one.

@@ -10,7 +10,8 @@ from mjx_nero.urdf.report import Notes
 MAX_ELEMENTS = 5_000  # links and joints
 MAX_NUMBER = 1e6  # [m, kg]
 MAX_NAME = 150  # characters: scenes and models add to it
-_SHAPES = ("box", "cylinder", "sphere", "mesh")
+CAPSULE = "capsule"
+_SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
 # tag -> attribute -> how many numbers it holds; None: 1 or 3
 _NUMBERS: dict[str, dict[str, int | None]] = {
     "origin": {"xyz": 3, "rpy": 3},
@@ -18,6 +19,7 @@ _NUMBERS: dict[str, dict[str, int | None]] = {
     "mass": {"value": 1},
     "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
     "box": {"size": 3},
+    "capsule": {"radius": 1, "length": 1},
     "cylinder": {"radius": 1, "length": 1},
     "sphere": {"radius": 1},
     "mesh": {"scale": None},
@@ -26,7 +28,13 @@ _NUMBERS: dict[str, dict[str, int | None]] = {
     "mimic": {"multiplier": 1, "offset": 1},
     "color": {"rgba": 4},
 }
-_NEEDED = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",), "mesh": ("filename",)}
+_NEEDED = {
+    "box": ("size",),
+    "capsule": ("radius", "length"),
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
+    "mesh": ("filename",),
+}
 _REPAIRED = ("mass", "inertia", "limit", "dynamics", "color")  # where numbers that are not finite are not the end
 
 
@@ -72,6 +80,8 @@ def check(root: etree._Element, notes: Notes) -> None:
                 element.remove(shape)
         for part in element.iter():
             _check_numbers(part, kind, name)
+        for shape in element.findall("visual") + element.findall("collision"):
+            _name_capsule(shape)
         for tensor in element.iter("inertia"):
             for axis in ("ixx", "iyy", "izz"):
                 tensor.set(axis, tensor.get(axis, "0"))  # yourdfpy would make it 1 kg m2
@@ -84,6 +94,15 @@ def _unusable(shape: etree._Element) -> str:
         return f"its geometry is {kinds[0] if kinds else 'missing'}: {', '.join(_SHAPES)} are known"
     lacking = [a for a in _NEEDED[kinds[0]] if not (geometry[0].get(a) or "").strip()]
     return f"its {kinds[0]} has no {lacking[0]}" if lacking else ""
+
+
+def _name_capsule(shape: etree._Element) -> None:
+    """Makes a capsule a cylinder whose visual or collision is called ``CAPSULE``: yourdfpy reads no capsules."""
+    solid = shape.find("geometry")[0]
+    shape.attrib.pop("name", None)
+    if solid.tag == CAPSULE:
+        shape.set("name", CAPSULE)
+        solid.tag = "cylinder"
 
 
 def _check_numbers(part: etree._Element, kind: str, name: str) -> None:

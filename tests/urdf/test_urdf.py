@@ -18,10 +18,10 @@ import mjx_nero
 from mjx_nero.sim import grasp, robot_file, scene
 from mjx_nero.tools.import_urdf import main
 from mjx_nero.types import UserError
-from mjx_nero.urdf import drives, geometry, import_urdf, inertia, primitives
+from mjx_nero.urdf import drives, files, geometry, import_urdf, inertia, meshes, primitives, read
 from mjx_nero.urdf import folder as model_folder
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Mass
+from mjx_nero.urdf.tree import Mass, bodies
 
 KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in ("plane", "sphere", "capsule", "box")}
 EXACT = {"rtol": 0, "atol": 1e-12}
@@ -487,6 +487,102 @@ def test_limits_dynamics_and_continuous(tmp_path):
     np.testing.assert_allclose(model.joint("j2").axis, [0, 0.6, 0.8], **EXACT)
     assert report.robot.arm.home == (0.0, 2.0) and report.robot.arm.speed == (1.0, 2.0)
     assert any("axis" in n for n in report.notes.of("joint", "j2"))
+
+
+@pytest.mark.parametrize("length, kind, size", [(0.2, "capsule", (0.05, 0.1)), (0.0, "sphere", (0.05,))])
+def test_capsules_are_kept_as_they_are(tmp_path, length, kind, size):
+    """The length is the cylinder's, without the round ends; without any length it is a ball."""
+    capsule = f'<capsule radius="0.05" length="{length}"/>'
+    shapes = [make.shape(capsule, tag, xyz="0.1 0 0.3", rpy="0 1.5707963267948966 0") for tag in ("visual", "collision")]
+    model, report = imported(tmp_path, make.arm(2, make.link("e", *shapes), make.joint("j", "l2", "e", "fixed")))
+    assert not [w for w in report.warnings if w.startswith("link e")] and report.links["e"]["covered"] == 1
+    (row,) = report.links["e"]["shapes"]
+    assert row["kind"] == kind and row["size"] == list(size)
+    geoms = [model.geom(i) for i in range(model.ngeom) if KINDS[int(model.geom(i).type[0])] == kind]
+    assert len(geoms) == 2  # one to look at, one that touches
+    for geom in geoms:
+        np.testing.assert_allclose(geom.size[: len(size)], size, **EXACT)
+        np.testing.assert_allclose(geom.pos, [0.1, 0, 0.4], atol=1e-9)  # the joint is 0.1 m up
+        if kind == "capsule":
+            turn = np.zeros(9)
+            mujoco.mju_quat2Mat(turn, geom.quat)
+            np.testing.assert_allclose(np.abs(turn[2::3]), [1, 0, 0], atol=1e-9)
+
+
+def test_capsules_are_weighed_by_their_volume(tmp_path):
+    """No masses: as heavy as water, pi 0.05^2 0.2 + 4/3 pi 0.05^3 = 0.0020944 m3."""
+    links = [make.link(name, make.shape('<capsule radius="0.05" length="0.2"/>')) for name in ("base", "a")]
+    _, report = imported(tmp_path, make.robot(*links, make.joint("j", "base", "a")))
+    assert report.links["a"]["mass"] == pytest.approx(2.0944, rel=0.03)
+    np.testing.assert_allclose(
+        geometry._solid("capsule", (0.05, 0.2)).bounds, [[-0.05, -0.05, -0.15], [0.05, 0.05, 0.15]], atol=1e-6
+    )
+
+
+def test_other_shapes_may_be_called_capsule(tmp_path):
+    named = '<collision name="capsule"><geometry><cylinder radius="0.05" length="0.2"/></geometry></collision>'
+    path = make.write(tmp_path, make.arm(2, make.link("e", named), make.joint("j", "l2", "e", "fixed")))
+    tree, _ = read.read(path, files.Roots(path, {}), Notes())
+    assert [shape.kind for shape in tree.links["e"].collisions] == ["cylinder"]
+
+
+@pytest.mark.parametrize(
+    "limit, degrees, expected, speed",
+    [
+        ('lower="-170" upper="90" velocity="180"', True, (-17 * np.pi / 18, np.pi / 2), np.pi),
+        ('lower="-170" upper="90" velocity="180"', False, (-170.0, 90.0), 180.0),
+        ('lower="0" upper="26" velocity="2"', False, (0.0, 26.0), 2.0),
+        ('lower="-25" upper="25" velocity="2"', False, (-25.0, 25.0), 2.0),  # 8 pi = 25.13
+        ('upper="90"', True, (0.0, np.pi / 2), None),
+        ('lower="-3600" upper="3600" velocity="90"', True, (-20 * np.pi, 20 * np.pi), np.pi / 2),
+    ],
+)
+def test_limits_in_degrees(tmp_path, limit, degrees, expected, speed):
+    slide = make.joint("s", "l1", "tip", **{**make.SLIDE, "limit": 'lower="0" upper="30" velocity="60"'})
+    text = make.arm(1, make.link("tip"), slide).replace('lower="-1" upper="1" effort="10" velocity="2"', limit)
+    path, notes = make.write(tmp_path, text), Notes()
+    tree, _ = read.read(path, files.Roots(path, {}), notes, degrees=degrees)
+    hinge, slider = tree.joints["j1"], tree.joints["s"]
+    np.testing.assert_allclose([hinge.lower, hinge.upper], expected)
+    assert hinge.velocity == (None if speed is None else pytest.approx(speed))
+    assert (slider.lower, slider.upper, slider.velocity) == (0, 30, 60)
+    suspected = [(n.kind, n.name) for n in notes if "looks like degrees" in n.text and "--degrees" in n.text]
+    assert suspected == ([("warning", "j1")] if not degrees and max(map(abs, expected)) > 8 * np.pi else [])
+
+
+def test_degrees_of_the_command(tmp_path):
+    limit = 'lower="-90" upper="90" effort="10" velocity="60"'
+    path = make.write(tmp_path / "in", make.arm(2).replace('lower="-1" upper="1" effort="10" velocity="2"', limit))
+    with pytest.raises(UserError, match="--strict: joint j1: .*looks like degrees.*--degrees"):
+        main([str(path), "--out", str(tmp_path / "out"), "--strict"])
+    assert not (tmp_path / "out").exists()
+    main([str(path), "--out", str(tmp_path / "out"), "--degrees"])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    np.testing.assert_allclose(model.jnt_range, [[-np.pi / 2, np.pi / 2]] * 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "corner, scale, offset, wanted",
+    [
+        ((100, 20, 40), "1 1 1", 0.2, "0.001 0.001 0.001"),
+        ((10, 2, 4), "5 -5 5", 0.2, "0.005 -0.005 0.005"),  # 50 m
+        ((100, 20, 40), "0.001 0.001 0.001", 0.2, None),
+        ((9, 2, 4), "1 1 1", 0.1, None),  # 10 m are the least
+        ((12, 2, 4), "1 1 1", 0.3, None),  # 50 times 0.3 m are 15 m
+    ],
+)
+def test_meshes_in_millimetres(tmp_path, corner, scale, offset, wanted):
+    make.box(tmp_path / "in" / "m.stl", (0, 0, 0), corner)
+    end = make.link("end", make.inertial(0.1), make.mesh("m.stl", scale=scale))
+    path = make.write(tmp_path / "in", make.arm(2, end, make.joint("j", "l2", "end", xyz=f"0 0 {offset}")))
+    roots, notes = files.Roots(path, {}), Notes()
+    tree, _ = read.read(path, roots, notes)
+    if wanted is None:
+        geometry.Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
+        return
+    with pytest.raises(UserError, match=f"'m.stl' .* millimetres; give it scale=\"{wanted}\"") as error:
+        import_urdf(path, tmp_path / "out")
+    assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("kind", ["stl", "obj", "dae"])
