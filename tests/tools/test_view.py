@@ -241,7 +241,7 @@ def test_in_a_browser(browser):
         browser.get(page.url)
         canvas = wait(lambda: browser.find_elements(By.TAG_NAME, "canvas"))[0]
         wait(lambda: "Agent" in browser.find_element(By.TAG_NAME, "body").text)
-        client = wait(lambda: list(page._server.get_clients().values()))[0]
+        client = wait(lambda: list(page.server.get_clients().values()))[0]
         wait(lambda: page.session.frame.step > 0)
 
         def button(name):

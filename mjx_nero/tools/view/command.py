@@ -1,8 +1,6 @@
 """The command line of ``view``, and what it starts."""
 
-import contextlib
 import dataclasses
-import io
 import pathlib
 import threading
 from collections.abc import Mapping, Sequence
@@ -36,7 +34,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="side by side (default: %(default)s)")
     parser.add_seed(1)
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at; others than this machine's need a token")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
     parser.add_argument("--port", type=cli.at_most(65535), default=8080, help="(default: %(default)s)")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     given = parser.given(argv)  # else what the run says
@@ -75,14 +73,15 @@ class View:
     """A page that is being served.
 
     Attributes:
-        url: to open, with the token where there is one.
+        url: to open, with its token.
+        server: viser's.
         session: what it shows.
         panel: its controls.
     """
 
-    def __init__(self, server, door, session, panel, run: pathlib.Path | None, env_name: str):
-        self._server, self._door, self.session, self.panel = server, door, session, panel
-        self.url = door.url if door else f"http://localhost:{server.get_port()}"
+    def __init__(self, page, door, orders, session, panel, run: pathlib.Path | None, env_name: str):
+        self._page, self._door, self._orders, self.session, self.panel = page, door, orders, session, panel
+        self.url, self.server = door.url, page.server
         self._run, self._env_name = run, env_name
         self._seen: pathlib.Path | None = None
         self._ended = threading.Event()
@@ -110,15 +109,14 @@ class View:
         self.session.reset()
 
     def close(self) -> None:
-        """Ends simulation and server."""
+        """Ends simulation and servers."""
         self._ended.set()
         self.session.stop()
         if self._thread:
             self._thread.join(timeout=5)
-        if self._door:
-            self._door.close()
-        with contextlib.redirect_stdout(io.StringIO()):  # it tells of it
-            self._server.stop()
+        self._door.close()
+        self._orders.close()
+        self._page.close()
 
 
 def open_view(
@@ -139,14 +137,14 @@ def open_view(
     Args:
         agent: a name of ``agents.known``; None: a policy, a controller, or if there is none the joint sliders.
         run: folder of a training to follow.
-        host: address to listen at; with another than this machine's own the page asks for a token.
+        host: address to listen at.
         port: the first free one from here on.
 
     Raises:
         UserError: as the command.
     """
-    viser = need("viser", "view")
-    from mjx_nero.tools.view import door, panel, scene, session
+    need("viser", "view")
+    from mjx_nero.tools.view import door, inner, orders, panel, scene, session
 
     described = _described(run) if run else {}
     env_name = env_name or described.get("env_name", "nero_lift")
@@ -159,12 +157,16 @@ def open_view(
     chosen = _chosen(agent, list(makers), env_name)
     home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
-    local = host in ("127.0.0.1", "localhost", "::1")
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints an address, which with a door is not the one to open
-        server = viser.ViserServer(host="127.0.0.1", port=port if local else 0, verbose=False)
-    guard = None if local else door.Door(host, port, server.get_port())
-    picture, controls = scene.Scene(server, sim, env.mj_model), panel.Panel(server, sim, makers, chosen)
-    view = View(server, guard, sim, controls, run, env_name)
+    page = inner.Inner()
+    try:
+        guard = door.Door(host, port, page.path)
+    except UserError:
+        page.close()
+        raise
+    work = orders.Orders()
+    picture = scene.Scene(page.server, sim, env.mj_model, work)
+    controls = panel.Panel(page.server, sim, makers, chosen, work)
+    view = View(page, guard, work, sim, controls, run, env_name)
 
     def shown(frame) -> None:
         picture.show(frame)

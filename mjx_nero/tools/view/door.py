@@ -1,45 +1,70 @@
-"""A door before a page server: whoever comes from another machine needs the token of the printed address."""
+"""The door before a page's server: who comes in has the token of the printed address, and comes from that address."""
 
 import asyncio
 import contextlib
+import errno
 import hmac
-import http.cookies
+import ipaddress
+import pathlib
 import secrets
 import socket
 import threading
-import urllib.parse
 
+from mjx_nero.tools.view import request
+from mjx_nero.tools.view.log import LOG
 from mjx_nero.types import UserError
 
-_COOKIE = "mjx_nero_view"
-_LONGEST = 65536  # bytes of a request's head
-_REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nContent-Length: %d\r\nConnection: close\r\n\r\n%s"
+PATIENCE_S = 10.0  # for a request's head
+GUESTS = 64  # at a time who still stand before the door, and as many behind it
+PORTS = 100  # that are tried
+RATE = 1 << 18  # bytes a second that a page may send
+_LOCAL = ("localhost", "127.0.0.1", "[::1]")
+_ANSWER = (
+    "HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {length}\r\nX-Frame-Options: DENY\r\n"
+    "Cache-Control: no-store\r\nReferrer-Policy: no-referrer\r\n{more}Connection: close\r\n\r\n{text}"
+)
+_STRANGER = "Open the address that the program printed, with its token.\n"
 
 
 class Door:
-    """Listens at ``host:port`` and lets through, to a server on this machine, connections whose first request has the token.
+    """Listens at ``host:port`` and lets through, to a server on this machine, requests with the token: it comes with the address
+    once, a cookie keeps it.
 
-    The token comes with the address once; a cookie keeps it. What comes in is not encrypted: use it in a network that you trust,
-    or a tunnel.
+    Browsers say which address they mean (Host) and which page asks (Origin). Both have to be this one's, so that neither another
+    page that the user has open comes in, nor one whose name is made to lead here (DNS rebinding). What comes in is not encrypted:
+    use it in a network that you trust, or a tunnel.
 
     Args:
-        behind: port of the server at 127.0.0.1.
+        host: to listen at. With one of the whole network, addresses and this machine's name are its own as well.
+        port: the first free one from here on; 0: any.
+        behind: Unix socket of the server.
+
+    Attributes:
+        url: to open, with the token.
 
     Raises:
         UserError: the address cannot be listened at.
     """
 
-    def __init__(self, host: str, port: int, behind: int):
+    def __init__(self, host: str, port: int, behind: pathlib.Path):
         self.token, self._behind = secrets.token_urlsafe(16), behind
+        self._waiting: dict[asyncio.StreamWriter, None] = {}
+        self._open: set[asyncio.Task | None] = set()  # the loop alone would forget who waits for the server behind
+        self._inside = 0
         self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(lambda _, context: LOG.warning("the door: %s", context["message"]))
         try:
-            self._server = self._loop.run_until_complete(asyncio.start_server(self._come, host, port, limit=_LONGEST))
+            self._server = self._loop.run_until_complete(self._listen(host, port))
         except OSError as error:
             self._loop.close()
-            raise UserError(f"cannot listen at {host}:{port}: {error.strerror or error}; pass another --port") from None
+            raise UserError(f"cannot listen at {host}:{port}: {error.strerror or error}; pass another --host or --port") from None
         self.port = self._server.sockets[0].getsockname()[1]
-        name = socket.gethostname() if host in ("0.0.0.0", "::", "") else host
-        self.url = f"http://{name}:{self.port}/?token={self.token}"
+        self._cookie = f"mjx_nero_view_{self.port}"  # cookies do not tell ports apart
+        self._everywhere = not _is_local(host)
+        name = socket.gethostname() if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
+        # The name localhost may lead to another address of this machine, where another user listens.
+        self.url = f"http://{'127.0.0.1' if name == 'localhost' else name}:{self.port}/?token={self.token}"
+        self._names = {name.lower(), *_LOCAL, *([socket.gethostname().lower()] if self._everywhere else [])}
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
 
@@ -50,67 +75,109 @@ class Door:
         self._thread.join(timeout=5)
         self._loop.close()
 
+    async def _listen(self, host: str, port: int) -> asyncio.Server:
+        last = min(port + PORTS - 1, 65535) if port else 0
+        while True:
+            try:
+                where = "127.0.0.1" if host == "localhost" else host
+                return await asyncio.start_server(self._come, where, port, limit=request.LONGEST)
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE or port == last:
+                    raise
+                port += 1
+
     async def _end(self) -> None:
         self._server.close()
-        open_ones = asyncio.all_tasks() - {asyncio.current_task()}
+        open_ones = [task for task in self._open if task]
         for task in open_ones:
             task.cancel()
         await asyncio.gather(*open_ones, return_exceptions=True)
 
     async def _come(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        task = asyncio.current_task()
+        self._open.add(task)
+        with contextlib.suppress(OSError, asyncio.CancelledError):
             try:
-                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), timeout=10)
-                if self._knows(_cookie(head)):
-                    await self._through(head, reader, writer)
-                elif self._knows(_query(head)):
-                    cookie = f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-                    answer = f"HTTP/1.1 303 See Other\r\nLocation: /\r\nSet-Cookie: {cookie}\r\nContent-Length: 0\r\n"
-                    writer.write(f"{answer}Connection: close\r\n\r\n".encode())
-                else:
-                    text = b"Open the address that the program printed, with its token.\n"
-                    writer.write(_REFUSED % (len(text), text))
-                await writer.drain()
-            except TimeoutError:
-                pass
+                await self._serve(reader, writer)
             finally:
+                self._open.discard(task)
+                self._waiting.pop(writer, None)
                 writer.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._waiting[writer] = None
+        if len(self._waiting) > GUESTS:  # whoever says nothing for long goes first
+            next(iter(self._waiting)).transport.abort()
+        try:
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
+            asked = request.parse(head)
+        except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
+            await _answer(reader, writer, "400 Bad Request", "This is no request for a page.\n")
+            return
+        if not self._is_mine(asked):
+            await _answer(reader, writer, "403 Forbidden", _STRANGER)
+        elif not asked.query and self._knows(asked.cookie(self._cookie)):
+            await self._through(asked, reader, writer)
+        elif set(asked.query) == {"token"} and self._knows(asked.query["token"]):
+            cookie = f"Set-Cookie: {self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/\r\n"
+            await _answer(reader, writer, "303 See Other", "", f"Location: /\r\n{cookie}")
+        else:  # also with other queries: by some of them viser's page would talk to a server of somebody else's
+            await _answer(reader, writer, "403 Forbidden", _STRANGER)
+
+    def _is_mine(self, asked: request.Request) -> bool:
+        """Whether a request means this address, and comes from it."""
+        known = asked.host in self._names or (self._everywhere and _is_address(asked.host))  # no name leads to an address
+        return known and asked.own_origin
 
     def _knows(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(), self.token.encode())
 
-    async def _through(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        inner, outer = await asyncio.open_connection("127.0.0.1", self._behind)
-        outer.write(head)
+    async def _through(self, asked: request.Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._waiting.pop(writer)
+        if self._inside >= GUESTS:
+            await _answer(reader, writer, "503 Service Unavailable", "Too many pages are open.\n")
+            return
+        self._inside += 1
         try:
-            ways = [asyncio.create_task(_pump(reader, outer)), asyncio.create_task(_pump(inner, writer))]
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-            for way in ways:
-                way.cancel()
+            inner, outer = await asyncio.open_unix_connection(self._behind)
+            outer.write(asked.head())
+            ways = [asyncio.create_task(_pump(inner, writer))]
+            if asked.upgrades:  # else there is no more to say
+                ways.append(asyncio.create_task(_pump(reader, outer, RATE)))
+            try:
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for way in ways:
+                    way.cancel()
+                outer.close()
+                await asyncio.gather(*ways, return_exceptions=True)
         finally:
-            outer.close()
+            self._inside -= 1
 
 
-async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
-    while data := await source.read(1 << 16):
+async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: str, text: str, more: str = "") -> None:
+    """Answers, and reads on for a moment: what lies unread would throw the answer away."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(1.0):
+            writer.write(_ANSWER.format(status=status, length=len(text), more=more, text=text).encode())
+            await writer.drain()
+            writer.write_eof()
+            while await reader.read(1 << 16):
+                pass
+
+
+async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter, rate: float = float("inf")) -> None:
+    while data := await source.read(1 << 12 if rate < float("inf") else 1 << 16):
         sink.write(data)
         await sink.drain()
+        await asyncio.sleep(len(data) / rate)
 
 
-def _lines(head: bytes) -> list[str]:
-    return head.decode("latin-1").split("\r\n")
+def _is_address(name: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name.strip("[]")))
+    return False
 
 
-def _query(head: bytes) -> str:
-    target = _lines(head)[0].split(" ")[1:2]
-    return urllib.parse.parse_qs(urllib.parse.urlsplit("".join(target)).query).get("token", [""])[0]
-
-
-def _cookie(head: bytes) -> str:
-    for line in _lines(head)[1:]:
-        name, _, value = line.partition(":")
-        if name.lower() == "cookie":
-            with contextlib.suppress(http.cookies.CookieError):
-                found = http.cookies.SimpleCookie(value).get(_COOKIE)
-                return found.value if found else ""
-    return ""
+def _is_local(host: str) -> bool:
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)

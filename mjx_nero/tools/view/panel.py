@@ -1,6 +1,7 @@
 """The controls beside the picture: run and step, who acts, joints, curves."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Mapping
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_nero.tools.view.agents import SLIDERS, Make
+from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import CURVE, Frame, Session
 from mjx_nero.types import UserError
 
@@ -22,22 +24,23 @@ class Panel:
         server: a ``viser.ViserServer``.
         makers: agents to choose from, as ``agents.known``.
         chosen: the one that plays.
+        orders: where what takes time is done.
     """
 
-    def __init__(self, server, session: Session, makers: Mapping[str, Make], chosen: str):
+    def __init__(self, server, session: Session, makers: Mapping[str, Make], chosen: str, orders: Orders):
         self._session, self._makers, self._gui = session, dict(makers), server.gui
-        self._drawn = 0.0
+        self._orders, self._drawn, self._drawing = orders, 0.0, threading.Lock()
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._status = server.gui.add_markdown("")
         self._run = server.gui.add_button("Pause")
         self._run.on_click(lambda _: self._pause())
         server.gui.add_button("Step").on_click(lambda _: session.single_step())
-        server.gui.add_button("Reset").on_click(lambda _: session.reset())
+        server.gui.add_button("Reset").on_click(lambda _: orders.give("reset", session.reset))
         speed = server.gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
         speed.on_update(lambda _: setattr(session, "speed", speed.value))
         self.agent = server.gui.add_dropdown("Agent", tuple(self._makers), initial_value=chosen)
-        self.agent.on_update(lambda _: self.play(self.agent.value))
+        self.agent.on_update(lambda _: orders.give("play", lambda: self.play(self.agent.value)))
         self._message = server.gui.add_markdown("")
         self._joints = server.gui.add_folder("Joint targets", expand_by_default=chosen == SLIDERS)
         with self._joints:
@@ -46,7 +49,7 @@ class Panel:
             groups = {name: list(terms) for name, terms in session.frame.curves.items()}
             lines = [f"{group}: {term}" for group, terms in groups.items() for term in ("all", *terms)[group != "rewards" :]]
             self._what = server.gui.add_dropdown("Curve", tuple(lines), initial_value="rewards: all")
-            self._what.on_update(lambda _: self._draw_curves())
+            self._what.on_update(lambda _: orders.give("curves", self._draw_curves))
             self._plot = None
             self._draw_curves()
         self._tell(session.frame)
@@ -83,7 +86,7 @@ class Panel:
         for name, home in zip(robot.joints, robot.home, strict=True):
             low, high = (float(x) for x in model.joint(name).range)
             sliders.append(self._gui.add_slider(name, min=low, max=high, step=(high - low) / 1000, initial_value=home))
-            sliders[-1].on_update(lambda _: self._slid())
+            sliders[-1].on_update(lambda _: self._orders.give("slid", self._slid))
         return sliders
 
     def _slid(self) -> None:
@@ -101,7 +104,11 @@ class Panel:
         )
 
     def _draw_curves(self) -> None:
-        group, _, term = self._what.value.partition(": ")
+        with self._drawing:  # a page's choice and the session's steps come from two threads
+            self._draw(self._what.value)
+
+    def _draw(self, what: str) -> None:
+        group, _, term = what.partition(": ")
         frames = list(self._session.history) or [self._session.frame]
         values = {name: np.stack([f.curves[group][name] for f in frames]) for name in frames[-1].curves[group]}
         if term == "all":
@@ -111,13 +118,13 @@ class Panel:
             names = [f"{term} {i}" if len(lines) > 1 else term for i in range(len(lines))]
         seconds = (np.arange(len(frames)) - len(frames) + 1) * self._session.env.dt
         data = (seconds, *lines)
-        if self._plot is not None and self._shown == self._what.value:
+        if self._plot is not None and self._shown == what:
             with contextlib.suppress(ValueError):
                 self._plot.data = data
             return
         if self._plot is not None:
             self._plot.remove()
-        self._shown = self._what.value
+        self._shown = what
         styles = [{"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5} for i, name in enumerate(names)]
         span = {"min": -CURVE * self._session.env.dt, "max": 0.0}
         self._plot = self._gui.add_uplot(

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from mjx_nero.sim.touch import OBSTACLE
+from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import Frame, Session, free_joints
 
 HIDDEN = 3  # geom groups from here on: what collides
@@ -21,9 +22,11 @@ class Scene:
     Args:
         server: a ``viser.ViserServer``.
         model: with visual shapes (``ManipulationEnv.mj_model``).
+        orders: where drags are done.
     """
 
-    def __init__(self, server, session: Session, model: mujoco.MjModel):
+    def __init__(self, server, session: Session, model: mujoco.MjModel, orders: Orders):
+        self._orders = orders
         self._server, self._session, self._model, self._data = server, session, model, mujoco.MjData(model)
         across = int(np.ceil(np.sqrt(session.size)))
         self._corners = np.array([(i // across * APART, i % across * APART, 0.0) for i in range(session.size)])
@@ -100,11 +103,15 @@ class Scene:
             i = event.instance_index or 0
             if event.phase == "start":  # later on the browser's picture is behind what it has been told
                 grabbed[event.client_id] = np.asarray(handle.batched_positions[i]) - event.start_position
+            if event.client_id not in grabbed:
+                return
             to = event.end_position + grabbed[event.client_id] - self._corners[i]
+            if event.phase == "end":
+                del grabbed[event.client_id]
             if body == "goal":
-                self._session.move_goal(i, to)
+                self._orders.give((body, i), lambda: self._session.move_goal(i, to))
             else:
-                self._session.move_object(i, things[body], to)
+                self._orders.give((body, i), lambda: self._session.move_object(i, things[body], to))
 
 
 def _meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:

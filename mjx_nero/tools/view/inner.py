@@ -1,0 +1,132 @@
+"""viser's server, where nobody but the door reaches it and where it reads checked messages alone."""
+
+import asyncio
+import contextlib
+import functools
+import io
+import pathlib
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import viser
+import websockets.asyncio.server as ws
+from viser import _messages
+from websockets.http11 import Request, Response
+
+from mjx_nero.tools.view import messages
+from mjx_nero.tools.view.log import LOG
+from mjx_nero.types import UserError
+
+REST_S = 1 / 200  # between two messages of a page, which sends 20 a second while something is dragged
+FRAGMENTS = 16  # of a message
+_TOO_BIG = 1009  # a close code of websockets
+
+
+class Inner:
+    """A ``viser.ViserServer`` behind a Unix socket, in a folder that only this user can enter (mode 0700).
+
+    viser's own way is a port of this machine, which every user of it can reach, and so can every web page that one of them has
+    open. A secret that the door adds would do as well, but has to be compared in viser's handshake and kept out of its log; a
+    folder's mode is the kernel's to keep.
+
+    Attributes:
+        server: viser's.
+        path: of the socket.
+
+    Raises:
+        UserError: this viser listens in another way.
+    """
+
+    def __init__(self) -> None:
+        self._folder = pathlib.Path(tempfile.mkdtemp(prefix="mjx_nero_view_"))
+        self.path = self._folder / "page"
+        with _listening_at(self.path, self._read), contextlib.redirect_stdout(io.StringIO()):  # it prints its address
+            self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        if not self.path.is_socket():
+            self.close()
+            raise UserError(f"viser {viser.__version__} is not known here: install the version that constraints.txt names")
+        # A page's word opened a tunnel to a public address, past every door: nobody listens for it any more.
+        for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+            self.server._websock_server.unregister_handler(share)
+        self.server._event_loop.set_exception_handler(tell)
+
+    def close(self) -> None:
+        """Ends the server."""
+        with contextlib.redirect_stdout(io.StringIO()):  # it tells of it
+            self.server.stop()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _read(self, raw: bytes) -> bytes | None:
+        """A message for viser; None: there is nothing in it that it may see."""
+        try:
+            return messages.checked(raw, self.server)
+        except ValueError as error:
+            LOG.warning("a message was ignored: %s", error)
+            return None
+
+
+def tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """What an event loop does with errors that nobody waits for: a line, now and then."""
+    LOG.warning("a connection failed: %s", context.get("exception") or context["message"])
+
+
+@contextlib.contextmanager
+def _listening_at(path: pathlib.Path, read: Callable[[bytes], bytes | None]) -> Iterator[None]:
+    """viser takes a host and a port alone; while it starts, what it starts with listens at ``path`` instead."""
+    original, version = ws.serve, f"viser-v{viser.__version__}"
+
+    def serve(handler, host, port, **kwargs):
+        kwargs.update(
+            create_connection=functools.partial(_Connection, read=read),
+            max_size=messages.LONGEST,
+            subprotocols=[version],
+            select_subprotocol=None,  # whoever does not name it gets 400
+            process_response=_guard,
+            open_timeout=10,
+            close_timeout=2,
+            logger=LOG,
+        )
+        return original(handler, unix=True, path=str(path), **kwargs)
+
+    ws.serve = serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        ws.serve = original  # type: ignore[misc]
+
+
+def _guard(connection: ws.ServerConnection, request: Request, response: Response) -> None:
+    """Lets the page talk to its own address alone, and be shown in no other page."""
+    own = "'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
+    socket = f"ws://{request.headers.get('Host', '')}"
+    response.headers["Content-Security-Policy"] = (
+        f"default-src {own}; connect-src {own} {socket}; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    )
+    response.headers["X-Frame-Options"] = "DENY"
+    response.headers["Cross-Origin-Opener-Policy"] = "same-origin"
+    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    response.headers["Cache-Control"] = "no-store"
+
+
+class _Connection(ws.ServerConnection):
+    """A page's connection that hands on what ``read`` makes of its messages, at a bounded rate."""
+
+    def __init__(self, *args: Any, read: Callable[[bytes], bytes | None], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._read = read
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        while True:
+            await asyncio.sleep(REST_S)
+            fragments: list[bytes] = []
+            async for fragment in self.recv_streaming(decode=False):
+                fragments.append(fragment)
+                if len(fragments) > FRAGMENTS:  # empty ones have no size that a limit would meet
+                    await self.close(_TOO_BIG)
+                    raise self.protocol.close_exc
+            message = self._read(b"".join(fragments))
+            if message is not None:
+                return message
