@@ -34,7 +34,10 @@ class Request:
 
     @property
     def own_origin(self) -> bool:
-        """Whether it comes from a page of this address. Browsers name the page's for each websocket, but for no page that is opened."""
+        """Whether it comes from a page of this address.
+
+        A browser names the origin of every websocket, but not of a page that is opened.
+        """
         origin = self.headers.get("origin")
         return not self.upgrades if origin is None else origin.lower() == f"http://{self.headers['host'].lower()}"
 
