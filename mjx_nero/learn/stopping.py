@@ -1,6 +1,7 @@
 """Signals: before training they end a program at once, during training they let it save first."""
 
 import contextlib
+import os
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -40,12 +41,16 @@ def at_once() -> Iterator[None]:
 
 @contextlib.contextmanager
 def after_this(say: Callable[[str], None]) -> Iterator[Stop]:
-    """The first signal sets a flag, so that what is in flight ends whole; the second raises ``Signalled``."""
+    """The first signal sets a flag, so that what is in flight ends whole; the second ends the process where it stands.
+
+    The second raises nothing: the program may be within a callback of compiled code, through which no exception may pass. Files
+    appear whole or not at all, so nothing is left half-written.
+    """
     stop = Stop()
 
     def handle(number: int, _: Any) -> None:
         if stop.number is not None:
-            raise Signalled(number)
+            os._exit(128 + number)
         stop.number = number
         say("stopping after this update (Ctrl-C again: at once) ...")
 
