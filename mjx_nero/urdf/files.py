@@ -34,7 +34,7 @@ class Roots:
     These are the URDF's own folder; the package that it lies in, the nearest folder with a ``package.xml`` at most ``LEVELS``
     above, or without one the folder above, if the URDF lies in a folder called ``urdf``, ``robots`` or ``xacro``; ``packages``;
     and packages that it names which lie beside it or beside a folder above it: ``NAME/package.xml``. Inside its own folders
-    a package is a folder called so, or one whose ``package.xml`` says so. A folder of another name serves for none.
+    a package is a folder called so, or that of a ``package.xml`` that says so. A folder of another name serves for none.
 
     Args:
         urdf: path of the URDF.
@@ -133,10 +133,10 @@ class Roots:
 
     @functools.cached_property
     def _named(self) -> list[tuple[str, pathlib.Path]]:
-        """Name and folder of the packages that the own folders are, and hold: by the folder's name, by its ``package.xml``."""
+        """Name and folder of the packages that the own folders are: by the folder's name, by its ``package.xml``."""
         found = [(folder.name, folder) for folder in self._own]
         for own in dict.fromkeys(self._own):
-            for file in (own / "package.xml", *sorted(own.glob("*/package.xml"))):
+            for file in (own / "package.xml",):
                 if os.path.realpath(file) == str(file) and os.path.isfile(file):
                     found.append((package_name(file.parent), file.parent))
         return found

@@ -428,7 +428,6 @@ def test_packages_that_are_none(tmp_path):
         ("other", ["other/m.stl", "beside/m.stl"], "package://pkg/m.stl", None),
         ("other", ["other/m.stl", "other/package.xml:pkg"], "package://pkg/m.stl", "other/m.stl"),
         ("other/urdf", ["other/m.stl", "other/package.xml:pkg"], "package://pkg/m.stl", "other/m.stl"),
-        ("other", ["other/inner/m.stl", "other/inner/package.xml:pkg"], "package://pkg/m.stl", "other/inner/m.stl"),
         ("pkg/urdf", ["pkg/m.stl"], "package://pkg/m.stl", "pkg/m.stl"),
         ("pkg", ["pkg/m.stl"], "package://pkg/m.stl", "pkg/m.stl"),
         ("other", ["other/pkg/m.stl"], "package://pkg/m.stl", "other/pkg/m.stl"),
