@@ -1,9 +1,6 @@
-"""The browser view: the session behind it, the door before it, and the page itself in a real browser."""
+"""The browser view: the session behind it, and the page itself in a real browser."""
 
-import http.client
-import shutil
 import time
-import urllib.parse
 
 import imageio.v3 as imageio
 import jax.numpy as jnp
@@ -14,12 +11,11 @@ import mjx_nero
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.tools import view
 from mjx_nero.tools.view import agents
-from mjx_nero.tools.view.door import Door
+from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.scene import Scene
 from mjx_nero.tools.view.session import Session, free_joints
 
 STRONG = {"robot.gravity_compensation": True}  # the drives hold the arm up, so that it gets where it is sent
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +107,7 @@ def test_thirty_frames_a_second_leave_a_core_time(following):
     viser = pytest.importorskip("viser")
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
-        picture = Scene(server, following, following.env.mj_model)
+        picture = Scene(server, following, following.env.mj_model, Orders())
 
         def frames(n):
             started = time.process_time()
@@ -152,32 +148,6 @@ def test_a_training_writes_what_the_view_follows(call, tmp_path):
         followed.close()
 
 
-def ask(port, path="/", cookie=""):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    connection.request("GET", path, headers={"Cookie": cookie} if cookie else {})
-    answer = connection.getresponse()
-    return answer.status, dict(answer.getheaders()), answer.read()
-
-
-def test_a_stranger_needs_the_token():
-    viser = pytest.importorskip("viser")
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    door = Door("127.0.0.1", 0, server.get_port())
-    try:
-        token = urllib.parse.parse_qs(urllib.parse.urlsplit(door.url).query)["token"][0]
-        assert len(token) >= 20
-        for path, cookie in (("/", ""), ("/?token=wrong", ""), ("/?token=", ""), ("/", "mjx_nero_view=wrong")):
-            status, _, text = ask(door.port, path, cookie)
-            assert status == 403 and b"with its token" in text
-        status, headers, _ = ask(door.port, f"/?token={token}")
-        assert status == 303 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
-        status, _, page = ask(door.port, "/", headers["Set-Cookie"].partition(";")[0])
-        assert status == 200 and len(page) > 100_000
-    finally:
-        door.close()
-        server.stop()
-
-
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -190,25 +160,6 @@ def test_a_stranger_needs_the_token():
 def test_mistakes_are_one_line(call, argv, message):
     status, out, err = call("mjx_nero", "view", *argv)
     assert (status, out) == (2, "") and message in err and err.count("\n") == 1
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Headless Chromium that draws in software."""
-    if not (CHROMIUM and DRIVER):
-        pytest.skip("no Chromium with its driver (Debian: apt-get install chromium chromium-driver)")
-    from selenium import webdriver
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "use-angle=swiftshader", "enable-unsafe-swiftshader"):
-        options.add_argument(f"--{flag}")
-    options.add_argument("--window-size=900,700")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    driver.set_page_load_timeout(120)
-    yield driver
-    driver.quit()
 
 
 def wait(condition, seconds=180):

@@ -1,7 +1,9 @@
 """The browser view against strangers: who gets in, what a page may say, and that no page harms another or the server."""
 
+import asyncio
 import contextlib
 import http.client
+import http.server
 import os
 import random
 import socket
@@ -436,7 +438,7 @@ def test_the_viewer_outlives_odd_messages(lift, capfd):
     with talk(lift) as other:  # somebody else, who stays all the time
         look(lift, other)
         pages = odd_messages(lift, draw)
-        threading.Thread(target=lambda: [None for _ in other], daemon=True).start()
+        threading.Thread(target=drain, args=(other,), daemon=True).start()
         while sent < 2000:
             connections += 1
             with talk(lift) as client:
@@ -444,7 +446,7 @@ def test_the_viewer_outlives_odd_messages(lift, capfd):
                 look(lift, client)
                 for _ in range(200):
                     raw_message = next(pages)
-                    client.send(raw_message.decode("latin-1") if draw.random() < 0.05 else raw_message)
+                    client.send(raw_message[:1000].decode("latin-1") if draw.random() < 0.05 else raw_message)
                     sent += 1
                 time.sleep(1.5)  # the server reads 200 a second
         say(other, "GuiUpdateMessage", uuid=controls(lift)["Speed"][0], updates={"value": 3.0})
@@ -461,10 +463,7 @@ def drain(client):
 
 @pytest.mark.usefixtures("silence")
 def test_odd_frames_end_their_own_connection_alone(lift):
-    def mask(data):
-        return data  # of zeros
-
-    frames = {
+    frames = {  # masked with zeros
         "oversize": struct.pack("!BBQ", 0x82, 0xFF, 1 << 40) + bytes(4),
         "a bit too large": struct.pack("!BBH", 0x82, 0xFE, messages.LONGEST + 1) + bytes(4) + bytes(messages.LONGEST + 1),
         "unmasked": b"\x82\x01a",
@@ -477,6 +476,7 @@ def test_odd_frames_end_their_own_connection_alone(lift):
         "close with one byte": b"\x88\x81" + bytes(4) + b"a",
     }
     with talk(lift) as other:
+        threading.Thread(target=drain, args=(other,), daemon=True).start()
         look(lift, other)
         for name, data in frames.items():
             with talk(lift) as client:
@@ -510,8 +510,6 @@ def test_the_server_opens_no_tunnel(lift, monkeypatch):
     handlers = lift.server._websock_server._incoming_handlers
     assert not [kind for kind in handlers if "share" in kind.__name__.lower()]
     loop = lift.server._event_loop
-    import asyncio
-
     for share in (_messages.ShareUrlRequest(), _messages.ShareUrlDisconnect()):
         asyncio.run_coroutine_threadsafe(lift.server._websock_server._handle_incoming_message(0, share), loop).result(timeout=10)
     time.sleep(0.5)
@@ -570,3 +568,101 @@ def test_a_line_now_and_then(caplog):
         log.LOG.warning("bad \x1b[2J thing %d\n%s", i, "y" * 1000)
     (line,) = caplog.messages
     assert line.startswith("view: bad \\x1b[2J thing 0\\n") and len(line) < 200
+
+
+EVIL = """<!doctype html><title>evil</title><body><script>
+const seen = {};
+const done = (name, what) => { seen[name] = what; document.title = JSON.stringify(seen); };
+function tryAll(port, version, update) {
+  for (const host of ["127.0.0.1", "localhost", "evil.example"])
+    for (const path of ["/", "/?token=", "/x"]) {
+      const name = "ws " + host + path;
+      const socket = new WebSocket(`ws://${host}:${port}${path}`, [version]);
+      socket.onopen = () => {
+        done(name, "open");
+        for (const each of update) socket.send(Uint8Array.from(each));
+      };
+      socket.onerror = () => seen[name] || done(name, "refused");
+    }
+  for (const mode of ["cors", "no-cors"])
+    fetch(`http://127.0.0.1:${port}/`, {mode, credentials: "include"})
+      .then(r => r.text()).then(t => done("fetch " + mode, t.length)).catch(() => done("fetch " + mode, "refused"));
+  const frame = document.createElement("iframe");
+  frame.onload = () => {
+    let inside = "nothing";
+    try { inside = frame.contentDocument === null ? "hidden" : "page"; } catch (e) {}
+    done("frame", frame.contentWindow.length + inside);
+  };
+  frame.src = `http://127.0.0.1:${port}/?websocket=ws://127.0.0.1:1`;
+  document.body.append(frame);
+}
+</script>"""
+
+
+@pytest.fixture
+def evil():
+    """A web page of somebody else's on this machine: every port is another origin."""
+
+    class Page(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(EVIL.encode())
+
+        def log_message(self, *args):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Page)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_port
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_a_page_of_another_origin_neither_steers_nor_shares(browser, evil, host, monkeypatch, tmp_path):
+    """While the user has the view open in the same browser, whose cookie goes along where the other page is of the same site."""
+    from selenium.webdriver.common.by import By
+    from viser import _viser
+
+    opened = []
+    monkeypatch.setattr(_viser, "ViserTunnel", lambda *args, **kwargs: opened.append(args))
+    shown = view.open_view(env_name="nero_lift", agent="zero", port=18500, host=host)
+    try:
+        port = shown._door.port
+        browser.get(f"http://127.0.0.1:{port}/?token={token_of(shown._door)}")
+        own = browser.current_window_handle
+        wait(lambda: shown.server.get_clients(), 120)
+        wait(lambda: "Agent" in browser.find_element(By.TAG_NAME, "body").text, 120)
+        named = controls(shown)
+        orders = [{"type": "ViewerCameraMessage"} | CAMERA]
+        orders += [{"type": "GuiUpdateMessage", "uuid": named["Speed"][0], "updates": {"value": 4.0}}]
+        orders += [{"type": "GuiUpdateMessage", "uuid": named["Pause"][0], "updates": {"value": True}}, {"type": "ShareUrlRequest"}]
+        packed = [list(msgspec.msgpack.encode(each)) for each in orders]
+        for origin in (f"http://127.0.0.1:{evil}", f"http://localhost:{evil}", f"http://evil.example:{evil}"):
+            browser.switch_to.new_window("tab")
+            browser.get(origin)
+            browser.execute_script("tryAll(...arguments)", port, SPOKEN, packed)
+            wait(lambda: len(seen := browser.execute_script("return seen")) == 12 and seen, 60)
+            seen = browser.execute_script("return seen")
+            assert {what for name, what in seen.items() if name.startswith("ws")} == {"refused"}, seen
+            assert seen["fetch cors"] == "refused" and seen["fetch no-cors"] in ("refused", 0) and seen["frame"] != "0page", seen
+            browser.close()
+            browser.switch_to.window(own)
+        browser.switch_to.new_window("tab")
+        browser.get(f"http://evil.example:{port}/?token={token_of(shown._door)}")  # a name that is made to lead here
+        assert "Open the address that the program printed" in browser.find_element(By.TAG_NAME, "body").text
+        browser.close()
+        browser.switch_to.window(own)
+        assert len(shown.server.get_clients()) == 1 and opened == []
+        assert shown.session.running and shown.session.speed == 1.0
+        # The page itself steers, and it draws.
+        browser.find_element(By.XPATH, "//button[.//*[text()='Pause'] or text()='Pause']").click()
+        wait(lambda: not shown.session.running)
+        browser.save_screenshot(str(tmp_path / "view.png"))
+        errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
+        assert not [e for e in errors if "Content Security Policy" in e]
+    finally:
+        shown.close()

@@ -107,7 +107,9 @@ class Door:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._waiting[writer] = None
         if len(self._waiting) > GUESTS:  # whoever says nothing for long goes first
-            next(iter(self._waiting)).transport.abort()
+            longest = next(iter(self._waiting))
+            del self._waiting[longest]
+            longest.transport.abort()
         try:
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
             asked = request.parse(head)
@@ -133,7 +135,7 @@ class Door:
         return hmac.compare_digest(given.encode(), self.token.encode())
 
     async def _through(self, asked: request.Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._waiting.pop(writer)
+        self._waiting.pop(writer, None)
         if self._inside >= GUESTS:
             await _answer(reader, writer, "503 Service Unavailable", "Too many pages are open.\n")
             return

@@ -15,6 +15,8 @@ class _Rarely(logging.Filter):
         self._next, self._kept = 0.0, 0
 
     def filter(self, record: logging.LogRecord) -> bool:
+        if record.getMessage() == "opening handshake failed":  # websockets says so of each page that is closed while it loads
+            return False
         if time.monotonic() < self._next:
             self._kept += 1
             return False
