@@ -5,7 +5,8 @@ import shutil
 import pytest
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-FLAGS = ("headless=new", "no-sandbox", "disable-gpu", "disable-dev-shm-usage", "use-angle=swiftshader", "enable-unsafe-swiftshader")
+FLAGS = ("headless=new", "no-sandbox", "disable-gpu", "disable-dev-shm-usage")
+FLAGS += ("use-angle=swiftshader", "enable-unsafe-swiftshader")
 QUIET = ("disable-quic", "no-first-run", "disable-background-networking", "disable-component-update", "disable-sync")
 
 

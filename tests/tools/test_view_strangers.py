@@ -639,7 +639,8 @@ def test_a_page_of_another_origin_neither_steers_nor_shares(browser, evil, host,
         named = controls(shown)
         orders = [{"type": "ViewerCameraMessage"} | CAMERA]
         orders += [{"type": "GuiUpdateMessage", "uuid": named["Speed"][0], "updates": {"value": 4.0}}]
-        orders += [{"type": "GuiUpdateMessage", "uuid": named["Pause"][0], "updates": {"value": True}}, {"type": "ShareUrlRequest"}]
+        orders += [{"type": "GuiUpdateMessage", "uuid": named["Pause"][0], "updates": {"value": True}}]
+        orders += [{"type": "ShareUrlRequest"}]
         packed = [list(msgspec.msgpack.encode(each)) for each in orders]
         for origin in (f"http://127.0.0.1:{evil}", f"http://localhost:{evil}", f"http://evil.example:{evil}"):
             browser.switch_to.new_window("tab")
