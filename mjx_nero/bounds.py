@@ -68,7 +68,7 @@ LATEST = 256  # control steps that a delay or a history may hold: buffers of eve
 Step = Annotated[int, Bounds(0, LATEST)]
 Steps = Annotated[tuple[Step, Step], Ascending()]  # a range of whole steps
 Past = Annotated[int, Bounds(1, LATEST)]  # so many last values
-Worlds = Annotated[int, Bounds(1, 2**20)]  # environments stepped together
+Worlds = Annotated[int, Bounds(1, 2**24)]  # environments stepped together
 Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # all that JAX's generators take: beyond, seeds would repeat
 
 

@@ -53,7 +53,7 @@ MISTAKES = [
     ("eval", ["--json", "."], "--json takes a name that ends in .json, got '.'"),
     ("eval", ["--failures"], "--failures chooses what a video shows: give --video FILE.mp4, too"),
     ("eval", ["--video", "v.zzz"], "--video takes a name that ends in .mp4, got 'v.zzz'"),
-    ("eval", ["--episodes", "1e12"], "--episodes must be at least 1 and at most 1e+06, got '1e12'"),
+    ("eval", ["--episodes", "1e12"], "--episodes must be at least 1 and at most 1000000, got '1e12'"),
     ("eval", ["--seed", "18446744073709551616"], "--seed takes a whole number, got '18446744073709551616'"),
     ("eval", ["--seed", "-1"], "--seed must be at least 0 and at most 4294967295, got '-1'"),
     ("train", ["--max-minutes", "nan"], "--max-minutes takes a finite number, got 'nan'"),
