@@ -136,9 +136,9 @@ class Roots:
         """Name and folder of the packages that the own folders are: by the folder's name, by its ``package.xml``."""
         found = [(folder.name, folder) for folder in self._own]
         for own in dict.fromkeys(self._own):
-            for file in (own / "package.xml",):
-                if os.path.realpath(file) == str(file) and os.path.isfile(file):
-                    found.append((package_name(file.parent), file.parent))
+            file = own / "package.xml"
+            if os.path.realpath(file) == str(file) and os.path.isfile(file):
+                found.append((package_name(own), own))
         return found
 
     def _inside(self, path: pathlib.Path, name: str) -> pathlib.Path | None:
