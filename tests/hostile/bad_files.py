@@ -96,9 +96,10 @@ def mesh(folder: pathlib.Path, content: bytes, kind: str, count: int = 1) -> lis
 
 
 def stl(triangles: int, equal: bool = False) -> bytes:
-    """A binary STL of some triangles in a row, or of the same again and again."""
-    one = struct.Struct("<12fH")
-    rows = (one.pack(0, 0, 1, i, 0, 0, i + 1, 0, 0, i, 1, 1, 0) for i in ([0] * triangles if equal else range(triangles)))
+    """A binary STL of some triangles in a row of 1 m, or of the same again and again."""
+    one, wide = struct.Struct("<12fH"), 1 / triangles
+    places = (0.0 if equal else i * wide for i in range(triangles))
+    rows = (one.pack(0, 0, 1, x, 0, 0, x + wide, 0, 0, x, 1, 1, 0) for x in places)
     return bytes(80) + struct.pack("<I", triangles) + b"".join(rows)
 
 

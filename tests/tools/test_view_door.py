@@ -209,7 +209,7 @@ def test_slow_clients_go_when_others_come(doors, monkeypatch):
         assert knock(port, "localhost", cookie=cookie_of(doors["127.0.0.1"])) == 200  # at once
         started = time.monotonic()
         slow[-1].settimeout(10)
-        assert slow[-1].recv(100).startswith(b"HTTP/1.1 400") and time.monotonic() - started < 5
+        assert slow[-1].recv(100) == b"" and time.monotonic() - started < 5  # a browser's early connection: no page yet
         assert len(doors["127.0.0.1"]._waiting) <= module.GUESTS
     finally:
         for each in slow:

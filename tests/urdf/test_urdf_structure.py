@@ -282,8 +282,8 @@ def test_opening_and_pads_are_known(tmp_path):
 def test_buffers_hold_the_worst_case(tmp_path):
     model, _ = imported(tmp_path, base(), *six(), *fingers(tmp_path, "link6"))
     sim = registry.env_cfg("reach", robot=tmp_path / "out").sim
-    # nothing meets anything: limits of eight joints, and the coupling of two
-    assert (sim.contacts_per_env, sim.constraints_per_env, sim.ls_iterations) == (1, 9, 6)
+    # nothing meets anything: limits of six joints and of the driving finger, and the coupling of two
+    assert (sim.contacts_per_env, sim.constraints_per_env, sim.ls_iterations) == (1, 8, 6)
     robot = robot_file.read(tmp_path / "out")
     sim = contacts.sized(robot, scene.SceneCfg(), scene.SimCfg())
     model = scene.build(robot, scene.SceneCfg(), scene.SimCfg(), visuals=False)
@@ -326,14 +326,14 @@ def test_a_palm_ends_where_the_pads_begin(tmp_path):
 
 
 def test_a_robot_without_masses_is_filled_with_water(tmp_path):
-    """Its links are boxes of known size; one link with a mass, and all keep what they say."""
+    """Its links are boxes of known size. A link that says its mass keeps it."""
     weightless = [
         p[: p.index("<inertial>")] + p[p.index("</inertial>") + 11 :] if "<inertial>" in p else p for p in [base(), *six()]
     ]
     _, report = imported(tmp_path / "none", *weightless)
     assert report.mass_read == 0 and report.mass == pytest.approx(1000 * (0.1**3 + 6 * 0.05 * 0.05 * 0.08), rel=0.03)
     _, report = imported(tmp_path / "some", base(), *weightless[1:])
-    assert report.mass == pytest.approx(5 + 6 * 0.001)
+    assert report.mass == pytest.approx(5 + 6 * 1000 * 0.05 * 0.05 * 0.08, rel=0.03)
 
 
 def test_efforts_of_one_at_every_joint_are_none(tmp_path):

@@ -113,7 +113,9 @@ class Door:
         try:
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
             asked = request.parse(head)
-        except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
+        except TimeoutError:  # browsers connect ahead: an answer before the request would become the page
+            return
+        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
             await _answer(reader, writer, "400 Bad Request", "This is no request for a page.\n")
             return
         if not self._is_mine(asked):
