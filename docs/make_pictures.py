@@ -17,7 +17,8 @@ from PIL import Image
 
 from mjx_nero import cli
 from mjx_nero.envs import registry
-from mjx_nero.learn import evaluation, policy, rollout
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.sim import render
 
 HERE = pathlib.Path(__file__).parent

@@ -13,7 +13,7 @@ import pytest
 import mjx_nero
 from mjx_nero import cli, config, control, env_cfg, list_envs, list_presets
 from mjx_nero.envs import registry
-from mjx_nero.learn import training
+from mjx_nero.learn.runs import training
 
 ROOT = pathlib.Path(__file__).parents[1]
 

@@ -15,7 +15,7 @@ from mjx_nero.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn.policy import Policy
-from mjx_nero.learn.run_folder import versions
+from mjx_nero.learn.runs.folder import versions
 from mjx_nero.types import UserError
 
 OPSET = 17  # of 2021: what embedded runtimes know, too

@@ -98,7 +98,7 @@ class Kind:
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
 
 
-# The package's own: the module that has its ``KIND``. The presets stand in one beside it, ``<module>_cfg``, without Brax.
+# The package's own: the folder whose ``learner`` has its ``KIND``; the presets stand in ``cfg`` beside it, without Brax.
 _KINDS: dict[str, Kind | str] = {"ppo": "mjx_nero.learn.ppo"}
 
 
@@ -127,7 +127,7 @@ def find(name: str) -> Kind:
     kind = _KINDS.get(name)
     if kind is None:
         raise UserError(f"unknown learner {name!r}{config.hint(name, _KINDS)}: choose one of {', '.join(_KINDS)}")
-    return importlib.import_module(kind).KIND if isinstance(kind, str) else kind
+    return importlib.import_module(f"{kind}.learner").KIND if isinstance(kind, str) else kind
 
 
 def cfg_for(name: str, preset: str, fields: Mapping[str, Any]) -> Any:
@@ -137,7 +137,7 @@ def cfg_for(name: str, preset: str, fields: Mapping[str, Any]) -> Any:
         fields: what the task asks for, by dotted name (``EnvCfg.training``); those that this learner does not have are left out.
     """
     kind = _KINDS.get(name)
-    presets = importlib.import_module(f"{kind}_cfg").PRESETS if isinstance(kind, str) else find(name).presets
+    presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else find(name).presets
     cfg = presets.get(preset, presets["default"])
     known = config.flatten(cfg)
     return config.override(cfg, {field: value for field, value in fields.items() if field in known})

@@ -21,7 +21,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
 from mjx_nero.learn.learner import Act, Observation
-from mjx_nero.learn.ppo_cfg import NetworkCfg as NetworkCfg
+from mjx_nero.learn.ppo.cfg import NetworkCfg as NetworkCfg
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import ASSETS, RobotCfg
 

@@ -12,7 +12,9 @@ from mjx_nero import cli, console, files
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import evaluation, policy, run_cfg
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import evaluation
+from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.sim.physics import warp_available
 from mjx_nero.tools.benchmark import learning, machine
 

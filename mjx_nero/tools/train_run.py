@@ -9,10 +9,11 @@ from typing import Any
 
 from mjx_nero import cli, console
 from mjx_nero.errors import UserError
-from mjx_nero.learn import learner, machines, resume, seeds, track, training
-from mjx_nero.learn.checkpoints import saved
-from mjx_nero.learn.run_cfg import RunCfg
-from mjx_nero.learn.run_folder import CONFIG
+from mjx_nero.learn import learner, machines
+from mjx_nero.learn.runs import resume, seeds, track, training
+from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.runs.checkpoints import saved
+from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.sim import render
 
 

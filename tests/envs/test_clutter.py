@@ -10,7 +10,7 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.tasks import clutter
-from mjx_nero.learn import evaluation
+from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import metrics, rewards
 from mjx_nero.mdp.terms import MetricTerm, RewardTerm
 from mjx_nero.sim import contacts, scene

@@ -19,7 +19,7 @@ from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.arms.so_arm100 import SO_ARM100
 from mjx_nero.envs.tasks import building
-from mjx_nero.learn import evaluation
+from mjx_nero.learn.play import evaluation
 from mjx_nero.sim import contacts, grasp, robot_file, scene
 from mjx_nero.sim.robot import GripperCfg
 from mjx_nero.urdf import import_urdf

@@ -10,7 +10,7 @@ import pytest
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs import regions, registry
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.learn import evaluation
+from mjx_nero.learn.play import evaluation
 from mjx_nero.sim import scene, touch
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.sim.scene import ObjectCfg, ObstacleCfg, SceneCfg, SimCfg

@@ -3,7 +3,8 @@
 import pytest
 
 from mjx_nero import list_envs
-from mjx_nero.learn import evaluation, policy
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import evaluation
 from mjx_nero.tools import results
 
 NAMES = [name for name in list_envs() if policy.shipped(name).exists()]

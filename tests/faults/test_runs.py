@@ -11,7 +11,9 @@ import pytest
 from faults_run import CHUNK, STEPS, last, rows
 
 from mjx_nero import files
-from mjx_nero.learn import checkpoint, compiled, loop, run_folder
+from mjx_nero.learn import checkpoint
+from mjx_nero.learn.runs import compiled, loop
+from mjx_nero.learn.runs import folder as run_folder
 
 # --- nothing goes wrong
 

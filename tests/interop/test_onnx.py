@@ -18,7 +18,7 @@ import mjx_nero
 from mjx_nero import interop
 from mjx_nero.interop import onnx as export
 from mjx_nero.learn import checkpoint, policy
-from mjx_nero.learn.ppo_cfg import ACTIVATIONS
+from mjx_nero.learn.ppo.cfg import ACTIVATIONS
 from mjx_nero.mdp import actions
 from mjx_nero.mdp.terms import Term
 from mjx_nero.types import UserError

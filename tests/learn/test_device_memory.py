@@ -11,7 +11,7 @@ from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import device_memory
 from mjx_nero.learn.policy import NetworkCfg
-from mjx_nero.learn.ppo import Learner
+from mjx_nero.learn.ppo.learner import Learner
 
 
 def learner(num_envs=512, **fields):

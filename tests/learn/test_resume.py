@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError
-from mjx_nero.learn import checkpoint, resume
+from mjx_nero.learn import checkpoint
+from mjx_nero.learn.runs import resume
 
 META = {
     "env": "nero_lift",

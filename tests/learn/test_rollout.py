@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.learn import evaluation, rollout
+from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.sim import physics
 from mjx_nero.types import Scenery
 

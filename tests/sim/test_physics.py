@@ -169,7 +169,7 @@ import os
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 from mjx_nero import env_cfg
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import rollout
+from mjx_nero.learn.play import rollout
 import jax
 
 env = ManipulationEnv(env_cfg("nero_lift", "sim2real"), impl="native", num_envs=64)

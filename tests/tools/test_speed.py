@@ -15,7 +15,8 @@ import pytest
 
 import mjx_nero
 from mjx_nero.envs import wrappers
-from mjx_nero.learn import ppo, run_cfg
+from mjx_nero.learn.ppo import learner as ppo
+from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.sim.physics import fusion
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.tools.benchmark import throughput

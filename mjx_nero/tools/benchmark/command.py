@@ -16,8 +16,11 @@ from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import compiled, device_memory, evaluation, run_cfg
+from mjx_nero.learn import device_memory
 from mjx_nero.learn import learner as learners
+from mjx_nero.learn.play import evaluation
+from mjx_nero.learn.runs import cfg as run_cfg
+from mjx_nero.learn.runs import compiled
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
 from mjx_nero.tools.benchmark.program import Row

@@ -12,7 +12,7 @@ from importlib import metadata
 import jax
 
 import mjx_nero
-from mjx_nero.learn import run_folder
+from mjx_nero.learn.runs import folder as run_folder
 from mjx_nero.tools.benchmark.program import Row
 
 

@@ -12,7 +12,8 @@ from brax.envs.base import State
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.learn import policy, rollout
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import rollout
 from mjx_nero.mdp import actions, sensors
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.fields import Randomization

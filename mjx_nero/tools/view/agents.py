@@ -12,8 +12,9 @@ from flax import struct
 
 from mjx_nero import control, files
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import checkpoint, header, policy, rollout
-from mjx_nero.learn.checkpoints import POLICY, saved
+from mjx_nero.learn import checkpoint, header, policy
+from mjx_nero.learn.play import rollout
+from mjx_nero.learn.runs.checkpoints import POLICY, saved
 from mjx_nero.types import UserError
 
 SLIDERS = "joint sliders"

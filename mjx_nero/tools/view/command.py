@@ -12,7 +12,7 @@ from mjx_nero import cli, config, files, values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
-from mjx_nero.learn.run_folder import CONFIG
+from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
 

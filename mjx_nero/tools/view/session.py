@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop.batch import Batch, where
-from mjx_nero.learn import rollout
+from mjx_nero.learn.play import rollout
 from mjx_nero.types import Scenery
 
 CURVE = 400  # control steps that the curves show

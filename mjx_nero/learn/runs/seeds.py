@@ -12,10 +12,12 @@ from scipy import stats
 from mjx_nero import files, values
 from mjx_nero.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
-from mjx_nero.learn import compiled, device_memory, machines, run_folder, stopping, training
-from mjx_nero.learn.loop import Diverged, Tally
-from mjx_nero.learn.rollout import wilson
-from mjx_nero.learn.run_cfg import RunCfg, fit_machine
+from mjx_nero.learn import device_memory, machines
+from mjx_nero.learn.play.rollout import wilson
+from mjx_nero.learn.runs import compiled, signals, training
+from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.learn.runs.cfg import RunCfg, fit_machine
+from mjx_nero.learn.runs.loop import Diverged, Tally
 
 SEEDS = "seeds.json"
 Row = dict[str, Any]
@@ -44,7 +46,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
 
     Raises:
         UserError: anything that the user can mend.
-        stopping.Signalled: a signal came before training began.
+        signals.Signalled: a signal came before training began.
     """
     if machines.several():
         raise UserError("--seeds trains on one machine: on several, start a run a seed with --seed")
@@ -53,7 +55,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
     learner = compiled.make_learner(run)
     device_memory.check(learner)
     meta = training.describe(run, learner)
-    with stopping.at_once(), run_folder.claim(run.out, run.env_name, goes_on=False) as folder:
+    with signals.at_once(), run_folder.claim(run.out, run.env_name, goes_on=False) as folder:
         homes = {seed: folder / f"seed_{seed}" for seed in seeds}
         for home in homes.values():
             if (home / run_folder.CONFIG).exists():

@@ -12,9 +12,10 @@ import jax
 
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory, learner, rollout
+from mjx_nero.learn import device_memory, learner
 from mjx_nero.learn.learner import Learner, Metrics
-from mjx_nero.learn.run_cfg import RunCfg
+from mjx_nero.learn.play import rollout
+from mjx_nero.learn.runs.cfg import RunCfg
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ import sys
 
 PROGRAM = """
 import ctypes, os, signal, time
-from mjx_nero.learn import stopping
+from mjx_nero.learn.runs import signals
 
 def within():
     for _ in range({times}):
@@ -13,7 +13,7 @@ def within():
         time.sleep(0.01)
     return 0
 
-with stopping.after_this(print) as stop:
+with signals.after_this(print) as stop:
     ctypes.CFUNCTYPE(ctypes.c_int)(within)()
     print("went on", stop.code, flush=True)
 """

@@ -43,9 +43,9 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.policy import from_meta, init_params, make_act, make_networks, shapes
-from mjx_nero.learn.ppo_cfg import PRESETS as PRESETS
-from mjx_nero.learn.ppo_cfg import PpoCfg as PpoCfg
-from mjx_nero.learn.ppo_cfg import fit
+from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
+from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
+from mjx_nero.learn.ppo.cfg import fit
 from mjx_nero.types import Key
 
 Metrics = dict[str, Float[Array, ""]]

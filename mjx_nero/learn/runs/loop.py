@@ -9,11 +9,11 @@ from typing import Any
 from mjx_nero.console import Show
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, machines
-from mjx_nero.learn.checkpoints import Checkpoints
-from mjx_nero.learn.compiled import Compiled
-from mjx_nero.learn.logs import Logs
-from mjx_nero.learn.run_cfg import RunCfg
-from mjx_nero.learn.stopping import Stop
+from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.runs.checkpoints import Checkpoints
+from mjx_nero.learn.runs.compiled import Compiled
+from mjx_nero.learn.runs.logs import Logs
+from mjx_nero.learn.runs.signals import Stop
 from mjx_nero.types import LEVEL
 
 _ROWS = 2000  # of metrics in a run, evaluations apart

@@ -13,13 +13,16 @@ from mjx_nero import config, console, files, values
 from mjx_nero.bounds import Share
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
-from mjx_nero.learn import compiled, device_memory, header, machines, policy, resume, rollout, run_folder, stopping, track, trust
-from mjx_nero.learn.checkpoints import Checkpoints, NotWritten, saved
-from mjx_nero.learn.compiled import Compiled
+from mjx_nero.learn import device_memory, header, machines, policy
 from mjx_nero.learn.learner import Learner
-from mjx_nero.learn.logs import Logs
-from mjx_nero.learn.loop import Loop, Tally
-from mjx_nero.learn.run_cfg import RunCfg, fit_machine, learner_cfg, resolve
+from mjx_nero.learn.play import rollout
+from mjx_nero.learn.runs import compiled, resume, signals, track, trust
+from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.learn.runs.cfg import RunCfg, fit_machine, learner_cfg, resolve
+from mjx_nero.learn.runs.checkpoints import Checkpoints, NotWritten, saved
+from mjx_nero.learn.runs.compiled import Compiled
+from mjx_nero.learn.runs.logs import Logs
+from mjx_nero.learn.runs.loop import Loop, Tally
 from mjx_nero.sim import render
 
 __all__ = ["RunCfg", "carry_out", "describe", "film", "fit_machine", "learner_cfg", "prepare", "resolve", "speaker", "train"]
@@ -42,7 +45,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
 
     Raises:
         UserError: anything that the user can mend: impl, folder, checkpoint, sizes.
-        stopping.Signalled: a signal came before training began.
+        signals.Signalled: a signal came before training began.
     """
     say = speaker()
     run, note = fit_machine(run)
@@ -51,7 +54,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     meta = describe(run, learner)
     goes_on = run.restore is not None and run.restore.is_dir() and run.out in (None, run.restore)
     path = run.restore if goes_on else run.out
-    with stopping.at_once(), run_folder.claim(path, run.env_name, goes_on or run.auto) as folder:
+    with signals.at_once(), run_folder.claim(path, run.env_name, goes_on or run.auto) as folder:
         source = _source(run, meta, say)
         tally = _tally(source) if source and goes_on else Tally()
         if over := _over(run, tally):
@@ -203,7 +206,7 @@ def _loop(run: RunCfg, made: Compiled, tally: Tally, meta: dict[str, Any], folde
     try:
         with (
             device_memory.out_of_memory_as_user_error(made.learner),
-            stopping.after_this(say) as stop,
+            signals.after_this(say) as stop,
             console.Show(screen, run.num_timesteps, run.max_minutes) as show,
         ):
             why = Loop(run, made, tally, meta, checkpoints, logs, back, say, show, stop)(made.state)

@@ -10,11 +10,12 @@ import jax
 from mjx_nero import config, files, values
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
-from mjx_nero.learn import checkpoint, checkpoints, compiled, header
-from mjx_nero.learn import trust as trust_of
+from mjx_nero.learn import checkpoint, header
 from mjx_nero.learn.learner import Learner
-from mjx_nero.learn.run_cfg import Asked, RunCfg, resolve
-from mjx_nero.learn.run_folder import CONFIG
+from mjx_nero.learn.runs import checkpoints, compiled
+from mjx_nero.learn.runs import trust as trust_of
+from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
+from mjx_nero.learn.runs.folder import CONFIG
 
 # Fields of a run's environment that name files: another place than the folder of the run.
 _PATHS = ("identified", "robot.folder", "robot.name", "robot.mjcf")

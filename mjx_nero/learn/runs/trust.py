@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from mjx_nero import cache, files
 from mjx_nero.errors import UserError
-from mjx_nero.learn.run_folder import CONFIG
+from mjx_nero.learn.runs.folder import CONFIG
 
 
 def mark(folder: pathlib.Path) -> None:

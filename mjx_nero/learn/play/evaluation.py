@@ -14,7 +14,8 @@ from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import policy, rollout
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import rollout
 from mjx_nero.mdp import metrics
 from mjx_nero.sim.physics import warp_available
 

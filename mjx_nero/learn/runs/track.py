@@ -10,8 +10,8 @@ from typing import Any
 
 from mjx_nero import config, files
 from mjx_nero.errors import UserError
-from mjx_nero.learn.logs import Row, Tracker
-from mjx_nero.learn.run_cfg import RunCfg
+from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.runs.logs import Row, Tracker
 
 
 class Wandb:

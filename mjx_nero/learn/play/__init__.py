@@ -1,0 +1,1 @@
+"""Whole episodes played by a policy or a controller, and their figures."""

@@ -1,0 +1,1 @@
+"""PPO: its config, its networks and its learner."""
