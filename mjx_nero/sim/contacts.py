@@ -1,4 +1,4 @@
-"""What can touch what, and the contacts and constraint rows that this needs at worst."""
+"""Pairs of geoms that can touch, and the most contacts and constraint rows that a scene can need."""
 
 import dataclasses
 import itertools
@@ -10,8 +10,7 @@ from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
-# The most contacts that MuJoCo and MJX-Warp find between two shapes; a pair that is not listed goes by their general convex
-# routine, which gives 4.
+# The most contacts that MuJoCo and MJX-Warp find between two shapes. Other pairs use their general convex routine: 4.
 _MOST = {
     "plane": {"sphere": 1, "ellipsoid": 1, "capsule": 2, "cylinder": 4, "box": 4},
     "sphere": {"sphere": 1, "capsule": 1, "ellipsoid": 1, "cylinder": 1, "box": 1, "mesh": 1},
@@ -25,7 +24,7 @@ _EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two geoms that can meet: the most contacts that their shapes make, and the constraint rows of all those."""
+    """Two geoms that can meet, with the most contacts that their shapes make and the constraint rows of all of them."""
 
     first: str
     second: str
@@ -36,9 +35,10 @@ class Pair:
 
 
 def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
-    """The pairs of geoms that MuJoCo lets meet.
+    """Lists the pairs of geoms that MuJoCo lets meet.
 
-    Explicit pairs, and those whose contact bits match: unless of one body, of a body and its parent, or of excluded bodies.
+    These are the explicit pairs, and those whose contact bits match, except within a body, between a body and its parent, and
+    between excluded bodies.
     """
     explicit = {(int(a), int(b)): int(d) for a, b, d in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True)}
     excluded = {(int(s) >> 16, int(s) & 0xFFFF) for s in model.exclude_signature}
@@ -60,7 +60,7 @@ def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
 
 
 def constraint_rows(model: mujoco.MjModel) -> dict[str, int]:
-    """Constraint rows at worst, by kind: all contacts made, every joint at a limit."""
+    """Counts the most constraint rows by kind: all contacts made, every joint at a limit."""
     kinds = [mujoco.mjtEq(kind).name.removeprefix("mjEQ_") for kind in model.eq_type]
     return {
         "contacts": sum(pair.rows for pair in contact_pairs(model)),
@@ -71,8 +71,7 @@ def constraint_rows(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
-    """``sim`` for the worst case of a robot in a scene, MJX-Warp's buffers and the line search: what an imported robot gets, of
-    which nobody has counted how many contacts its work makes."""
+    """Sizes MJX-Warp's buffers for every contact that the scene can make. Imported robots get these: nobody counted theirs."""
     model = scene.build(robot, objects, sim, visuals=False)
     contacts = sum(pair.contacts for pair in contact_pairs(model))
     rows = sum(constraint_rows(model).values())
@@ -80,10 +79,11 @@ def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
 
 
 def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
-    """``sim`` with MJX-Warp's buffers for a scene of several objects, not all of which can touch all others at once.
+    """Sizes MJX-Warp's buffers for a scene of several objects, which cannot all touch one another at once.
 
-    Each lies on the table, each of the robot's geoms touches the table and one object, and every other object one more; always
-    those that make the most of it. What is lost beyond that is counted (see ``Physics``).
+    The count assumes that every object lies on the table, every geom of the robot touches the table and one object, and every
+    second object touches one more; each time the pair with the most contacts. Contacts beyond that are lost and counted (see
+    ``Physics``).
     """
     model = scene.build(robot, objects, sim, visuals=False)
     of_object = {geom: _body(model, geom) for geom in range(model.ngeom) if _body(model, geom) in objects.objects}
@@ -112,7 +112,7 @@ def _body(model: mujoco.MjModel, geom: int) -> str:
 
 
 def _condim(model: mujoco.MjModel, a: int, b: int) -> int:
-    """The higher priority's, else the larger."""
+    """Contact dimension of a pair: that of the geom with higher priority, else the larger one."""
     (pa, pb), (da, db) = model.geom_priority[[a, b]], model.geom_condim[[a, b]]
     return int(max(da, db) if pa == pb else da if pa > pb else db)
 

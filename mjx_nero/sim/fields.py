@@ -1,4 +1,4 @@
-"""Model fields that differ from world to world: drawn by the terms of ``mdp.randomization``, and what follows from them."""
+"""Model fields that differ between worlds: those that ``mdp.randomization`` draws, and those derived from them."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,7 +12,7 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.randomization import Drawn, Model
 from mjx_nero.types import Key, UserError
 
-# What may be drawn: all backends read it afresh at every step.
+# Fields that a term may draw: all backends read them at every step.
 DRAWABLE = (
     "body_mass",
     "body_inertia",
@@ -40,10 +40,10 @@ class Randomization:
         terms: by name, each ``(key, model) -> {field: (rows, values)}``.
 
     Attributes:
-        names: of the fields that differ from world to world.
+        names: names of the fields that differ between worlds.
 
     Raises:
-        UserError: a term names what is not there, or draws a field that cannot differ.
+        UserError: a term names something that the model lacks, or draws a field that cannot differ.
     """
 
     def __init__(self, model: mujoco.MjModel, terms: Mapping[str, Callable[[Key, Model], Drawn]]):
@@ -70,7 +70,7 @@ class Randomization:
         self.names = tuple(rows) + tuple(self._derived)
 
     def __call__(self, key: Key, level: Float[Array, ""] | None = None) -> Fields:
-        """The fields of one world; empty without terms. ``level``: see ``types.LEVEL``."""
+        """Draws the fields of one world; empty without terms. ``level``: see ``types.LEVEL``."""
         drawn: Fields = {}
         for k_term, term in zip(
             jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True
@@ -92,10 +92,10 @@ class Randomization:
 
 
 def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:
-    """Prepares the model for what MuJoCo decides when it is compiled, and a drawn field could not change any more.
+    """Undos decisions of MuJoCo's compiler that would make it ignore a drawn field.
 
     Raises:
-        UserError: that cannot be.
+        UserError: a decision cannot be undone.
     """
     frictions, bodies, geoms = (sorted(rows.get(name, ())) for name in ("dof_frictionloss", "body_ipos", "geom_size"))
     model.dof_frictionloss[frictions] = np.maximum(model.dof_frictionloss[frictions], 1e-9)  # without any there is no constraint
@@ -115,7 +115,7 @@ def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:
         model.bvh_aabb[nodes, 3:] *= 2
 
 
-# What follows from masses, inertias and armatures. MuJoCo computes it when a model is compiled (mj_setConst), at ``qpos0``.
+# Fields derived from masses, inertias and armatures. MuJoCo's compiler computes them at ``qpos0`` (mj_setConst).
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0")
 
 
@@ -158,7 +158,7 @@ class _Tree:
     def __call__(self, fields: Mapping[str, Array], moved: bool = False) -> Drawn:
         """
         Args:
-            moved: the centres of mass are not where they were.
+            moved: the centres of mass have moved.
         """
         linear: Array = jnp.asarray(self._linear)
         if moved:

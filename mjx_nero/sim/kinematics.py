@@ -1,8 +1,8 @@
 """Forward kinematics and Jacobians in plain JAX.
 
-``mjx.step`` leaves body and site poses one physics step behind ``qpos``, and every backend keeps them elsewhere. A chain
-of a few joints is cheap enough to compute where it is read, so the terms see poses that fit ``qpos`` on every backend,
-also right after a reset; and controllers need neither a simulator nor its data.
+``mjx.step`` leaves body and site poses one physics step behind ``qpos``, and every backend keeps them in another place. A chain
+of a few joints is cheap to compute wherever it is read. So terms see poses consistent with ``qpos`` on every backend, even right
+after a reset, and controllers need neither a simulator nor its data.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,10 +21,10 @@ _STILL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Chain:
-    """Poses and Jacobians of frames as functions of some hinges and slides; pure, for one configuration (vmap it).
+    """Poses and Jacobians of frames as functions of some hinges and slides. Its methods are pure and take one configuration.
 
-    Joints that are not listed stay where the model's ``qpos0`` has them. What does not move between two joints is merged
-    into one fixed transform when the chain is made.
+    Joints that are not listed stay at the model's ``qpos0``. The constructor merges everything fixed between two joints into one
+    transform.
 
     Args:
         model: compiled model.
@@ -65,7 +65,7 @@ class Chain:
         del self._model, self._last
 
     def _body(self, body: int, frame: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
-        """The node that carries a body, and the fixed transform from there; adds nodes on the way."""
+        """Returns the node that carries a body and the fixed transform from there. Adds nodes on the way."""
         if body in self._last:
             return self._last[body]
         m = self._model
@@ -90,7 +90,7 @@ class Chain:
         return node, _compose(fixed, (m.site_pos[site], m.site_quat[site]))
 
     def path(self, frame: int) -> tuple[list[tuple[int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]], tuple]:
-        """What moves a frame, from the world on: (index in ``q``, fixed transform, axis, slide?) a joint; its own transform."""
+        """Returns a frame's joints, from the world on: (index in ``q``, fixed transform, axis, slide?); and its own transform."""
         node, end = self._ends[frame]
         links = []
         while node >= 0:
@@ -99,11 +99,11 @@ class Chain:
         return links[::-1], end
 
     def poses(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
-        """Positions [m] and orientations (wxyz) of the frames in the world."""
+        """Computes positions [m] and orientations (wxyz) of the frames in the world."""
         return self._frames(self._forward(q))
 
     def jacobians(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
-        """``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
+        """Computes ``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
         nodes = self._forward(q)
         pos, quat = self._frames(nodes)
         columns: list[Array] = [jnp.zeros((len(self.frames), 6))] * len(self.joints)
@@ -134,8 +134,8 @@ class Chain:
 def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " nq"]], Pose]:
     """Builds ``qpos -> (position [m], orientation wxyz)`` of a site or body in the world frame.
 
-    For the inner loop of thousands of environments, where ``Chain`` is for controllers: neighbouring links are put together in
-    pairs, then the pairs, so that seven joints take three rounds.
+    The environments' inner loop uses this function; controllers use ``Chain``. It composes neighbouring links in pairs, then the
+    pairs, so that seven joints take three rounds.
 
     Raises:
         KeyError: the model has no such site or body.
@@ -185,7 +185,7 @@ def _attach(nodes: list[Pose], parent: int, fixed: tuple[np.ndarray, np.ndarray]
 
 
 def _compose(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The transform ``b`` in the frame ``a``; double precision, when a chain is made."""
+    """Composes two transforms, in double precision: ``b`` given in the frame ``a``."""
     pos, quat = np.zeros(3), np.zeros(4)
     mujoco.mju_rotVecQuat(pos, np.asarray(b[0], float), a[1])
     mujoco.mju_mulQuat(quat, a[1], np.asarray(b[1], float))

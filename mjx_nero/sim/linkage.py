@@ -1,4 +1,4 @@
-"""Joints that equalities of the model couple."""
+"""Joints that equality constraints of the model couple."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 @dataclasses.dataclass(frozen=True)
 class Coupling:
-    """An equality of one joint's position with a polynomial of another's; MuJoCo counts both from their ``qpos0``.
+    """One joint's position as a polynomial of another's. MuJoCo counts both from their ``qpos0``.
 
     Attributes:
-        follower, leader: addresses in qpos; a follower without a leader is its own, and the polynomial a constant.
-        coefficients: from the constant one on, which holds the follower's ``qpos0``, too.
+        follower, leader: addresses in qpos. A follower without a leader is its own leader, with a constant polynomial.
+        coefficients: polynomial coefficients, lowest first. The constant includes the follower's ``qpos0``.
         reference: the leader's ``qpos0`` [rad or m].
     """
 
@@ -24,14 +24,14 @@ class Coupling:
     reference: float = 0.0
 
     def position(self, qpos: Float[Array, " nq"] | Float[np.ndarray, " nq"]) -> Float[Array, ""] | float:
-        """Where the follower has to be [rad or m]."""
+        """Position that the coupling asks of the follower [rad or m]."""
         offset, *powers = self.coefficients
         leader = qpos[self.leader] - self.reference
         return offset + sum((c * leader ** (k + 1) for k, c in enumerate(powers)), 0.0)
 
 
 def couplings(model: mujoco.MjModel) -> list[Coupling]:
-    """The joints that active equalities couple, leaders before their followers: where a linkage starts closed."""
+    """Lists the active couplings, leaders before their followers, so that a linkage can start closed."""
     found = list(_couplings(model))
     followers = {c.follower for c in found}
     ordered: list[Coupling] = []

@@ -1,7 +1,7 @@
-"""``model.xml`` of an imported robot, which may be a stranger's: read by an allow-list, with limits, before MuJoCo sees it.
+"""Reader of an imported robot's ``model.xml``. A stranger may have made it, so an allow-list and limits come before MuJoCo.
 
-What is allowed is what ``import-urdf`` writes, and what people change or add by hand: bodies, joints, primitives and meshes with
-their defaults and materials, couplings of joints. Drives, sensors, options and the like are the scene's.
+The list allows what ``import-urdf`` writes and what people add by hand: bodies, joints, primitives and meshes with their defaults
+and materials, couplings of joints. Drives, sensors and options belong to the scene.
 """
 
 import pathlib
@@ -53,10 +53,10 @@ _SCENES = {"body": ("world", "cube", "goal"), "joint": ("cube",), "geom": ("tabl
 
 
 def read(path: pathlib.Path) -> mujoco.MjSpec:
-    """The model, with its meshes, which lie in its folder.
+    """Reads a model and the meshes in its folder.
 
     Raises:
-        UserError: a file is missing, damaged or too large, lies elsewhere, or holds what is not allowed here.
+        UserError: a file is missing, damaged or too large, lies outside the folder, or holds something that is not allowed.
     """
     root = files.parse_xml(files.read_bytes(path, MAX_XML), str(path))
     if root.tag != "mujoco":
@@ -98,7 +98,7 @@ def _is_number(text: str) -> bool:
 
 
 def _meshes(root: etree._Element, path: pathlib.Path) -> dict[str, bytes]:
-    """Name as MuJoCo asks for it -> content."""
+    """Reads the meshes: name as MuJoCo asks for it -> content."""
     folders = [e.get("meshdir") for e in root.iter("compiler") if e.get("meshdir")]
     names = {e.get("file") for e in root.iter("mesh")} - {None}
     if len(names) > MAX_MESHES:

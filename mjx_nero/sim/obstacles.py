@@ -1,4 +1,4 @@
-"""Where a scene's obstacles stand, as model fields that differ from world to world."""
+"""A scene's obstacles as model fields that differ between worlds."""
 
 from collections.abc import Iterable, Mapping
 
@@ -13,11 +13,11 @@ FIELDS = ("geom_pos", "geom_quat", "geom_size", "geom_rbound")
 
 
 class Obstacles:
-    """The boxes of one world: from views to fields, and back.
+    """Converts the obstacles of one world between views and model fields.
 
     Args:
         model: compiled scene.
-        names: of its obstacles.
+        names: names of its obstacles.
     """
 
     def __init__(self, model: mujoco.MjModel, names: Iterable[str]):
@@ -25,10 +25,10 @@ class Obstacles:
         self._nominal = {name: np.array(getattr(model, name), np.float32) for name in FIELDS}
 
     def placed(self, fields: Mapping[str, Array], boxes: Mapping[str, ObstacleView]) -> dict[str, Array]:
-        """``fields`` with these boxes in their places; those that are not named stay in theirs.
+        """Returns ``fields`` with the named boxes moved.
 
         Raises:
-            UserError: the scene has no obstacle of a name.
+            UserError: the scene lacks an obstacle of that name.
         """
         if unknown := [name for name in boxes if name not in self._rows]:
             there = ", ".join(self._rows) or "none"
@@ -41,6 +41,6 @@ class Obstacles:
         return {**fields, **now}
 
     def views(self, fields: Mapping[str, Array]) -> dict[str, ObstacleView]:
-        """The boxes by name."""
+        """Returns the boxes by name."""
         pos, quat, half = (jnp.asarray(fields.get(name, self._nominal[name])) for name in FIELDS[:3])
         return {name: ObstacleView(pos[row], quat[row], 2 * half[row]) for name, row in self._rows.items()}

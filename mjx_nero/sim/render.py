@@ -30,13 +30,13 @@ _APART = 1.5  # between robots that share a picture [m]
 
 @dataclasses.dataclass(frozen=True)
 class VideoCfg:
-    """A video of episodes. What is None or 0 is chosen by how fast the machine draws: 1280 x 720 at 25 frames a second if it can.
+    """Options of a video. The machine's drawing speed decides what is None or 0: 1280 x 720 at 25 frames a second if it can.
 
     Attributes:
         size: width and height [pixels].
         fps: frames a second.
-        envs: robots side by side in one picture; 1: episodes come one after another.
-        episodes: how many one after another, where ``envs`` is 1.
+        envs: robots side by side in one picture; 1 shows episodes one after another.
+        in_turn: number of episodes one after another, if ``envs`` is 1.
     """
 
     size: tuple[int, int] | None = None
@@ -46,7 +46,7 @@ class VideoCfg:
 
     @property
     def episodes(self) -> int:
-        """How many have to be played."""
+        """Number of episodes to play."""
         return self.envs if self.envs > 1 else self.in_turn
 
 
@@ -55,10 +55,10 @@ class Renderer:
 
     Args:
         width, height: pixels.
-        camera: one of the model's, or a free one.
-        samples: of a pixel's edge; None: as the model says.
-        shadows: pixels along a shadow map's side; None: as the model says.
-        envs: robots in one picture, at most.
+        camera: name of a camera of the model, or a free camera.
+        samples: samples a pixel; None: the model's setting.
+        shadows: pixels along a side of the shadow map; None: the model's setting.
+        envs: most robots in one picture.
 
     Raises:
         UserError: the machine cannot draw offscreen.
@@ -93,18 +93,18 @@ class Renderer:
         self._renderer.close()
 
     def render(self, qpos: np.ndarray, scenery: Scenery) -> np.ndarray:
-        """One frame, uint8 [height, width, 3].
+        """Draws one frame, uint8 [height, width, 3].
 
         Args:
             qpos: [nq].
-            scenery: what else there is to see (``ManipulationEnv.scenery``).
+            scenery: goal, obstacles and looks (``ManipulationEnv.scenery``).
         """
         self._forward(qpos, scenery)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
 
     def render_all(self, qpos: np.ndarray, scenery: Scenery) -> np.ndarray:
-        """One frame of several robots, each at its own table, in rows; uint8 [height, width, 3].
+        """Draws several robots in rows, each at its own table, into one frame; uint8 [height, width, 3].
 
         Args:
             qpos: [envs, nq].
@@ -140,7 +140,7 @@ class Renderer:
         mujoco.mj_forward(self._model, self._data)
 
     def _overview(self, columns: int, rows: int) -> mujoco.MjvCamera:
-        """From the front and above, far enough for all robots."""
+        """Camera in front and above, far enough away to see all robots."""
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat = self._model.stat.center
@@ -150,17 +150,17 @@ class Renderer:
 
 
 def unmarked(*shape: int) -> Scenery:
-    """The model alone, for as many steps and environments: the goal marker is under the table."""
+    """Scenery that hides the goal marker under the table; ``shape`` gives the leading axes."""
     return Scenery(jnp.tile(jnp.array([0.0, 0.0, -10.0]), (*shape, 1)), jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (*shape, 1)))
 
 
 def frames(model: mujoco.MjModel, qpos: np.ndarray, scenery: Scenery, every: int = 1, **kwargs) -> list[np.ndarray]:
-    """Frames of recorded episodes, one after another.
+    """Draws recorded episodes, one after another.
 
     Args:
         qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
-        every: render each ``every``-th step.
-        kwargs: of ``Renderer``.
+        every: draw every ``every``-th step.
+        kwargs: arguments of ``Renderer``.
     """
     with Renderer(model, **kwargs) as renderer:
         steps, episodes = qpos.shape[:2]
@@ -176,12 +176,12 @@ def write_episodes(
     cfg: VideoCfg = VideoCfg(),
     update: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Writes recorded episodes as an MP4 in real time.
+    """Writes recorded episodes as an MP4 that plays in real time.
 
     Args:
         qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
-        dt: between steps [s].
-        update: called with frames drawn and frames in all.
+        dt: time between steps [s].
+        update: called with the numbers of frames drawn and of all frames.
 
     Raises:
         UserError: the machine cannot draw, or the path cannot be written.
@@ -206,7 +206,7 @@ def write_episodes(
 
 
 def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> None:
-    """Writes an MP4; the file appears whole or not at all.
+    """Writes an MP4. The file appears whole or not at all.
 
     Raises:
         UserError: the path cannot be written.
@@ -222,7 +222,7 @@ def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) ->
 def _quality(
     model: mujoco.MjModel, qpos: np.ndarray, scenery: Scenery, dt: float, cfg: VideoCfg, shots: int
 ) -> tuple[int, int, int, int, int]:
-    """The best picture that the machine draws in time: width, height, samples, shadows, and each how many steps to draw one."""
+    """Chooses the best quality that the machine draws in time: width, height, samples, shadows, and steps between frames."""
     every = max(1, round(1 / ((cfg.fps or 25) * dt)))
     seconds = math.inf
     for width, height, samples, shadows in _QUALITIES:

@@ -1,4 +1,4 @@
-"""Robots: what the model files leave open (mounting, drives, home pose, gripper), as frozen values. The arms are in ``arms``."""
+"""Robots as frozen values: mounting, drives, home pose and gripper, which model files leave open. ``envs.arms`` has the arms."""
 
 import dataclasses
 import pathlib
@@ -17,14 +17,14 @@ ASSETS = next(d for d in (_HERE / "assets", _HERE.parent / "assets") if d.is_dir
 
 @dataclasses.dataclass(frozen=True)
 class DriveCfg:
-    """PD position drives of a group of joints; tuples run along ``joints``.
+    """PD position drives of a group of joints. All tuples have the order of ``joints``.
 
     Attributes:
         joints: names in the model.
         stiffness: [N m/rad] or [N/m].
         damping: [N m s/rad] or [N s/m].
-        effort: limits of the drives' forces [N m] or [N].
-        speed: limits of how fast the position targets move [rad/s] or [m/s].
+        effort: force limits [N m] or [N].
+        speed: speed limits of the position targets [rad/s] or [m/s].
         home: joint positions at reset and at action zero [rad] or [m].
     """
 
@@ -37,19 +37,22 @@ class DriveCfg:
 
     @property
     def lead(self) -> tuple[float, ...]:
-        """Damping over stiffness [s]. A target this many seconds ahead of a moving set-point makes a drive that damps a joint's
-        speed damp its speed error instead: it tracks without lag."""
+        """Damping over stiffness [s].
+
+        A drive damps a joint's speed, so it lags behind a moving set-point. A target ``lead`` seconds ahead makes it damp the
+        speed error instead, and it tracks without lag.
+        """
         return tuple(d / k for d, k in zip(self.damping, self.stiffness, strict=True))
 
 
 @dataclasses.dataclass(frozen=True)
 class GripperCfg(DriveCfg):
-    """A gripper: drives with an open and a closed target. Without joints: none.
+    """Drives with an open and a closed target. A robot without a gripper has one without joints.
 
     Attributes:
         open, close: targets of the two actions [rad] or [m].
-        gap: ``positions [n] -> distance between the fingers' pads [m]``, of two opposed slides unless given; None: unknown.
-        positions: its inverse.
+        gap: ``positions [n] -> distance between the fingers' pads [m]``; None: unknown. The default suits two opposed slides.
+        positions: inverse of ``gap``.
     """
 
     open: tuple[float, ...] = ()
@@ -63,29 +66,29 @@ class RobotCfg:
     """A robot.
 
     Attributes:
-        name: folder under ``assets``, holding ``<name>.xml``; or what an imported robot is called.
+        name: name of an imported robot, or of a folder under ``assets`` that holds ``<name>.xml``.
         base_link: body that is fixed in the world.
-        base_pos: where the robot stands in the world [m].
-        base_quat: how its base link is turned there, wxyz. Commands and observations use the unturned frame.
-        arm, gripper: their drives.
+        base_pos: place of the base link in the world [m].
+        base_quat: orientation of the base link, wxyz. Commands and observations use the frame before this rotation.
+        arm, gripper: drives.
         ee_site: site at the grasp point.
         down: orientation of ``ee_site`` when the gripper points straight down and its fingers open along y, wxyz.
-        gravity_compensation: the drives carry the links' weight, as a robot's own controller does; False where the recipe that a
-            robot comes from does not.
-        max_step: the longest physics step that the drives bear [s]; 0: any that a task has.
-        workspace: box of the unturned frame in which ``ee_site`` gets everywhere, ranges of x, y and z [m]; what reach tasks
-            command unless they say otherwise.
-        floor: height of the floor that a robot beside the table stands on [m]; 0: it stands on the table.
-        opening: between the gripper's pads when it is open [m]; 0: unknown.
-        pad: size of a pad along the approach, across, and along the opening [m]; zeros: unknown.
-        grip: where the middle of a cube is that the gripper holds, in the frame of ``ee_site`` [m].
-        pick: box of the unturned frame over the table in which ``ee_site`` gets everywhere with the gripper pointing down, as far
-            as the arm can; its lowest height is the one to grasp a cube of the gripper's size at (``sim.grasp``) [m].
-        lean: how far from straight down the gripper has to lean somewhere in ``pick`` [rad]; 0: it points down everywhere.
-        hold: box of the unturned frame above, to which the gripper can bring what it holds [m]; ``pick`` and ``hold`` are what
-            lift commands unless it is told otherwise.
-        folder: of an imported robot, holding ``model.xml``; empty: one of the package's.
-        mjcf: the model itself, as text in place of a file.
+        gravity_compensation: the drives carry the links' weight, as most robots' own controllers do. False where the recipe of a
+            robot has none.
+        max_step: longest physics step at which the drives are stable [s]; 0: no limit.
+        workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
+            draw their commands from it by default.
+        floor: height of the floor under a robot beside the table [m]; 0: the robot stands on the table.
+        opening: distance between the pads of the open gripper [m]; 0: unknown.
+        pad: size of a pad along the approach, across it, and along the opening [m]; zeros: unknown.
+        grip: centre of a held cube in the frame of ``ee_site`` [m].
+        pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the
+            unrotated base frame [m]. Its lowest height is where to grasp a cube that fits the gripper (``sim.grasp``).
+        lean: largest angle from straight down that the gripper needs in ``pick`` [rad]; 0: it points down everywhere.
+        hold: box above, to which the gripper can bring what it holds, in the same frame [m]. Lift tasks draw their objects from
+            ``pick`` and their goals from ``hold`` by default.
+        folder: folder of an imported robot, which holds ``model.xml``; empty for the package's own.
+        mjcf: text of the model, in place of a file.
     """
 
     name: str
@@ -116,7 +119,7 @@ class RobotCfg:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Joint names, arm first: the order of ``View.joint_pos``, of the actuators and of ``ctrl``."""
+        """Joint names, arm first. ``View.joint_pos``, the actuators and ``ctrl`` have this order."""
         return self.arm.joints + self.gripper.joints
 
     @property

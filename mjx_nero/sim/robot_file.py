@@ -1,4 +1,4 @@
-"""Files of robots: models, and beside an imported one its config ``robot.yaml``, which import-urdf writes and users edit."""
+"""Robots' files: the model, and an imported robot's config ``robot.yaml``, which import-urdf writes and users edit."""
 
 import dataclasses
 import math
@@ -47,24 +47,25 @@ _PLAIN = (
 )
 _HEAD = """\
 # A robot for mjx_nero: edit at will. Units: m, rad, kg, N, s; quaternions wxyz.
-# arm, gripper: a line a joint, position drives with stiffness [N m/rad or N/m] and damping, limits of effort and speed, and home.
-# workspace: box that reach tasks command from, in the robot's own frame before base_quat turns it. down: ee_site's orientation
-# when the gripper points straight down. floor: height of what a robot beside the table stands on. opening: between the pads when
-# open; pad: size of one along the approach, across and along the opening; 0: unknown. grip: where the middle of what it holds is,
-# in ee_site's frame. pick, hold: boxes of lift tasks, in the frame of workspace: pick over the table, where the gripper can point
-# down, from the height at which it grasps; lean: how far it leans there where it cannot; hold: for goals.
+# arm, gripper: one line a joint: stiffness [N m/rad or N/m] and damping of its position drive, limits of effort and speed, home.
+# workspace: box from which reach tasks draw their commands, in the base frame before base_quat rotates it.
+# down: orientation of ee_site when the gripper points straight down. floor: height of the floor under a robot beside the table.
+# opening: distance between the pads of the open gripper. pad: size of a pad along the approach, across it and along the opening.
+# A zero means unknown. grip: centre of a held object in the frame of ee_site.
+# pick, hold: boxes of lift tasks, in the frame of workspace. The gripper can point down everywhere in pick, which begins at the
+# height for grasping; lean is the largest angle from straight down that it needs there. hold: box of goals.
 """
 
 
 def write(folder: pathlib.Path, robot: RobotCfg) -> None:
-    """Writes ``robot.yaml``; callables (the gripper's gap) are not kept."""
+    """Writes ``robot.yaml``. Callables (the gripper's gap) are not kept."""
     content = {name: _plain(getattr(robot, name)) for name in _PLAIN}
     content |= {"arm": _rows(robot.arm, _ARM), "gripper": _rows(robot.gripper, _GRIPPER)}
     (folder / NAME).write_text(_HEAD + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130))
 
 
 def read(folder: pathlib.Path) -> RobotCfg:
-    """The robot of a folder that ``import-urdf`` made.
+    """Reads the robot from a folder that ``import-urdf`` made.
 
     Raises:
         UserError: a file is missing or damaged, or names what the model does not have.
@@ -98,14 +99,14 @@ def read(folder: pathlib.Path) -> RobotCfg:
         if not lower < upper:
             raise UserError(f"{robot.xml}: joint {name!r} has no range: give it one, drives need it")
     slides = [spec.joint(j).type for j in gripper.joints] == [mujoco.mjtJoint.mjJNT_SLIDE] * 2
-    # Known of two opposed slides that are together at zero; others open alike, or about another middle.
+    # The default gap holds for two opposed slides that meet at zero, not for slides that open alike or about another middle.
     if not slides or not math.isclose(gripper.open[0] - gripper.open[1], robot.opening, abs_tol=1e-3):
         gripper = dataclasses.replace(gripper, gap=None, positions=None)
     return dataclasses.replace(robot, gripper=gripper)
 
 
 def _check(robot: RobotCfg, path: pathlib.Path) -> None:
-    """What no field can say by itself."""
+    """Checks what concerns several fields."""
     boxes = {name: getattr(robot, name) or () for name in ("workspace", "pick", "hold")}
     for number in (*robot.base_pos, *(end for box in boxes.values() for axis in box for end in axis)):
         if not abs(number) <= MAX_NUMBER:
@@ -126,10 +127,10 @@ def _check(robot: RobotCfg, path: pathlib.Path) -> None:
 
 
 def model(robot: RobotCfg) -> mujoco.MjSpec:
-    """The robot's model, of the package or imported.
+    """Reads the robot's model.
 
     Raises:
-        UserError: the file is missing or damaged, or lacks what the robot's config names.
+        UserError: the file is missing or damaged, or lacks a joint, site or body that the robot's config names.
     """
     if robot.mjcf:
         where, spec = f"the mjcf of {robot.name}", _parsed(robot)
@@ -160,7 +161,7 @@ def _rows(drive: DriveCfg, columns: tuple[str, ...]) -> dict[str, dict[str, floa
 
 
 def _columns(rows: Any, columns: tuple[str, ...], where: str) -> dict[str, Any]:
-    """``joint -> {column: value}`` as the fields of a drive."""
+    """Turns ``joint -> {column: value}`` into the fields of a drive."""
     rows = {} if rows is None else rows
     if not isinstance(rows, Mapping):
         raise UserError(f"{where} takes a line a joint, got {short(rows)}")

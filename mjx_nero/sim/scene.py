@@ -32,15 +32,15 @@ class ObjectCfg:
     """A free body.
 
     Attributes:
-        shape: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``can``; the last three stand along z. A can is a cylinder to the
-            table, and to all else the capsule within it: what flat pads press on a cylinder's side is a single point that jumps
-            about, and MJX-JAX knows of none.
-        size: of a box its edges, of a sphere its radius, of a capsule (without its ends) or a cylinder radius and length [m].
+        shape: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``can``; the last three stand along z. A can meets the table as a
+            cylinder and everything else as the capsule inside it: a flat pad touches a cylinder's side at a single point that
+            jumps about, and MJX-JAX finds no contact there.
+        size: edges of a box; radius of a sphere; radius and length of a cylinder, or of a capsule without its ends [m].
         mass: [kg].
-        friction: sliding; spinning and rolling [m].
-        condim: how many of these a contact has: 3 sliding, 4 spinning, too, 6 rolling, too; of two geoms that meet, the more.
-        pos: where it is before the reset events: x, y, and how far above the table it hovers [m].
-        quat: how it is turned there, wxyz.
+        friction: sliding [1], spinning and rolling [m].
+        condim: contact dimension: 3 slides, 4 also spins, 6 also rolls. The larger of two geoms holds.
+        pos: place before the reset events: x, y, and height above the table [m].
+        quat: orientation there, wxyz.
         rgba: colour.
     """
 
@@ -55,7 +55,7 @@ class ObjectCfg:
 
     @property
     def rest_height(self) -> float:
-        """Of its centre, where it touches the table [m]."""
+        """Height of its centre when it rests on the table [m]."""
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, np.asarray(self.quat) / np.linalg.norm(self.quat))
         up, (first, *rest) = turn[6:], self.size
@@ -73,13 +73,12 @@ def cube(edge: float, mass: float) -> ObjectCfg:
 
 @dataclasses.dataclass(frozen=True)
 class ObstacleCfg:
-    """A box that stands still and stops robot and objects. Where nobody draws its place (``EnvCfg.obstacles``), it is below the
-    table, out of the way.
+    """A fixed box that stops robot and objects. It stays below the table unless a task draws its place (``EnvCfg.obstacles``).
 
     Attributes:
-        size: its edges [m].
-        pos: of its centre in the world [m].
-        quat: how it is turned, wxyz.
+        size: edges [m].
+        pos: centre in the world [m].
+        quat: orientation, wxyz.
         rgba: colour.
     """
 
@@ -93,19 +92,19 @@ class ObstacleCfg:
 class SceneCfg:
     """Table, objects and goal marker. Lengths in m.
 
-    The table top is the plane z = 0 (a plane costs the fewest contacts); its drawn edges only matter to the
-    termination that counts an object beyond them as fallen.
+    The table top is the plane z = 0, because a plane costs the fewest contacts. Its drawn edges matter only to the termination
+    that counts an object beyond them as fallen.
 
     Attributes:
-        table_center, table_size: of the drawn top, along x and y.
-        table: False makes it a picture alone: nothing meets it, and without contacts the physics is several times faster.
+        table_center, table_size: centre and size of the drawn top, along x and y.
+        table: False draws the table but lets nothing touch it; without contacts the physics is several times faster.
         objects: free bodies by name.
-        obstacles: boxes that stand still, by name. The whole arm meets them, and what touches is measured (``sim.touch``).
-        self_collision: the robot's links meet one another, which is measured likewise.
-        goal: the marker's shape: ``sphere``, ``frame`` (a sphere with axes), ``cube``, an object's name, whose shape it then
-            has, or ``none``.
-        goal_edge: of a cube.
-        look_at, view_distance: where the cameras look, and from how far.
+        obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
+        self_collision: the robot's links collide with one another; ``sim.touch`` measures those forces, too.
+        goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
+            whose shape it takes.
+        goal_edge: edge of the ``cube`` marker.
+        look_at, view_distance: point that the cameras look at, and their distance from it.
     """
 
     table_center: tuple[float, float] = (0.3, 0.0)
@@ -129,7 +128,7 @@ Slots = Annotated[int, Bounds(1, 100_000)]
 
 @dataclasses.dataclass(frozen=True)
 class SimCfg:
-    """Physics options, and the buffers that MJX-Warp needs (overflows are counted, see ``Physics``)."""
+    """Physics options and MJX-Warp's buffer sizes. Overflows are counted, see ``Physics``."""
 
     dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
     decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps a control step
@@ -141,19 +140,18 @@ class SimCfg:
     constraints_per_env: Slots = 128  # Warp: constraint rows of one environment
 
     def finer(self, max_step: float) -> "SimCfg":
-        """With so many more and shorter physics steps a control step that none is longer than ``max_step`` [s]; 0: as it is."""
+        """Splits each physics step until none is longer than ``max_step`` [s]; the control step stays. 0 changes nothing."""
         times = math.ceil(self.dt / max_step - 1e-6) if max_step else 1
         return dataclasses.replace(self, dt=self.dt / times, decimation=self.decimation * times)
 
 
 def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, fuse: bool = False) -> mujoco.MjModel:
-    """Compiles robot, table, objects (body, joint and geom by the object's name) and goal marker.
+    """Compiles robot, table, objects and goal marker. An object's body, joint and geom carry its name.
 
     Args:
-        visuals: False leaves out all that physics does not need (visual shapes, lights, cameras): same qpos, qvel and
-            ctrl, less work a step.
-        fuse: makes links that nothing moves against their parents a part of them, unless one serves as the end effector: Warp
-            goes through the tree level by level.
+        visuals: False drops what physics does not need (visual shapes, lights, cameras): same qpos, qvel and ctrl, faster steps.
+        fuse: merges links that cannot move against their parents, unless one is the end effector. Warp goes through the tree
+            level by level, so fewer levels are faster.
 
     Raises:
         UserError: an object's shape, size or name is not possible.
@@ -190,7 +188,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
 
 
 def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
-    """The scene with table and cameras where an imported robot works: the table under it, or in front of one on the floor."""
+    """Moves table and cameras to where an imported robot works: under the robot, or in front of one that stands on the floor."""
     boxes = [np.array(box).T for box in (robot.workspace, robot.pick, robot.hold) if box]  # [2, 3]
     if not boxes:
         return scene
@@ -214,12 +212,12 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
 
 
 def robot_model(robot: RobotCfg) -> mujoco.MjModel:
-    """The robot alone where it is mounted: what kinematics need."""
+    """Compiles the mounted robot alone, for kinematics."""
     return _robot_spec(robot).compile()
 
 
 def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
-    """``whole``: with the shapes that meet obstacles alone."""
+    """Reads and mount the robot. ``whole`` keeps the shapes that meet obstacles only."""
     spec = robot_file.model(robot)
     for geom in [] if whole else spec.geoms:
         if geom.conaffinity == touch.OBSTACLE:
@@ -276,12 +274,12 @@ def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectCfg) -> None:
 
 
 def side(name: str) -> str:
-    """Name of the geom that a can's side is."""
+    """Name of the geom that forms the side of can ``name``."""
     return f"{name}_side"
 
 
 def _geom(item: ObjectCfg) -> tuple[mujoco.mjtGeom, list[float]]:
-    """MuJoCo's type and size."""
+    """MuJoCo's geom type and size of an object."""
     half = [item.size[0], *(x / 2 for x in item.size[1:])] if item.shape != "box" else [x / 2 for x in item.size]
     return _SHAPES[item.shape][0], half + [0.0] * (3 - len(half))
 

@@ -1,8 +1,8 @@
-"""What must not happen: touching an obstacle, or the robot itself. Obstacles in the model, and the force of such contacts.
+"""Unwanted contacts: the robot with obstacles or with itself. Puts obstacles into the model and reads the contact forces.
 
-The force is that of MuJoCo's contact sensors, the strongest contact of each obstacle and each pair of links, because all three
-backends have them with the same meaning; the net force on a link would hide a link that is squeezed, and distances between all
-shapes would be computed once more in every step and know nothing of the physics steps between two control steps.
+The force is the strongest contact of each obstacle and each pair of links, from MuJoCo's contact sensors: all three backends have
+them with the same meaning. A net force on a link would hide a link that is squeezed. Distances between all shapes would cost time
+in every step and miss what happens between two control steps.
 """
 
 import dataclasses
@@ -17,29 +17,29 @@ from mjx_nero.sim import linkage, robot_file
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
-OBSTACLE = 8  # contact bit; robot shapes of this bit alone are left out where there is nothing of the kind
-COLLISION = 3  # geom group of the robots' collision shapes, those that meet nothing as yet included
-NAME = "touch"  # of the reading
-_PREFIX = f"{NAME}:"  # of the sensors' names
-# Shapes that every backend can bring together with a box.
+OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
+COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
+NAME = "touch"  # name of the reading
+_PREFIX = f"{NAME}:"  # prefix of the sensors' names
+# Shapes that every backend can collide with a box.
 _MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
-_SAMPLES = 1000  # postures in which links are looked at
-_ALWAYS = 0.9  # links that touch in so many of them are made that way
-_ANYWHERE = 10.0  # [m] half the edge of the bounding box of what may stand anywhere
+_SAMPLES = 1000  # postures in which links are tested
+_ALWAYS = 0.9  # links that touch in this share of the postures are built that way
+_ANYWHERE = 10.0  # [m] half the edge of the bounding box of an obstacle, which may stand anywhere
 
 
 def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, Any], objects: tuple[str, ...], pairs) -> None:
-    """Puts obstacles into a scene, lets robot and objects meet them, and measures their contacts.
+    """Adds obstacles to a scene, lets robot and objects collide with them, and adds sensors for their contacts.
 
     Args:
         spec: robot and objects.
         base: the robot's base link.
         obstacles: ``scene.ObstacleCfg`` by name.
-        objects: names of bodies and their geoms.
-        pairs: names of the robot's geoms that can meet.
+        objects: names of objects; body and geom share a name.
+        pairs: names of the robot's geoms that can collide.
 
     Raises:
-        UserError: a name is taken, or a shape cannot meet a box on every backend.
+        UserError: a name is taken, or a shape cannot collide with a box on every backend.
     """
     shapes = [*_collision_shapes(spec, base), *(spec.geom(name) for name in objects)]
     if obstacles:
@@ -74,7 +74,7 @@ def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, Any], objects: t
 
 
 def _collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
-    """Of the robot, named."""
+    """Lists the robot's collision shapes and names those without a name."""
     geoms = [geom for geom in spec.body(base).find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.conaffinity or geom.group == COLLISION]
     for i, geom in enumerate(geoms):
         geom.name = geom.name or f"{geom.parent.name}'s shape {i + 1}"
@@ -94,7 +94,7 @@ def _add_sensor(spec: mujoco.MjSpec, first: str, second: str | None) -> None:
 
 
 def unbounded(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model, ready for obstacles anywhere: what MuJoCo derives from their first poses is made to hold for all."""
+    """Makes the model ready for obstacles anywhere: MuJoCo derives bounds from their first poses, and these must hold for all."""
     for geom in np.flatnonzero(model.geom_contype & OBSTACLE):
         body = model.geom_bodyid[geom]
         model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -105,23 +105,23 @@ def unbounded(model: mujoco.MjModel) -> mujoco.MjModel:
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """Sensor values [*b, nsensordata], NumPy's or JAX's -> the strongest contact's force [*b] [N].
+    """Computes the strongest contact's force [*b] [N] from sensor values [*b, nsensordata], in NumPy or JAX.
 
     Attributes:
-        addresses: of the three numbers of each contact's force.
-        pairs: the geoms that they are about, [ngeom, ngeom] of booleans.
+        addresses: place of each contact's force, three numbers, among the sensor values.
+        pairs: geoms whose contacts count, booleans [ngeom, ngeom].
     """
 
     addresses: np.ndarray
     pairs: np.ndarray
 
     def __call__(self, values: Any) -> Any:
-        """The force."""
+        """Returns the force."""
         return (values[..., self.addresses[:, None] + np.arange(3)] ** 2).sum(-1).max(-1) ** 0.5
 
 
 def readers(model: mujoco.MjModel) -> dict[str, Reader]:
-    """What reads a model's sensors, by the names of ``Sim.readings``; none if the scene does not ask for them."""
+    """Makes the readers of a model's sensors, by name in ``Sim.readings``. Empty if the scene has no such sensor."""
     ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(_PREFIX)]
     pairs = np.zeros((model.ngeom, model.ngeom), bool)
     for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
@@ -131,13 +131,13 @@ def readers(model: mujoco.MjModel) -> dict[str, Reader]:
 
 @functools.cache
 def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
-    """Names of the robot's collision shapes that can meet one another and ought not to.
+    """Lists pairs of the robot's collision shapes that can collide but should not, by name.
 
-    Left out are links that follow one another, the gripper's own parts, and what touches at home, in nearly all postures, or in
-    none of those looked at.
+    It leaves out consecutive links, parts of the gripper, and pairs that touch at home, in nearly all sampled postures, or in
+    none of them.
 
     Raises:
-        UserError: shapes that not every backend can bring together.
+        UserError: not every backend can collide two of the shapes.
     """
     spec = robot_file.model(robot)
     shapes = _collision_shapes(spec, robot.base_link)
@@ -171,7 +171,7 @@ def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
 
 
 def _link(model: mujoco.MjModel, body: int, arm: list[int]) -> int:
-    """How many of the arm's joints move a body: its place in the chain."""
+    """Place of a body in the chain: the number of arm joints that move it."""
     moved = 0
     while body:
         moved += sum(int(model.jnt_bodyid[joint]) == body for joint in arm)
@@ -180,7 +180,7 @@ def _link(model: mujoco.MjModel, body: int, arm: list[int]) -> int:
 
 
 def _postures(model: mujoco.MjModel, robot: RobotCfg) -> Iterator[np.ndarray]:
-    """Home, and postures of the arm spread evenly over its joints' ranges."""
+    """Yields home, then postures of the arm spread evenly over its joints' ranges."""
     ids = [model.joint(name).qposadr[0] for name in robot.joints]
     limits = [model.joint(name).range if model.joint(name).limited[0] else (-np.pi, np.pi) for name in robot.arm.joints]
     low, high = np.array(limits).T

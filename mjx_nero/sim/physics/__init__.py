@@ -1,6 +1,6 @@
-"""Physics backends: one control step of a batch of environments, on whatever this machine has.
+"""Physics backends: each computes one control step of a batch of environments.
 
-Each is a module of its own with one class; ``make_physics`` picks by name. All give the terms the same state, ``types.Sim``.
+A backend is one module with one class; ``make_physics`` picks it by name. All backends give the terms the same ``types.Sim``.
 """
 
 import contextlib
@@ -20,11 +20,12 @@ from mjx_nero.types import Sim, UserError
 
 @dataclasses.dataclass(frozen=True)
 class Footprint:
-    """What a backend takes of a device's memory for an environment [bytes].
+    """Device memory that a backend needs for one environment [bytes].
 
     Attributes:
-        in_program: of JAX's, in a compiled step.
-        outside: of its own, beside JAX's; and what there is ``free`` for that on each device.
+        in_program: JAX's memory, in a compiled step.
+        outside: the backend's own memory, beside JAX's.
+        free: memory available for ``outside`` on each device.
     """
 
     in_program: float = 0.0
@@ -42,27 +43,27 @@ class Physics(Protocol):
         ...
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
-        """One control step (``decimation`` physics steps); pure, for one environment or vmapped for many.
+        """Computes one control step (``decimation`` physics steps). Pure; takes one environment, vmap it for many.
 
         Returns:
-            the state, and 1.0 if contacts or constraint rows were lost for want of buffer (Warp only), else 0.0.
+            the state, and 1.0 if a full buffer lost contacts or constraint rows (Warp only), else 0.0.
         """
         ...
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Makes ready what ``step`` needs for so many environments on each of the first devices; it may be called in a thread.
+        """Prepares what ``step`` needs for ``num_envs`` environments on each of the first devices. A thread may call it.
 
-        ``step`` would do it, too, but inside a JAX program, and for as long as that runs XLA's autotuner lets no other program
-        for that device be compiled.
+        ``step`` would prepare it, too, but inside a JAX program; while that runs, XLA's autotuner lets no other program for the
+        device compile.
         """
         ...
 
     def memory(self, num_devices: int = 1) -> Footprint:
-        """What an environment takes of each of the first devices."""
+        """Returns the memory that one environment needs on each of the first devices."""
         ...
 
 
-# (model from ``scene.build(..., visuals=False, fuse=True)``, options and buffer sizes, fields that differ from world to world)
+# (model from ``scene.build(..., visuals=False, fuse=True)``, options and buffer sizes, fields that differ between worlds)
 Make = Callable[[mujoco.MjModel, SimCfg, Sequence[str]], Physics]
 
 
@@ -78,7 +79,7 @@ _BACKENDS: dict[str, Make] = {
 
 
 def impls() -> tuple[str, ...]:
-    """The names that ``--impl`` takes."""
+    """Lists the names that ``--impl`` takes."""
     return ("auto", *_BACKENDS)
 
 
@@ -86,7 +87,7 @@ def register(name: str, make: Make) -> None:
     """Adds a backend.
 
     Raises:
-        UserError: there is one of this name.
+        UserError: a backend has this name already.
     """
     if name in impls():
         raise UserError(f"there is a physics {name!r} already: choose another name")
@@ -101,10 +102,10 @@ def warp_available() -> bool:
 
 
 def resolve_impl(impl: str) -> str:
-    """``auto`` -> the fastest that this machine has; checks the others.
+    """Turns ``auto`` into the fastest backend of this machine and checks other names.
 
     Raises:
-        UserError: unknown, or not possible on this machine.
+        UserError: the name is unknown, or this machine cannot run the backend.
     """
     if impl not in impls():
         raise UserError(f"unknown impl {impl!r}: choose one of {', '.join(impls())}")
@@ -116,12 +117,12 @@ def resolve_impl(impl: str) -> str:
 
 
 def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str, fields: Sequence[str] = ()) -> Physics:
-    """The backend of a name that ``resolve_impl`` gave.
+    """Makes the backend that ``resolve_impl`` named.
 
     Args:
         model: from ``scene.build(..., visuals=False, fuse=True)``.
         cfg: options and buffer sizes.
-        fields: names of the model's fields that ``Sim.fields`` brings for every world.
+        fields: names of the model fields that ``Sim.fields`` holds for every world.
 
     Raises:
         UserError: the backend cannot compute this model.
@@ -130,10 +131,10 @@ def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str, fields: Sequence
 
 
 def fusion() -> dict[str, str | bool]:
-    """The compiler options of a backend that is no JAX program itself.
+    """Compiler options of a backend that is not a JAX program itself.
 
-    With an old JAX the package switches off a fusion of XLA's that MJX-JAX and the controllers cannot do with (see
-    ``mjx_nero/__init__.py``). Networks take half as long again without it, so for them it comes back where MJX-JAX is not.
+    With an old JAX the package switches off a fusion of XLA that breaks MJX-JAX and the controllers (see
+    ``mjx_nero/__init__.py``). Networks run 1.5 times as long without it, so backends other than MJX-JAX switch it on again.
     """
     switch = "xla_cpu_use_fusion_emitters"
     return {switch: True} if f"{switch}=false" in os.environ.get("XLA_FLAGS", "") else {}
@@ -141,10 +142,10 @@ def fusion() -> dict[str, str | bool]:
 
 @contextlib.contextmanager
 def possible(name: str) -> Iterator[None]:
-    """Says in one line what a backend cannot do with a model.
+    """Turns a library's errors about a model into one line.
 
     Raises:
-        UserError: in place of the library's own errors.
+        UserError: the backend cannot compute the model.
     """
     try:
         yield

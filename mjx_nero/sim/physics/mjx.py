@@ -1,4 +1,4 @@
-"""MJX-JAX: the physics as a JAX program, for any accelerator. With ``mujoco_warp`` the only caller of MJX."""
+"""MJX-JAX: physics as a JAX program, for any accelerator. Only this module and ``mujoco_warp`` call MJX."""
 
 import copy
 import dataclasses
@@ -15,8 +15,8 @@ from mjx_nero.sim.physics import Footprint, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
-# Steps of MJX's line search, at most. With 50, which MuJoCo's C library needs, a cube in the grip slipped by 2 mm in one of eight
-# places, with 20 in none (tests/sim/test_grasp.py).
+# Most steps of MJX's line search. With 50, which MuJoCo's C library needs, a held cube slipped by 2 mm in one of eight places.
+# With 20 it slipped in none (tests/sim/test_grasp.py).
 LINE_SEARCH = 20
 
 
@@ -36,8 +36,7 @@ class JaxPhysics:
         self._touches = bool(model.geom_contype.any())
 
     def step(self, sim: Sim, ctrl: Float[Array, " nu"]) -> tuple[Sim, Float[Array, ""]]:
-        """One control step of one environment; vmap it for many."""
-
+        """Computes one control step of one environment; vmap it for many."""
         mx = self._mx.replace(**sim.fields)
 
         def physics_step(_, sim: Sim) -> Sim:
@@ -48,29 +47,29 @@ class JaxPhysics:
             return dataclasses.replace(sim, readings=readings, **after)
 
         sim = dataclasses.replace(sim, ctrl=ctrl, readings=dict.fromkeys(self._readers, jnp.zeros(())))
-        # A loop, as two steps in a row would take twice as long to compile.
+        # A loop compiles in half the time of two unrolled steps.
         return jax.lax.fori_loop(0, self.decimation, physics_step, sim), jnp.zeros(())
 
     @property
     def compiler_options(self) -> dict[str, str | bool]:
-        """The package's own (see ``physics.fusion``)."""
+        """None: the package's own options suit MJX-JAX (see ``physics.fusion``)."""
         return {}
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Nothing: all is in the program."""
+        """Does nothing: the compiled program holds everything."""
 
     def memory(self, num_devices: int = 1) -> Footprint:
-        """A step takes a few times MJX's data."""
+        """Returns the memory of a step: a few times MJX's data."""
         return Footprint(in_program=2.5 * sum(x.nbytes for x in jax.tree.leaves(self._template)))
 
     def _saturated(self, mx, data):
-        """The model with constant forces in place of the drives that are at their limits.
+        """Replaces drives at their force limits by constant forces.
 
-        A drive there no longer damps. MuJoCo's C library and Warp leave its damping out of the implicit integration; MJX-JAX
-        forgets to, and its drives would speed up several times too slowly.
+        A drive at its limit no longer damps. MuJoCo's C library and Warp leave its damping out of the implicit integration;
+        MJX-JAX keeps it, so its drives would speed up several times too slowly.
 
-        Not done where something can touch: in single precision the solver ends early on what a drive's sudden jump costs, and
-        jolts a resting cube by 0.2 mm.
+        Scenes with contacts do not use this: in single precision the sudden change makes the solver stop early and jolts a
+        resting cube by 0.2 mm.
         """
         gain, bias = mx.actuator_gainprm, mx.actuator_biasprm
         force = (

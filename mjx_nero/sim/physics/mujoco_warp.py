@@ -1,8 +1,8 @@
 """MuJoCo Warp, the engine of MJX-Warp, on an NVIDIA GPU.
 
-MJX's own wrapper hands all of MuJoCo's data, some hundred arrays, back and forth at every physics step. Here they stay where
-Warp made them: in go the few arrays of ``types.Sim``, then one CUDA graph runs all physics steps of a control step, and out
-come the same few. What else the engine keeps is recomputed from them, so the function is pure.
+MJX's own wrapper passes about a hundred arrays of MuJoCo's data back and forth at every physics step. Here they stay in Warp.
+``step`` copies in the few arrays of ``types.Sim``, one CUDA graph runs all physics steps of a control step, and the same few
+arrays are copied out. The engine recomputes everything else from them, so the function is pure.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ _WARP = threading.Lock()
 
 
 class WarpPhysics:
-    """See ``physics.Physics``. Buffers are made at the first step on a device with a batch size, and kept."""
+    """See ``physics.Physics``. The first step with a batch size on a device makes the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
@@ -43,7 +43,7 @@ class WarpPhysics:
         self._batched = self._as_jax()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
-        """One control step; any leading axes are environments."""
+        """Computes one control step; leading axes are environments."""
         # The drawn fields travel with the targets: without any these go alone.
         lead = sim.qpos.shape[:-1]
         drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
@@ -108,7 +108,7 @@ class WarpPhysics:
         return fusion()
 
     def memory(self, num_devices: int = 1) -> Footprint:
-        """MuJoCo Warp's data."""
+        """Returns the size of MuJoCo Warp's data, and the free memory."""
         import warp as wp
 
         free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes' are theirs to ask
@@ -148,8 +148,12 @@ class WarpPhysics:
         return self._made[key]
 
     def _make(self, n: int) -> tuple[Any, Any, Callable[[], None], Any, Any]:
-        """MuJoCo Warp's data for ``n`` environments on the current device, their drawn fields as one array, what steps them,
-        the strongest contacts that count (None: none do), and what has to be kept."""
+        """Makes what ``n`` environments need on the current device.
+
+        Returns:
+            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the strongest unwanted contacts (None if
+            nobody reads them), and objects that must stay alive.
+        """
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
 
@@ -183,9 +187,9 @@ class WarpPhysics:
         return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
 
     def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
-        """The strongest contact that counts of each world [N], and what brings it up to date after the solver.
+        """Makes the array of each world's strongest unwanted contact [N], and the function that updates it after the solver.
 
-        What MuJoCo's contact sensors say, for which MuJoCo Warp looks through all contacts once more for each.
+        It equals MuJoCo's contact sensors, for each of which MuJoCo Warp would search all contacts once more.
         """
         import warp as wp
         from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
@@ -224,7 +228,7 @@ class WarpPhysics:
         return strongest, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs)
 
     def _world_fields(self, model: Any, n: int) -> Any:
-        """Puts the drawn fields in the model's place, one row a world: views of one array [n, numbers], None without any."""
+        """Replaces the drawn fields of the model by views of one array [n, numbers], one row a world. None without fields."""
         import warp as wp
 
         sizes = [math.prod(shape) for shape in self._fields.values()]
@@ -242,7 +246,7 @@ class WarpPhysics:
 
 
 def _load_kernels() -> None:
-    """Compiles the parts of MuJoCo Warp that every model needs side by side; a first run would do it one after another."""
+    """Compiles the parts of MuJoCo Warp that every model needs in parallel; a first run would compile them one by one."""
     import warp as wp
     from mujoco.mjx.third_party.mujoco_warp._src import constraint, derivative, forward, passive, smooth, support
 

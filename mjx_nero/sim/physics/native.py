@@ -1,6 +1,6 @@
-"""MuJoCo's C library on CPU threads: by far the fastest physics without an accelerator, and the sim-to-sim check of a policy.
+"""MuJoCo's C library on CPU threads: the fastest physics without an accelerator, and the sim-to-sim check of policies.
 
-JAX calls it back on the host, once a control step, with all environments of a batch. It computes in double precision.
+JAX calls back to the host once a control step with all environments of a batch. The library computes in double precision.
 """
 
 import contextlib
@@ -24,15 +24,15 @@ from mjx_nero.sim.physics import Footprint, fusion
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
-# One batch at a time: it has all the cores to itself, and its work arrays.
+# One batch at a time uses all the cores and its work arrays.
 _lock = threading.Lock()
 
 
 class NativePhysics:
-    """See ``physics.Physics``. Work arrays are made at the first step with a batch size, and kept.
+    """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept.
 
-    The C library does not tell the solver's last acceleration, so ``Sim.warmstart`` is the change of velocity over the last
-    physics step instead. It is a guess to start from, and a function of the state as the rest.
+    The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
+    physics step: a fair first guess, and a function of the state.
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
@@ -47,7 +47,7 @@ class NativePhysics:
         self._made: dict[int, tuple[np.ndarray, ...]] = {}  # by number of environments
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
-        """One control step; any leading axes are environments. Where MuJoCo gives up, the state is NaN."""
+        """Computes one control step; leading axes are environments. The state becomes NaN where MuJoCo gives up."""
         drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
         packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
         shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + len(self._readers)), jnp.float32)
@@ -60,7 +60,7 @@ class NativePhysics:
     def _step(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
         """(qpos, qvel, warmstart, ctrl, fields) -> the first three after the step, and the readings.
 
-        No JAX in here: it would wait for itself.
+        JAX calls this function back, so calling JAX in here would deadlock.
         """
         n, (nq, nqv, nqvv, end) = math.prod(packed.shape[:-1]), self._sizes
         given, fields = np.split(np.asarray(packed).reshape(n, -1), [end], axis=1)
@@ -92,7 +92,7 @@ class NativePhysics:
         return after.reshape(*packed.shape[:-1], -1)
 
     def _set(self, models: Any, present: np.ndarray, fields: np.ndarray) -> None:
-        """Brings the models up to date where the fields have changed: at the starts of episodes."""
+        """Updates the models whose fields have changed, which happens when episodes begin."""
         for i in np.flatnonzero((present != fields).any(axis=1)):
             at = 0
             for name, shape in self._fields.items():
@@ -107,10 +107,10 @@ class NativePhysics:
         return fusion()
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Nothing: the first step is as quick as any."""
+        """Does nothing: the first step is as quick as any."""
 
     def memory(self, num_devices: int = 1) -> Footprint:
-        """None of a device's."""
+        """Returns an empty footprint: the C library uses no device memory."""
         return Footprint()
 
     def _make(self, n: int) -> tuple:
@@ -126,7 +126,7 @@ class NativePhysics:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps MuJoCo from printing its warnings and writing them to a file; the environments count what came of them."""
+    """Silences MuJoCo's warnings, which it prints and writes to a file. The environments count the states that they concern."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
