@@ -8,6 +8,8 @@ import sys
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
+from mjx_nero.errors import missing
+
 if TYPE_CHECKING:
     from mjx_nero.envs.env import ManipulationEnv
     from mjx_nero.envs.registry import env_cfg, list_envs, list_presets, list_robots, make
@@ -41,15 +43,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-def missing(error: ModuleNotFoundError) -> str:
-    """What to do where a package is not installed; one line."""
-    package = (error.name or str(error)).partition(".")[0]
-    return (
-        f"{sys.executable} does not have the package {package!r}: activate the environment that mjx_nero was installed into "
-        "(. .venv/bin/activate), or install it (pip install -e .)"
-    )
 
 
 def _prepare() -> None:

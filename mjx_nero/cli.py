@@ -15,9 +15,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from importlib import metadata
 from typing import Annotated, Any, NoReturn
 
-import mjx_nero
 from mjx_nero import bounds, cache, config, values
-from mjx_nero.errors import UserError
+from mjx_nero.errors import UserError, missing
 
 LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 
@@ -113,8 +112,8 @@ class Parser(argparse.ArgumentParser):
 
     def given(self, argv: Sequence[str]) -> set[str]:
         """Names of the flags in ``argv``, as they are called in what ``parse`` gives; dotted ones apart."""
-        missing = object()
-        absent = {action.dest: None if isinstance(action.default, list) else missing for action in self._actions}  # lists grow
+        nothing = object()
+        absent = {action.dest: None if isinstance(action.default, list) else nothing for action in self._actions}  # lists grow
         found, _ = self.parse_known_args(argv, argparse.Namespace(**absent))
         return {name for name, value in absent.items() if getattr(found, name, value) is not value}
 
@@ -176,7 +175,7 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("mjx_nero"):
             raise
-        print(f"error: {mjx_nero.missing(error)}", file=sys.stderr)
+        print(f"error: {missing(error)}", file=sys.stderr)
         code = 2
     except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

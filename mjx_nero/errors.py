@@ -1,4 +1,6 @@
-"""The one error that a user is meant to see."""
+"""The one error that a user is meant to see, and what to say where a package is missing."""
+
+import sys
 
 
 class UserError(ValueError):
@@ -15,3 +17,12 @@ class UserError(ValueError):
         if len(text) > self.LONGEST:
             text = f"{text[: self.LONGEST - 164]} ... {text[-159:]}"  # what to do stands at the end
         super().__init__(text)
+
+
+def missing(error: ModuleNotFoundError) -> str:
+    """What to do where a package is not installed; one line."""
+    package = (error.name or str(error)).partition(".")[0]
+    return (
+        f"{sys.executable} does not have the package {package!r}: activate the environment that mjx_nero was installed into "
+        "(. .venv/bin/activate), or install it (pip install -e .)"
+    )

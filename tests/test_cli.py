@@ -1,6 +1,7 @@
 """Command lines: kinds of numbers and paths, help of every field, and programs outside their environment."""
 
 import argparse
+import ast
 import dataclasses
 import os
 import pathlib
@@ -141,6 +142,24 @@ def test_outside_the_environment_the_package_says_what_to_do():
     assert "activate the environment" in found.stderr.splitlines()[-1] and "ModuleNotFoundError" not in found.stderr
     with pytest.raises(AttributeError, match="no attribute 'mak'"):
         mjx_nero.mak  # noqa: B018
+
+
+def test_only_tools_and_interop_import_the_face_of_the_package():
+    """It names what lies above: a module that imports it would depend on all of that."""
+    package = pathlib.Path(mjx_nero.__file__).parent
+    importers = {path.relative_to(package) for path in package.rglob("*.py") if _imports_the_face(path)}
+    assert importers and {path.parts[0] for path in importers} <= {"interop", "tools"}
+
+
+def _imports_the_face(path):
+    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
+    whole = any(name.name == "mjx_nero" for node in nodes if isinstance(node, ast.Import) for name in node.names)
+    return whole or any(
+        name.name in (*mjx_nero.__all__, "__version__")
+        for node in nodes
+        if isinstance(node, ast.ImportFrom) and node.module == "mjx_nero"
+        for name in node.names
+    )
 
 
 def test_public_names_are_there():
