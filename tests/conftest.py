@@ -34,7 +34,7 @@ _CHECKED = (
     "urdf",
     "learn.checkpoint",
     "learn.policy",
-    "learn.rollout",
+    "learn.play.rollout",
 )
 # What a shell puts in the background ignores Ctrl-C, under nohup hangups, and so would the programs that tests start and signal.
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):

@@ -9,7 +9,7 @@ from mjx_nero import UserError, bounds, config, control, env_cfg, list_envs, lis
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.task import CALM, QUIET, EnvCfg
-from mjx_nero.learn.policy import NetworkCfg
+from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import PRESETS
 from mjx_nero.mdp import actions
 

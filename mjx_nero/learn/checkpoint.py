@@ -3,6 +3,7 @@
 import json
 import pathlib
 import zlib
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -24,6 +25,10 @@ class Damaged(UserError):
 
 def _names(tree: Any) -> list[str]:
     return [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def _renamed(name: str, held: Mapping[str, str]) -> str:
+    return next((other + name.removeprefix(own) for own, other in held.items() if name.startswith(own)), name)
 
 
 def fetch(tree: Tree) -> Tree:
@@ -70,6 +75,16 @@ def not_finite(tree: Any) -> str | None:
     return None
 
 
+def check_finite(tree: Any, path: pathlib.Path) -> None:
+    """Are all numbers of a policy finite?
+
+    Raises:
+        UserError: one of the file at ``path`` is not.
+    """
+    if name := not_finite(tree):
+        raise UserError(f"{path} holds numbers that are not finite, in {name}: give an earlier one, or copy it anew")
+
+
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
     total = 0
     for _, x in sorted(arrays.items()):
@@ -95,17 +110,21 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
     return meta
 
 
-def load(path: pathlib.Path, template: Tree) -> Tree:
+def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = None) -> Tree:
     """The arrays in the file as a tree like ``template`` (whose leaves need only shape and dtype).
+
+    Args:
+        held: the start of a name in ``template`` -> in the file, where the file is that of a larger tree.
 
     Raises:
         UserError: missing, damaged, or other names, shapes or types than the template's.
     """
     verify(path)
-    held, _ = header.read(path)
-    wanted = dict(zip(_names(template), jax.tree.leaves(template), strict=True))
+    there, _ = header.read(path)
+    names = [_renamed(name, held or {}) for name in _names(template)]
+    wanted = dict(zip(names, jax.tree.leaves(template), strict=True))
     for name, want in wanted.items():  # before any is read: the file may hold more than the memory
-        kind, shape = held.get(name, (str(want.dtype), want.shape))
+        kind, shape = there.get(name, (str(want.dtype), want.shape))
         if (kind, shape) != (str(want.dtype), want.shape):
             raise UserError(f"{path} does not fit: {name} is {kind}{shape}, expected {want.dtype}{want.shape}")
     try:

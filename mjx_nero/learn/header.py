@@ -149,6 +149,8 @@ _NETWORK: dict[str, Callable[[Any], bool]] = {
     "init_std": lambda value: _number(100)(value) and value > 0,
     "output_scale": _number(1e6),
     "max_observation": _number(1e6),
+    "encoders": _list(lambda pair: _list(_word, 2)(pair) and len(pair) == 2, 200),
+    "encoder_layers": _LAYERS,
 }
 _FIELDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("kind", "env", "preset", "robot", "learner", "fingerprint", "version"), _word),

@@ -90,12 +90,18 @@ class Kind:
             and ``num_timesteps``, 0: chosen for the machine.
         policy: what a policy file says -> a template of the policy's parameters, and how it acts.
         fit: (config, number of devices that a run starts on) -> the config with what they decide, which the run keeps.
+        held: where a checkpoint holds the policy's parameters: the start of their names in a policy's file -> in the learner's
+            state, as in ``{"['w']": ".best"}``. Empty: no checkpoint can be played, only a policy's file.
+        differing: (what a file says of its policy, what the run's own says) -> the config's fields in which they differ, by
+            dotted name, with the file's values.
     """
 
     make: Callable[["Env", Any, int], Learner]
     presets: Mapping[str, Any]
     policy: Callable[[Mapping[str, Any]], tuple[Params, Act]]
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
+    held: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
 
 
 # The package's own: the folder whose ``learner`` has its ``KIND``; the presets stand in ``cfg`` beside it, without Brax.

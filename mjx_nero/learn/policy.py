@@ -1,8 +1,7 @@
-"""Policies: networks, action selection, and the file they live in."""
+"""Policies: the file they live in, and whether one fits an environment."""
 
 import dataclasses
 import functools
-import hashlib
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -11,21 +10,13 @@ import mjx_nero.sim.quiet  # noqa: F401
 
 # isort: split
 import jax
-import jax.numpy as jnp
-import numpy as np
-from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import losses, networks
-from flax import linen
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
-from mjx_nero.learn.learner import Act, Observation
-from mjx_nero.learn.ppo.cfg import NetworkCfg as NetworkCfg
-from mjx_nero.sim import scene
-from mjx_nero.sim.robot import ASSETS, RobotCfg
-
-Sizes = Mapping[str, Any]  # shapes, an array a group; of a group whose terms stay apart, a dict of them
+from mjx_nero.learn.learner import Observation
+from mjx_nero.sim.fingerprint import fingerprint
+from mjx_nero.sim.robot import ASSETS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,62 +34,6 @@ class Policy:
     act: Callable[[Observation], jax.Array]
 
 
-def _is_shape(node: Any) -> bool:
-    return isinstance(node, tuple | list)
-
-
-def shapes(sizes: Any) -> list[tuple[int, ...]]:
-    """The shapes in ``Sizes``, or in a part of it: of all observations, also of groups whose terms stay apart."""
-    return jax.tree.leaves(sizes, is_leaf=_is_shape)
-
-
-def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.PPONetworks:
-    """Brax's PPO networks; the critic reads ``privileged_state`` where the environment has that group."""
-    return networks.make_ppo_networks(
-        dict(sizes),
-        action_size,
-        preprocess_observations_fn=functools.partial(running_statistics.normalize, max_abs_value=cfg.max_observation or None),
-        policy_hidden_layer_sizes=tuple(cfg.actor),
-        value_hidden_layer_sizes=tuple(cfg.critic),
-        activation=getattr(linen, cfg.activation),
-        value_obs_key="privileged_state" if "privileged_state" in sizes else "state",
-        distribution_type=cfg.distribution,
-        noise_std_type="log",
-        init_noise_std=cfg.init_std,
-        mean_kernel_init_fn=jax.nn.initializers.variance_scaling,  # LeCun's uniform one, as in the other layers, times a factor
-        mean_kernel_init_kwargs={"scale": cfg.output_scale**2, "mode": "fan_in", "distribution": "uniform"},
-    )
-
-
-def init_params(nets: networks.PPONetworks, sizes: Sizes, key: jax.Array) -> tuple:
-    """Fresh (normalizer, network parameters)."""
-    k_actor, k_critic = jax.random.split(key)
-    # The floor keeps a constant observation, whose deviation is 0, from being divided by nothing.
-    normalizer = running_statistics.init_state(
-        jax.tree.map(lambda size: specs.Array(size, jnp.dtype("float32")), dict(sizes), is_leaf=_is_shape)
-    )
-    normalizer = normalizer.replace(std_eps=jnp.float32(1e-4))
-    params = losses.PPONetworkParams(policy=nets.policy_network.init(k_actor), value=nets.value_network.init(k_critic))
-    return normalizer, params
-
-
-def make_act(nets: networks.PPONetworks, params: tuple) -> Callable[[Observation], jax.Array]:
-    """The deterministic policy: the mode of the action's distribution."""
-    normalizer, net_params = params
-    policy = networks.make_inference_fn(nets)((normalizer, net_params.policy), deterministic=True)
-    return lambda obs: policy(obs, None)[0]
-
-
-def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
-    """The networks that a policy file describes: a template of their parameters, and how they act."""
-    network: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in meta["network"].items()}
-    sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=_is_shape)
-    # Files of version 0.4 know no bound on observations.
-    nets = make_networks(sizes, meta["action_size"], NetworkCfg(**{"max_observation": 0.0, **network}))
-    template = jax.eval_shape(functools.partial(init_params, nets, sizes), jax.random.PRNGKey(0))
-    return template, lambda params, obs: make_act(nets, params)(obs)
-
-
 def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: Mapping[str, Any]) -> dict[str, Any]:
     """What a policy file says of the policy in it.
 
@@ -113,7 +48,7 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
         "preset": preset,
         "robot": env.cfg.robot.name,
         "fingerprint": fingerprint(env.cfg.robot),
-        "observation_size": jax.tree.map(list, env.observation_size, is_leaf=_is_shape),
+        "observation_size": jax.tree.map(list, env.observation_size, is_leaf=lambda node: isinstance(node, tuple)),
         "observations": terms,
         "action_size": env.action_size,
         "actions": env.action_kinds,
@@ -122,42 +57,33 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
     }
 
 
-def fingerprint(robot: RobotCfg) -> str:
-    """Tells robots apart that share a name: a hash of the compiled model's tree, joints and masses, of the drives and of home.
-
-    Numbers count to four digits, so that another compiler or processor does not make another robot.
-    """
-    model = scene.robot_model(robot)
-    bodies = ("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "site_pos")
-    joints = ("jnt_type", "jnt_pos", "jnt_axis", "jnt_range", "dof_armature", "dof_damping", "dof_frictionloss")
-    drives = [
-        getattr(d, name) for d in (robot.arm, robot.gripper) for name in ("stiffness", "damping", "effort", "speed", "home")
-    ]
-    numbers = np.concatenate([np.ravel(getattr(model, name)) for name in bodies + joints] + [np.ravel(d) for d in drives])
-    text = " ".join([*robot.joints, *(f"{x:.3e}" if abs(x) > 1e-9 else "0" for x in numbers.astype(float))])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def load(path: pathlib.Path | str) -> Policy:
-    """Reads a policy file.
+def checkpoint_policy(path: pathlib.Path | str) -> Policy:
+    """The policy in a policy's file or in a checkpoint of a run, rebuilt by its learner from what the file says of it.
 
     Raises:
-        UserError: missing, damaged, or not a policy.
+        UserError: missing, damaged, or it describes no policy.
     """
     path = pathlib.Path(path)
     meta = checkpoint.load_meta(path)
     header.check(meta, path)
-    size = path.stat().st_size
-    if meta.get("kind") == "policy" and size > header.MAX_POLICY:
+    whole, size = meta.get("kind") == "checkpoint", path.stat().st_size
+    if not whole and size > header.MAX_POLICY:
         raise UserError(f"{path} has {size / 1e6:.0f} MB: policies of more than {header.MAX_POLICY / 1e6:.0f} MB are not read")
+    kind = learner.find(meta.get("learner", "ppo"))
+    if whole and not kind.held:
+        raise UserError(
+            f"{path} is a checkpoint, which the learner {meta['learner']} cannot play: give the run's policy.safetensors"
+        )
     try:
-        template, act = learner.find(meta.get("learner", "ppo")).policy(meta)
+        template, act = kind.policy(meta)
     except (KeyError, TypeError, AttributeError):
         raise UserError(f"{path} does not describe a policy: give the policy.safetensors of a run") from None
-    params = checkpoint.load(path, template)
-    if not all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(params)):
-        raise UserError(f"{path} holds numbers that are not finite: train again or copy it anew")
+    params = checkpoint.load(path, template, kind.held if whole else {})
+    checkpoint.check_finite(params, path)
     return Policy(meta=meta, params=params, act=functools.partial(act, params))
+
+
+load = checkpoint_policy
 
 
 def load_for(
@@ -168,56 +94,62 @@ def load_for(
     any_robot: bool = False,
     preset: str = "default",
 ) -> Policy:
-    """Reads the policy at ``path`` (default: the one that ships for ``env_name``) and checks that it fits ``env``.
+    """Reads the policy at ``path`` (default: the bundled one for ``env_name``) and checks that it fits ``env``.
 
     Args:
-        preset: of the policy that ships, where it has one of its own.
+        preset: of the bundled policy, where it has one of its own.
         robot: what the user named for another than the environment's own, for the messages.
         any_robot: play it even if it was trained for another model of the robot.
 
     Raises:
         UserError: missing, damaged, or trained on another environment, robot or other observations.
     """
-    if path is None and not shipped(env_name, preset).is_file():
+    path = pathlib.Path(path or shipped(env_name, preset))
+    if path == shipped(env_name, preset) and not path.is_file():
         command = f"python train.py --env {env_name}" + (f" --robot {robot}" if robot else "")
         raise UserError(f"no policy ships for {env_name}: train one ({command}) and pass --policy PATH")
-    path = pathlib.Path(path or shipped(env_name, preset))
-    policy = load(path)
-    if policy.meta["env"] != env_name:
-        raise UserError(f"{path} is a policy of {policy.meta['env']}, not of {env_name}: pass --env {policy.meta['env']}")
-    name = env.cfg.robot.name
-    if policy.meta.get("robot", name) != name:
-        raise UserError(
-            f"{path} is a policy for {policy.meta['robot']}, not for {name}: pass the --robot that it was trained with"
-        )
-    here = fingerprint(env.cfg.robot)
-    if not any_robot and policy.meta.get("fingerprint", here) != here:
-        raise UserError(
-            f"{path} is a policy for another model of {name} (other links, masses, joints or drives): pass the --robot that "
+    policy = checkpoint_policy(path)
+    here = describe(env, env_name, preset, policy.meta.get("learner", "ppo"), {})
+    if fault := misfit(policy.meta, here, any_robot):
+        raise UserError(f"{path} {fault}")
+    return policy
+
+
+def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = False) -> str:
+    """What keeps a policy from being played in an environment, and what to do; empty if nothing does.
+
+    Args:
+        there: what the policy's file says (``describe``). Those of older versions say less.
+        here: the same of the environment.
+        any_robot: it may be of another model of the robot.
+    """
+    kind, robot = there.get("kind", "policy"), here["robot"]
+    if there["env"] != here["env"]:
+        return f"is a {kind} of {there['env']}, not of {here['env']}: pass --env {there['env']}"
+    if there.get("robot", robot) != robot:
+        return f"is a {kind} for {there['robot']}, not for {robot}: pass the --robot that it was trained with"
+    if not any_robot and there.get("fingerprint", here["fingerprint"]) != here["fingerprint"]:
+        return (
+            f"is a {kind} for another model of {robot} (other links, masses, joints or drives): pass the --robot that "
             "it was trained with, train one for this robot, or pass --any-robot to play it all the same"
         )
-    terms = {group: list(members) for group, members in env.cfg.observations.items()}
-    sizes = jax.tree.map(list, env.observation_size, is_leaf=_is_shape)
-    same_terms = policy.meta["observations"]["state"] == terms["state"]
-    if same_terms and policy.meta["action_size"] != env.action_size:
-        count = f"{policy.meta['action_size']} actions, {name} takes {env.action_size}"
-        raise UserError(f"{path} is of another robot ({count}): leave out --robot, or train one with it and pass --policy")
-    if not same_terms:
-        raise UserError(
-            f"{path} was trained on other observations (preset {policy.meta['preset']}): pass --preset {policy.meta['preset']}"
+    if there["observations"]["state"] != here["observations"]["state"]:
+        return f"was trained on other observations (preset {there['preset']}): pass --preset {there['preset']}"
+    if there["action_size"] != here["action_size"]:
+        count = f"{there['action_size']} actions, {robot} takes {here['action_size']}"
+        return f"is of another robot ({count}): leave out --robot, or train one with it and pass --policy"
+    if (sizes := [each["observation_size"]["state"] for each in (there, here)])[0] != sizes[1]:
+        return (
+            f"was trained on observations of size {sizes[0]}, here it is {sizes[1]}: pass the --preset (it had "
+            f"{there['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
         )
-    if (trained_on := policy.meta["observation_size"]["state"]) != sizes["state"]:
-        raise UserError(
-            f"{path} was trained on observations of size {trained_on}, here it is {sizes['state']}: pass the --preset (it had "
-            f"{policy.meta['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
-        )
-    if not header.acts_alike(policy.meta, {"actions": env.action_kinds}):
-        given = policy.meta.get("actions", ["JointPosition"])
-        raise UserError(
-            f"{path} was trained on other actions ({', '.join(given)}; here {', '.join(env.action_kinds)}): "
+    if not header.acts_alike(there, here):
+        kinds = ", ".join(there.get("actions", ["JointPosition"]))
+        return (
+            f"was trained on other actions ({kinds}; here {', '.join(here['actions'])}): "
             "pass the --preset that it was trained with, or train again"
         )
-    return policy
+    return ""
 
 
 def shipped(env_name: str, preset: str = "default") -> pathlib.Path:

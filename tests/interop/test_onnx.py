@@ -18,7 +18,8 @@ import mjx_nero
 from mjx_nero import interop
 from mjx_nero.interop import onnx as export
 from mjx_nero.learn import checkpoint, policy
-from mjx_nero.learn.ppo.cfg import ACTIVATIONS
+from mjx_nero.learn.ppo import networks
+from mjx_nero.learn.ppo.cfg import ACTIVATIONS, NetworkCfg
 from mjx_nero.mdp import actions
 from mjx_nero.mdp.terms import Term
 from mjx_nero.types import UserError
@@ -31,10 +32,10 @@ ABSENT = ("jax", "brax", "flax", "mujoco", "onnx", "yaml", "lxml")
 def fresh(path, **network):
     """A policy of ``nero_reach`` with drawn weights and statistics, as a file."""
     shipped = policy.load(policy.shipped("nero_reach")).meta
-    cfg = policy.NetworkCfg(actor=(32, 16), critic=(8,), **network)
+    cfg = NetworkCfg(actor=(32, 16), critic=(8,), **network)
     sizes = {"state": tuple(shipped["observation_size"]["state"])}
-    nets = policy.make_networks(sizes, shipped["action_size"], cfg)
-    normalizer, params = policy.init_params(nets, sizes, jax.random.PRNGKey(3))
+    nets = networks.make_networks(sizes, shipped["action_size"], cfg)
+    normalizer, params = networks.init_params(nets, sizes, jax.random.PRNGKey(3))
     mean, spread = jax.random.normal(jax.random.PRNGKey(4), (2, *sizes["state"]))
     normalizer = normalizer.replace(mean={"state": mean}, std={"state": jnp.exp(spread)})
     meta = {**shipped, "network": {"actor": [32, 16], "critic": [8], **network}}

@@ -10,7 +10,7 @@ from test_ppo import KEY, SMALL
 from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.policy import NetworkCfg
+from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import Learner
 
 

@@ -12,7 +12,8 @@ import pytest
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.task import joint_actions
 from mjx_nero.learn import checkpoint, policy
-from mjx_nero.learn.policy import NetworkCfg
+from mjx_nero.learn.ppo import networks
+from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.mdp.actions import BinaryGripper
 from mjx_nero.mdp.terms import Term
 
@@ -22,9 +23,9 @@ CFG = NetworkCfg(actor=(16, 8), critic=(8,))
 @pytest.fixture(scope="module")
 def trained(env):
     """Networks, parameters and description of an untrained policy of the default preset."""
-    nets = policy.make_networks(env.observation_size, env.action_size, CFG)
+    nets = networks.make_networks(env.observation_size, env.action_size, CFG)
     # Jitted, as in training: all leaves become arrays.
-    params = jax.jit(lambda key: policy.init_params(nets, env.observation_size, key))(jax.random.PRNGKey(0))
+    params = jax.jit(lambda key: networks.init_params(nets, env.observation_size, key))(jax.random.PRNGKey(0))
     return nets, params, policy.describe(env, "nero_lift", "default", "ppo", {"network": dataclasses.asdict(CFG)})
 
 
@@ -45,7 +46,7 @@ def test_loaded_policy_acts_bit_equal(env, trained, path, obs):
     for loaded in (policy.load(path), policy.load(str(path)), policy.load_for(env, "nero_lift", path)):
         assert loaded.meta == json.loads(json.dumps(meta))
         jax.tree.map(np.testing.assert_array_equal, loaded.params, params)
-        np.testing.assert_array_equal(loaded.act(obs), policy.make_act(nets, params)(obs))
+        np.testing.assert_array_equal(loaded.act(obs), networks.make_act(nets, params)(obs))
 
 
 def test_act_is_deterministic_single_or_batched_and_reads_the_state_alone(trained, path, obs):
@@ -63,12 +64,12 @@ def test_act_is_deterministic_single_or_batched_and_reads_the_state_alone(traine
 @pytest.mark.parametrize("distribution", ["normal", "tanh_normal"])
 def test_act_is_the_mode_of_the_distribution(env, obs, distribution):
     cfg = dataclasses.replace(CFG, distribution=distribution, init_std=0.5)
-    nets = policy.make_networks(env.observation_size, env.action_size, cfg)
-    normalizer, params = policy.init_params(nets, env.observation_size, jax.random.PRNGKey(0))
+    nets = networks.make_networks(env.observation_size, env.action_size, cfg)
+    normalizer, params = networks.init_params(nets, env.observation_size, jax.random.PRNGKey(0))
     logits = nets.policy_network.apply(normalizer, params.policy, obs)
     mean = nets.parametric_action_distribution.create_dist(logits).loc
     want = jnp.tanh(mean) if distribution == "tanh_normal" else mean
-    np.testing.assert_allclose(policy.make_act(nets, (normalizer, params))(obs), want, atol=1e-6)
+    np.testing.assert_allclose(networks.make_act(nets, (normalizer, params))(obs), want, atol=1e-6)
     if distribution == "normal":
         np.testing.assert_allclose(nets.parametric_action_distribution.create_dist(logits).scale, 0.5, rtol=1e-5)
 
@@ -86,10 +87,10 @@ def test_normalised_observations_have_a_bound(env, trained, obs):
     nets, params, _ = trained
     mean, std = params[0].mean["state"], params[0].std["state"]
     far, ten = ({**obs, "state": mean + k * std + 0 * obs["state"]} for k in (1e6, 10))
-    act = policy.make_act(nets, params)
+    act = networks.make_act(nets, params)
     np.testing.assert_array_equal(act(far), act(ten))
-    nets = policy.make_networks(env.observation_size, 8, dataclasses.replace(CFG, max_observation=0.0))
-    unbounded = policy.make_act(nets, params)
+    nets = networks.make_networks(env.observation_size, 8, dataclasses.replace(CFG, max_observation=0.0))
+    unbounded = networks.make_act(nets, params)
     np.testing.assert_array_equal(unbounded(ten), act(ten))
     assert np.abs(unbounded(far) - act(far)).min() > 1
 
@@ -106,8 +107,8 @@ def test_a_file_without_the_bound_is_played_without(trained, obs, tmp_path):
 def test_normalizer_is_part_of_the_policy(trained, obs):
     nets, (normalizer, params), _ = trained
     shifted = normalizer.replace(mean=jax.tree.map(lambda x: x + 0.5, normalizer.mean))
-    moved = policy.make_act(nets, (shifted, params))({**obs, "state": obs["state"] + 0.5})
-    np.testing.assert_allclose(moved, policy.make_act(nets, (normalizer, params))(obs), atol=1e-5)
+    moved = networks.make_act(nets, (shifted, params))({**obs, "state": obs["state"] + 0.5})
+    np.testing.assert_allclose(moved, networks.make_act(nets, (normalizer, params))(obs), atol=1e-5)
 
 
 def test_critic_reads_the_privileged_group_where_there_is_one(env, trained, obs):
@@ -116,8 +117,8 @@ def test_critic_reads_the_privileged_group_where_there_is_one(env, trained, obs)
     other = {**obs, "privileged_state": obs["privileged_state"] + 1}
     assert (nets.value_network.apply(normalizer, params.value, other) != value).all()
     recipe = make("nero_lift", "isaac", impl="native")
-    nets = policy.make_networks(recipe.observation_size, recipe.action_size, CFG)
-    normalizer, params = policy.init_params(nets, recipe.observation_size, jax.random.PRNGKey(0))
+    nets = networks.make_networks(recipe.observation_size, recipe.action_size, CFG)
+    normalizer, params = networks.init_params(nets, recipe.observation_size, jax.random.PRNGKey(0))
     assert nets.value_network.apply(normalizer, params.value, recipe.reset(jax.random.PRNGKey(0)).obs).shape == ()
 
 

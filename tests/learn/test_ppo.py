@@ -17,7 +17,7 @@ from kinematic import Kinematic
 from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, device_memory
-from mjx_nero.learn.policy import NetworkCfg
+from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import Learner, PpoCfg, _before, _bound_std, fit
 
 SMALL = PpoCfg(

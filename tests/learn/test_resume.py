@@ -2,12 +2,14 @@
 
 import pathlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjx_nero import UserError
-from mjx_nero.learn import checkpoint
+from mjx_nero.learn import checkpoint, learner
+from mjx_nero.learn.learner import Kind
 from mjx_nero.learn.runs import resume
 
 META = {
@@ -74,17 +76,38 @@ class Learner:
         return policy
 
 
+@pytest.fixture
+def three(monkeypatch):
+    """``Learner`` by the name ``three``."""
+    monkeypatch.setattr(learner, "_KINDS", dict(learner._KINDS))
+    template = {"w": jax.ShapeDtypeStruct((3,), np.float32)}
+    learner.register("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, None)))
+
+
 @pytest.mark.parametrize("kind", ["checkpoint", "policy"])
-def test_networks_that_are_not_finite_are_refused(kind, tmp_path):
+def test_networks_that_are_not_finite_are_refused(three, kind, tmp_path):
     path = tmp_path / "a.safetensors"
     for last in (3.0, np.nan, np.inf):
-        checkpoint.save(path, {"w": np.array([1.0, 2.0, last], np.float32)}, {**META, "kind": kind})
+        checkpoint.save(path, {"w": np.array([1.0, 2.0, last], np.float32)}, {**META, "learner": "three", "kind": kind})
         source = resume.find(path, print)
         if np.isfinite(last):
             assert resume.state(source, Learner(), 0)["w"].tolist() == [1.0, 2.0, 3.0]
         else:
             with pytest.raises(UserError, match=r"a.safetensors holds numbers that are not finite, in \['w'\]"):
                 resume.state(source, Learner(), 0)
+
+
+def test_networks_of_other_sizes_are_refused(three, tmp_path):
+    """A learner's own file describes networks that the run does not have."""
+    path = tmp_path / "a.safetensors"
+    checkpoint.save(path, {"w": np.zeros(3, np.float32)}, {**META, "learner": "three", "kind": "policy"})
+
+    class Wider(Learner):
+        def init(self, key):
+            return {"w": jnp.zeros(4)}
+
+    with pytest.raises(UserError, match=r"a.safetensors does not fit: \['w'\] is \(3,\), expected \(4,\)$"):
+        resume.state(resume.find(path, print), Wider(), 0)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import imageio.v3 as imageio
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 import mjx_nero
 from mjx_nero.learn import checkpoint, policy
@@ -122,19 +123,25 @@ def test_thirty_frames_a_second_leave_a_core_time(following):
         server.stop()
 
 
+@struct.dataclass
+class Trained:
+    """Of PPO's state, what a policy acts by."""
+
+    normalizer: object
+    params: object
+
+
 def test_checkpoints_of_a_training_play_too(tmp_path, reach):
     shipped = policy.load(policy.shipped("nero_reach"))
-    normalizer, params = shipped.params
-    run = tmp_path / "run"
-    state = agents._Trained(normalizer=normalizer, params=params)
+    run, state = tmp_path / "run", Trained(*shipped.params)
     assert agents.newest(run) is None
     checkpoint.save(run / "checkpoints" / "000000001000.safetensors", state, {**shipped.meta, "kind": "checkpoint"})
     path = agents.newest(run)
-    loaded = agents.load(reach, "nero_reach", path)
+    loaded = policy.load_for(reach, "nero_reach", path)
     obs = {"state": jnp.linspace(-1, 1, 47)[None]}
     np.testing.assert_array_equal(loaded.act(obs), shipped.act(obs))
     with pytest.raises(mjx_nero.UserError, match="is a checkpoint of nero_reach"):
-        agents.load(mjx_nero.make("nero_lift", impl="native"), "nero_lift", path)
+        policy.load_for(mjx_nero.make("nero_lift", impl="native"), "nero_lift", path)
 
 
 @pytest.mark.slow

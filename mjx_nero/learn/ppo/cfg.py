@@ -1,7 +1,8 @@
 """Hyperparameters of PPO and its networks: plain data, read without Brax, which takes seconds to import."""
 
 import dataclasses
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 from mjx_nero import config
 from mjx_nero.bounds import Bounds, NonNegative, Positive, Share
@@ -28,6 +29,9 @@ class NetworkCfg:
         init_std: of a normal distribution, at first.
         output_scale: of the first weights of the actor's last layer: small, so that it starts near home, whatever it sees.
         max_observation: bound on normalised observations, of which actions are some, so that nothing feeds itself; 0: none.
+        encoders: which encoder reads which observation term, as pairs of names, in groups whose terms stay apart; the others are
+            ``flat``, as they are.
+        encoder_layers: neurons of the encoder ``mlp``.
     """
 
     actor: tuple[int, ...] = (256, 128, 64)
@@ -37,18 +41,43 @@ class NetworkCfg:
     init_std: Positive = 1.0
     output_scale: Positive = 0.01
     max_observation: NonNegative = 10.0
+    encoders: tuple[tuple[str, str], ...] = ()
+    encoder_layers: tuple[int, ...] = (64,)
 
     def __post_init__(self):
         if self.activation not in ACTIVATIONS:
             raise UserError(f"unknown activation {self.activation!r}: choose one of {', '.join(ACTIVATIONS)}")
         if self.distribution not in ("normal", "tanh_normal"):
             raise UserError(f"unknown distribution {self.distribution!r}: choose normal or tanh_normal")
-        for name, layers in (("actor", self.actor), ("critic", self.critic)):
+        for name in ("actor", "critic", "encoder_layers"):
+            layers = getattr(self, name)
             if len(layers) > MAX_LAYERS or not all(1 <= width <= MAX_WIDTH for width in layers):
                 most = f"{MAX_LAYERS} layers of 1 to {MAX_WIDTH} neurons"
                 raise UserError(f"network.{name} takes up to {most}, got {short(layers)}")
         if not 0 < self.init_std <= 100:
             raise UserError(f"network.init_std takes a number above 0, up to 100, got {self.init_std:g}")
+        if len(dict(self.encoders)) < len(self.encoders):
+            raise UserError(f"network.encoders takes each term once, got {short(self.encoders)}")
+
+
+def described(network: Mapping[str, Any]) -> NetworkCfg:
+    """The config of the networks that a policy's file describes. Files of version 0.4 know no bound on observations.
+
+    Raises:
+        UserError: it is none.
+    """
+    return read(NetworkCfg, {"max_observation": 0.0, **network}, "network")
+
+
+def differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields in which the networks of two files differ, by dotted name, with the values of the first.
+
+    The scale of the first weights matters to none that has weights.
+    """
+    if "network" not in there:  # of an older version
+        return {}
+    own, other = (config.flatten(described(meta["network"])) for meta in (there, here))
+    return {f"network.{name}": x for name, x in own.items() if name != "output_scale" and x != other[name]}
 
 
 @dataclasses.dataclass(frozen=True)

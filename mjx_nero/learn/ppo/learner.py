@@ -42,10 +42,10 @@ from mjx_nero import config
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.learner import Kind, Observation
-from mjx_nero.learn.policy import from_meta, init_params, make_act, make_networks, shapes
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
-from mjx_nero.learn.ppo.cfg import fit
+from mjx_nero.learn.ppo.cfg import differing, fit
+from mjx_nero.learn.ppo.networks import from_meta, init_params, make_act, make_networks, shapes
 from mjx_nero.types import Key
 
 Metrics = dict[str, Float[Array, ""]]
@@ -196,7 +196,8 @@ class Learner:
         # Observations; actions, their means and deviations; log-probability, value, return, advantage, reward and two ends.
         obs = 4 * sum(map(math.prod, shapes(self.sizes)))
         step = obs + 4 * (3 * env.action_size + 7)
-        neurons = 4 * (sum(cfg.network.actor) + sum(cfg.network.critic))
+        encoded = 2 * len(cfg.network.encoders) * sum(cfg.network.encoder_layers)
+        neurons = 4 * (sum(cfg.network.actor) + sum(cfg.network.critic) + encoded)
         layers = 4 * max(a + b for a, b in itertools.pairwise((*cfg.network.critic, 1)))
         rollout = max(env.physics.memory(self.num_devices).in_program, cfg.unroll_length * (obs + layers))
         update = cfg.unroll_length * (step + 1.75 * neurons) / cfg.num_minibatches
@@ -360,4 +361,6 @@ def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any
     return {**policy, "params": {**layers, name: jax.tree.map(lambda x: jnp.clip(x, *bounds), layers[name])}}
 
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit)
+_HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
+
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit, held=_HELD, differing=differing)

@@ -10,8 +10,9 @@ import jax
 from mjx_nero import config, files, values
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
-from mjx_nero.learn import checkpoint, header
+from mjx_nero.learn import checkpoint, header, learner
 from mjx_nero.learn.learner import Learner
+from mjx_nero.learn.policy import checkpoint_policy
 from mjx_nero.learn.runs import checkpoints, compiled
 from mjx_nero.learn.runs import trust as trust_of
 from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
@@ -205,16 +206,14 @@ def check(source: Source, meta: dict[str, Any]) -> None:
             f"{path} does not fit: it was trained in {where} on other observations or actions "
             f"than those of {meta['env']} (preset {meta['preset']}): give one that was trained on the same"
         )
-    # Files of version 0.4 know no bound on observations; the scale of the first weights matters to none that has weights.
-    own = {"max_observation": 0.0, **there["network"]} if "network" in there else {}
-    if other := {name: x for name, x in own.items() if name != "output_scale" and x != meta["network"].get(name, x)}:
-        flags = " ".join(f"--{meta['learner']}.network.{name} {_flag(x)}" for name, x in other.items())
+    if other := learner.find(meta["learner"]).differing(there, meta):
+        flags = " ".join(f"--{meta['learner']}.{name} {_flag(x)}" for name, x in other.items())
         raise UserError(f"{path} does not fit: its networks are others: pass {flags}")
 
 
 def _flag(value: Any) -> str:
-    """A field of JSON as one types it."""
-    return "'" + ",".join(map(str, value)) + "'" if isinstance(value, list) else str(value)
+    """A field as one types it."""
+    return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
 def state(source: Source | None, learner: Learner, seed: int) -> Any:
@@ -228,18 +227,20 @@ def state(source: Source | None, learner: Learner, seed: int) -> Any:
     key = jax.random.PRNGKey(seed)
     like = jax.eval_shape(learner.init, key)
     if not source.is_checkpoint:
-        networks = _finite(checkpoint.load(source.path, learner.policy(like)), source)  # before compiling takes its time
+        networks = checkpoint_policy(source.path).params  # before compiling takes its time
+        if (found := _shapes(networks)) != (wanted := _shapes(learner.policy(like))):
+            name = min(found.items() ^ wanted.items())[0]
+            raise UserError(f"{source.path} does not fit: {name} is {found.get(name)}, expected {wanted.get(name)}")
         return learner.place(learner.with_policy(jax.jit(learner.init)(key), networks))
     try:
         held = checkpoint.load(source.path, like)
-        _finite(learner.policy(held), source)
+        checkpoint.check_finite(learner.policy(held), source.path)
         return learner.place(held)
     except UserError as error:
         made_by = source.meta.get("version")
         raise UserError(f"{error} (it was made by version {made_by} of mjx_nero)" if made_by else str(error)) from None
 
 
-def _finite(networks: Any, source: Source) -> Any:
-    if name := checkpoint.not_finite(networks):
-        raise UserError(f"{source.path} holds numbers that are not finite, in {name}: give an earlier one, or copy it anew")
-    return networks
+def _shapes(networks: Any) -> dict[str, tuple[int, ...]]:
+    """Of each array, by name."""
+    return {jax.tree_util.keystr(path): tuple(x.shape) for path, x in jax.tree_util.tree_leaves_with_path(networks)}

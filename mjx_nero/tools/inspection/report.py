@@ -17,6 +17,7 @@ from mjx_nero.envs import registry, tasks
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import policy
+from mjx_nero.learn.ppo import networks
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim import grasp, linkage, render, scene
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
@@ -197,7 +198,7 @@ def environments() -> tuple[Environment, ...]:
             out.append(Environment(env_name, task, None, presets, None, {}, policy=False))
             continue
         env = ManipulationEnv(registry.env_cfg(env_name), impl="jax")
-        shapes = {group: policy.shapes(env.observation_size[group]) for group in env.cfg.observations}
+        shapes = {group: networks.shapes(env.observation_size[group]) for group in env.cfg.observations}
         sizes = {group: sum(map(math.prod, those)) for group, those in shapes.items()}
         shipped = policy.shipped(env_name).is_file()
         out.append(Environment(env_name, task, env.cfg.robot.name, presets, env.action_size, sizes, shipped))

@@ -8,25 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
-from flax import struct
 
 from mjx_nero import control, files
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import checkpoint, header, policy
+from mjx_nero.learn import policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.learn.runs.checkpoints import POLICY, saved
-from mjx_nero.types import UserError
 
 SLIDERS = "joint sliders"
 Make = Callable[[], rollout.Agent]
-
-
-@struct.dataclass
-class _Trained:
-    """What a viewer reads of a training's checkpoint."""
-
-    normalizer: object
-    params: object
 
 
 def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
@@ -35,7 +25,7 @@ def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], pre
     shipped = policy.shipped(env_name, preset)
     for path in [*policies, *([shipped] if shipped.is_file() else [])]:
         name = f"policy {path.stem}" if path == shipped else f"policy {path}"
-        found[name] = lambda path=path: of_policy(load(env, env_name, path))  # type: ignore[misc]
+        found[name] = lambda path=path: of_policy(policy.load_for(env, env_name, path))  # type: ignore[misc]
     able: dict[str, Mapping[str, Any]] = dict(env.cfg.controllers)
     if not able and env.cfg.scene.goal == "frame":  # a pose is commanded, which is all that a follower asks for
         able["ik"] = {}
@@ -49,27 +39,6 @@ def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], pre
     found["zero"] = lambda: _always(lambda key, n: jnp.tile(jnp.asarray(env.home_action), (n, 1)))
     found["random"] = lambda: _always(lambda key, n: jax.random.uniform(key, (n, env.action_size), minval=-1, maxval=1))
     return found
-
-
-def load(env: ManipulationEnv, env_name: str, path: pathlib.Path) -> policy.Policy:
-    """A policy for ``env``, of a policy file or of a training's checkpoint.
-
-    Raises:
-        UserError: missing, damaged, or it does not fit.
-    """
-    if checkpoint.load_meta(path).get("kind") != "checkpoint":
-        return policy.load_for(env, env_name, path)
-    meta = checkpoint.load_meta(path)
-    header.check(meta, path)
-    sizes = {name: tuple(size) for name, size in meta["observation_size"].items()}
-    if (meta["env"], sizes["state"]) != (env_name, env.observation_size["state"]):
-        raise UserError(f"{path} is a checkpoint of {meta['env']} (preset {meta['preset']}): pass these with --env and --preset")
-    cfg: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in meta["network"].items()}
-    nets = policy.make_networks(sizes, meta["action_size"], policy.NetworkCfg(**{"max_observation": 0.0, **cfg}))
-    template = jax.eval_shape(lambda key: _Trained(*policy.init_params(nets, sizes, key)), jax.random.PRNGKey(0))
-    trained = checkpoint.load(path, template)
-    params = (trained.normalizer, trained.params)
-    return policy.Policy(meta=meta, params=params, act=policy.make_act(nets, params))
 
 
 def of_policy(trained: policy.Policy) -> rollout.Agent:

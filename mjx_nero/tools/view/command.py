@@ -1,6 +1,7 @@
 """The command line of ``view``, and what it starts."""
 
 import dataclasses
+import functools
 import pathlib
 import threading
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from mjx_nero import cli, config, files, values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
+from mjx_nero.learn import policy
 from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
@@ -105,7 +107,8 @@ class View:
         if newest is None or newest == self._seen:
             return
         self._seen, env = newest, self.session.env
-        self.panel.add(f"run {newest.stem}", lambda: agents.of_policy(agents.load(env, self._env_name, newest)))
+        trained = functools.partial(policy.load_for, env, self._env_name, newest, any_robot=True)
+        self.panel.add(f"run {newest.stem}", lambda: agents.of_policy(trained()))
         self.session.reset()
 
     def close(self) -> None:

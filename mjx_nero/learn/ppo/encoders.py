@@ -1,0 +1,90 @@
+"""Encoders, by name: each turns one observation term into features. They read groups whose terms stay apart.
+
+A policy's file says which encoder reads which term (``NetworkCfg.encoders``), so that a policy is rebuilt as it learnt.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+from flax import linen
+
+from mjx_nero import values
+from mjx_nero.errors import UserError
+from mjx_nero.learn.ppo.cfg import NetworkCfg
+from mjx_nero.types import Key
+
+FLAT = "flat"
+
+
+class Encoder(Protocol):
+    """Turns a term, normalised, into features. A Flax module is one."""
+
+    def init(self, key: Key, x: jax.Array) -> Any:
+        """Fresh variables. ``x``: a term [batch, *shape]."""
+        ...
+
+    def apply(self, variables: Any, x: jax.Array) -> jax.Array:
+        """Features [..., n] of a term [..., *shape]."""
+        ...
+
+
+class Flat(linen.Module):
+    """The term's own numbers in a row."""
+
+    axes: int  # of the term
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return x.reshape(*x.shape[: x.ndim - self.axes], -1)
+
+
+class Mlp(linen.Module):
+    """A multilayer perceptron of the term's numbers, which are put in a row.
+
+    Attributes:
+        axes: of the term.
+        layers: neurons.
+        activation: of every layer, the last one's too.
+    """
+
+    axes: int
+    layers: tuple[int, ...]
+    activation: str
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        x = Flat(self.axes)(x)
+        for size in self.layers:
+            x = getattr(linen, self.activation)(linen.Dense(size, kernel_init=jax.nn.initializers.lecun_uniform())(x))
+        return x
+
+
+Make = Callable[[tuple[int, ...], NetworkCfg], Encoder]  # (shape of the term, config of the networks) -> encoder
+
+_ENCODERS: dict[str, Make] = {
+    FLAT: lambda shape, cfg: Flat(len(shape)),
+    "mlp": lambda shape, cfg: Mlp(len(shape), tuple(cfg.encoder_layers), cfg.activation),
+}
+
+
+def register(name: str, make: Make) -> None:
+    """Adds an encoder, which ``NetworkCfg.encoders`` may then name.
+
+    Raises:
+        UserError: there is one of that name.
+    """
+    if name in _ENCODERS:
+        raise UserError(f"there is an encoder {name!r} already: register it under another name")
+    _ENCODERS[name] = make
+
+
+def make(name: str, shape: tuple[int, ...], cfg: NetworkCfg) -> Encoder:
+    """An encoder by name, for a term of that shape.
+
+    Raises:
+        UserError: unknown.
+    """
+    if name not in _ENCODERS:
+        raise UserError(values.unknown("encoder", name, _ENCODERS))
+    return _ENCODERS[name](shape, cfg)
