@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import logging
@@ -11,11 +12,12 @@ import re
 import sys
 import textwrap
 import traceback
+import typing
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from typing import Annotated, Any, NoReturn
 
-from mjx_nero import bounds, cache, config, values
+from mjx_nero import bounds, cache, config, docs, values
 from mjx_nero.errors import UserError, missing
 
 LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
@@ -60,6 +62,23 @@ class Parser(argparse.ArgumentParser):
         if several:
             text = "several, as in 0-7 or 0,3,5: a run each, one after another, and a table"
             group.add_argument("--seeds", type=seeds, help=text)
+
+    def add_fields(self, cls: type) -> None:
+        """A flag for each field that ``config.flag`` makes: named, read, bounded and explained as the field is.
+
+        A flag that is there already stays as it is.
+        """
+        about, kinds = docs.fields(cls), values.hints(cls)
+        for field in dataclasses.fields(cls):
+            name = f"--{field.name.replace('_', '-')}"
+            if not field.metadata.get("flag") or name in self._option_string_actions:
+                continue
+            shown = "" if field.default in (None, "", False) or isinstance(field.default, bool) else " (default: %(default)s)"
+            text = about.get(field.name, "").replace("%", "%%") + shown
+            if isinstance(field.default, bool):
+                self.add_argument(name, action="store_true", default=field.default, help=text)
+            else:
+                self.add_argument(name, default=field.default, help=text, **_reader(kinds[field.name]))
 
     def add_video(self) -> None:
         """What a video is like. Without these flags: as good as the machine draws within half a minute."""
@@ -232,6 +251,26 @@ def number(kind: Any) -> Callable[[str], Any]:
             raise argparse.ArgumentTypeError(str(error).strip()) from None
 
     return read
+
+
+def fields(args: argparse.Namespace, cls: type) -> dict[str, Any]:
+    """The values of the flags that ``Parser.add_fields`` made, by the names of the fields."""
+    return {name: getattr(args, name) for name in config.marked(cls)}
+
+
+def _reader(kind: Any) -> dict[str, Any]:
+    """Argparse's words for a field's declared type."""
+    kind = next((each for each in typing.get_args(kind) if each is not type(None)), kind) if _optional(kind) else kind
+    if kind is pathlib.Path:
+        return {"type": path()}
+    for bound in getattr(kind, "__metadata__", ()):
+        if isinstance(bound, bounds.OneOf):
+            return {"choices": [name for name in bound.names if name]}
+    return {"type": number(kind)}
+
+
+def _optional(kind: Any) -> bool:
+    return type(None) in typing.get_args(kind)
 
 
 positive = number(bounds.Count)  # a whole number from 1; 1e6 is one, 1_000 is none

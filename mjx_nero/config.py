@@ -17,6 +17,20 @@ from mjx_nero.values import UNTYPED, hint, hints, read, short
 Cfg = TypeVar("Cfg")
 
 
+def flag(default: Any, **about: Any) -> Any:
+    """A field of a frozen config that programs have a flag for (``cli.Parser.add_fields``).
+
+    Args:
+        about: kept with the field, for ``marked``.
+    """
+    return dataclasses.field(default=default, metadata={"flag": True, **about})
+
+
+def marked(cls: type, mark: str = "flag") -> tuple[str, ...]:
+    """Names of the fields of a config that bear a mark."""
+    return tuple(field.name for field in dataclasses.fields(cls) if field.metadata.get(mark))
+
+
 def _children(node: Any) -> dict[str, Any] | None:
     if dataclasses.is_dataclass(node) and not isinstance(node, type):
         return {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_nero import bounds, config
-from mjx_nero.bounds import NonNegative, Positive, Steps
+from mjx_nero.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.mdp import actions, success
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
@@ -52,11 +52,32 @@ def drive_targets() -> dict[str, Term]:
 
 @dataclasses.dataclass(frozen=True)
 class SuccessCfg:
-    """``condition`` has held for the end of the episode; ``distance`` [m] is what it is about."""
+    """``condition`` has held for the end of the episode; ``distance`` [m] is what it is about.
+
+    Attributes:
+        hold_s: for how long it has held [s].
+        follows: the distance is an error, which is to stay small once the robot is there; else it is a way to go.
+    """
 
     condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
     distance: Term = Term(success.object_distance)
-    hold_s: NonNegative = 0.5  # for how long [s]
+    hold_s: NonNegative = 0.5
+    follows: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """What a training of the task takes, where nobody asks for another number of env steps.
+
+    Attributes:
+        steps: env steps, with the thousands of environments of a GPU.
+        steps_on_cpu: env steps with the hundreds of environments of a CPU, which learn from fewer.
+        success: the success rate from which on the task counts as learnt.
+    """
+
+    steps: Count = 100_000_000
+    steps_on_cpu: Count = 10_000_000
+    success: Share = 0.95
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +104,7 @@ class EnvCfg:
         controllers: those of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config by
             dotted name.
         training: fields of the learner's config that suit the task, likewise.
+        budget: how long a training takes.
 
     Raises:
         UserError: a field is out of its bounds, or terms name what is not there.
@@ -115,6 +137,7 @@ class EnvCfg:
     identified: str = ""
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    budget: Budget = Budget()
 
     def __post_init__(self):
         config.freeze(self)

@@ -1,6 +1,7 @@
 """Metrics of an episode: terms with memory, ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, value)``."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -96,6 +97,18 @@ class JointAcceleration(TargetChange):
 
     def _read(self, view: View) -> Float[Array, " n"]:
         return view.joint_vel[: self.joints]
+
+
+def grasping(**held: Any) -> dict[str, MetricTerm]:
+    """Whether and when an object was first held.
+
+    Args:
+        held: parameters of ``rewards.held``.
+    """
+    return {
+        "grasped": MetricTerm(Grasped, params=held, over="rate", figure="grasp"),
+        "grasp_time": MetricTerm(GraspTime, params=held, where="grasped", figure="time_to_grasp"),
+    }
 
 
 def calmness(joints: int) -> dict[str, MetricTerm]:

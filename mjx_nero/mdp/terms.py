@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import bounds, config
-from mjx_nero.bounds import NonNegative, Past, Positive, Share, Steps
+from mjx_nero.bounds import NonNegative, OneOf, Past, Positive, Share, Steps
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History
 from mjx_nero.types import LEVEL, Key, UserError, View
@@ -105,9 +105,19 @@ def exact(group: Mapping[str, ObservationTerm]) -> dict[str, ObservationTerm]:
 
 @dataclasses.dataclass(frozen=True)
 class MetricTerm(Term):
-    """A figure of an episode."""
+    """A figure of an episode, and how those of many episodes become one.
 
-    at_end: bool = dataclasses.field(default=True, kw_only=True)  # 0 before the last step, so that their sum is the last one
+    Attributes:
+        at_end: 0 before the last step, so that their sum is the last one.
+        over: what the episodes' figures become: their ``mean``, or the ``rate`` of the episodes in which they are above 0.
+        where: another metric: the mean is that of the episodes in which it is above 0. Empty: of all.
+        figure: what the result is called, with ``_mean`` or ``_rate`` behind; empty: as the metric is.
+    """
+
+    at_end: bool = dataclasses.field(default=True, kw_only=True)
+    over: Annotated[str, OneOf("mean", "rate")] = dataclasses.field(default="mean", kw_only=True)
+    where: str = dataclasses.field(default="", kw_only=True)
+    figure: str = dataclasses.field(default="", kw_only=True)
 
 
 @dataclasses.dataclass(frozen=True)

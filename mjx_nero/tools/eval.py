@@ -42,16 +42,7 @@ def main(argv: Sequence[str]) -> None:
     video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
     cfg = evaluation.EvalCfg(
         args.env,
-        preset=args.preset,
-        robot=args.robot,
-        agent=args.agent,
-        policy=args.policy,
-        any_robot=args.any_robot,
-        controller=args.controller,
-        episodes=args.episodes,
-        seed=args.seed,
-        backend=args.backend,
-        impl=args.impl,
+        **cli.fields(args, evaluation.EvalCfg),
         record=RECORDED if args.failures else video.episodes if args.video else 0,
         env_fields=dotted["env"],
         control_fields=dotted["control"],
@@ -82,23 +73,9 @@ def _parser() -> cli.Parser:
         prog=cli.called_as("eval"), description="Plays episodes with a policy or a controller and reports success."
     )
     parser.add_environment(registry.list_envs())
-    parser.add_argument("--agent", choices=evaluation.AGENTS, help="who acts (default: the policy, else the task's controller)")
-    parser.add_argument(
-        "--controller", help=f"instead of an agent: {', '.join(control.CONTROLLERS)}, or expert, the task's first"
-    )
-    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the one that ships for the environment)")
-    parser.add_argument(
-        "--any-robot", action="store_true", help="play a policy though it was trained for another model of the robot"
-    )
-    parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=64, help="played side by side (default: %(default)s)")
     parser.add_seed(1)
-    parser.add_argument(
-        "--backend",
-        choices=evaluation.BACKENDS,
-        default="auto",
-        help="mjx, or mujoco: the C library (default: what --impl says)",
-    )
     parser.add_impl()
+    parser.add_fields(evaluation.EvalCfg)
     parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three of the episodes")
     parser.add_argument("--failures", action="store_true", help="the video shows episodes that fail")
     parser.add_video()

@@ -20,7 +20,6 @@ from mjx_nero.tools.benchmark import learning, machine
 
 Row = dict[str, Any]
 WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
-TARGETS = {"lift": 0.95, "reach": 0.98}  # success that a seed is trained to
 EVALUATIONS = 48  # of a seed, if it needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
 _PAGE = """# Benchmarks
@@ -106,7 +105,7 @@ def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """All seeds of an environment, by the settings that ``train.py --env`` has."""
     run, _ = run_cfg.fit_machine(run_cfg.resolve(env, "default", None, {}, {}))
     run = dataclasses.replace(run, eval_every=run.num_timesteps // EVALUATIONS)
-    *_, total = learning.measure_learning(run, args.seeds, TARGETS["lift" if run.env.scene.objects else "reach"])
+    *_, total = learning.measure_learning(run, args.seeds, run.env.budget.success)
     yield "learning", total
 
 

@@ -35,20 +35,8 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         args.robot,
         dotted["env"],
         {**sizes, **dotted[args.learner]},
-        learner=args.learner,
-        impl=args.impl,
-        seed=args.seed,
-        out=args.out,
-        restore=args.restore,
-        checkpoint_minutes=args.checkpoint_minutes,
-        on_nan=args.on_nan,
         auto=args.resume == "auto",
-        eval_every=args.eval_every,
-        checkpoint_every=args.checkpoint_every,
-        keep=args.keep,
-        max_minutes=args.max_minutes,
-        num_devices=args.num_devices,
-        track=args.track,
+        **cli.fields(args, RunCfg),
     )
     run = going_on(run, flags, dotted, args.trust)
     cli.setup_jax()

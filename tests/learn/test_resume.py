@@ -81,7 +81,7 @@ def three(monkeypatch):
     """``Learner`` by the name ``three``."""
     monkeypatch.setattr(learner, "_KINDS", dict(learner._KINDS))
     template = {"w": jax.ShapeDtypeStruct((3,), np.float32)}
-    learner.register("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, None)))
+    learner.register("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, lambda params, obs: params)))
 
 
 @pytest.mark.parametrize("kind", ["checkpoint", "policy"])

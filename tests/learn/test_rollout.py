@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.learn.play import evaluation, rollout
+from mjx_nero.learn.play import evaluation, figures, rollout
+from mjx_nero.learn.play.recorder import Record
+from mjx_nero.mdp import metrics as terms
+from mjx_nero.mdp.terms import MetricTerm
 from mjx_nero.sim import physics
 from mjx_nero.types import Scenery
 
 N = 8
-NOTHING = Scenery(np.zeros((5, 0, 3)), np.zeros((5, 0, 4)))
+_NONE = np.zeros((5, 0))
+NOTHING = Record(
+    {}, _NONE, _NONE, _NONE, _NONE, {}, Scenery(np.zeros((5, 0, 3)), np.zeros((5, 0, 4))), _NONE, _NONE > 0, _NONE > 0
+)
 
 
 def idle(params, obs, key):
@@ -65,6 +71,9 @@ def test_records(env, episodes):
     np.testing.assert_allclose(episodes.metrics["final_distance"][:3], distance, rtol=1e-5)
     assert episodes.distance.shape == (250, N) and episodes.memory == ()
     np.testing.assert_allclose(episodes.distance[-1], episodes.metrics["final_distance"], rtol=1e-6)
+
+
+GRASPING = terms.grasping(minimal_height=0.02, grasp_radius=0.04)
 
 
 class Counter:
@@ -136,8 +145,8 @@ def test_summary_by_hand():
         "overflow": np.array([0.0, 0, 3, 0]),
         "reward/a": np.array([1.0, 2, 3, 4]),
     }
-    returns, lengths, qpos = np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250]), np.zeros((250, 0, 16))
-    summary = rollout.Episodes(metrics, returns, lengths, qpos, NOTHING, np.zeros((250, 4)), memory=()).summary()
+    returns, lengths = np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250])
+    summary = rollout.Episodes(metrics, returns, lengths, NOTHING, np.zeros((250, 4)), (), GRASPING).summary()
     assert summary["success_rate"] == 0.5 and summary["grasp_rate"] == 0.5 and summary["dropped_rate"] == 0.25
     assert summary["diverged"] == 1  # the second, a failure that is in no mean
     assert summary["time_to_grasp_mean"] == 2.0  # of those that grasped
@@ -152,11 +161,40 @@ def test_summary_by_hand():
 def test_summary_of_nothing_but_divergence():
     metrics = dict.fromkeys(("success", "final_distance", "grasped", "grasp_time", "dropped", "overflow"), np.zeros(2))
     metrics |= {"nan": np.array([1.0, 0]), "reward/a": np.zeros(2)}
-    returns, qpos = np.array([0.0, np.nan]), np.zeros((5, 0, 16))
-    summary = rollout.Episodes(metrics, returns, np.ones(2), qpos, NOTHING, np.zeros((5, 2)), memory=()).summary()
+    summary = rollout.Episodes(metrics, np.array([0.0, np.nan]), np.ones(2), NOTHING, np.zeros((5, 2)), (), GRASPING).summary()
+    assert summary["grasp_rate"] == 0 and summary["time_to_grasp_mean"] is None
     assert summary["diverged"] == 2 and summary["success_rate"] == 0
     assert summary["return_mean"] is None and summary["final_distance_median"] is None
     assert summary["return_by_term"] == {"a": None}
+
+
+def test_metrics_become_figures_as_their_terms_say():
+    plain = MetricTerm(terms.Touched)
+    said = {
+        **GRASPING,
+        "touched": plain,
+        "hits": MetricTerm(terms.Touched, over="rate"),
+        "way": MetricTerm(terms.Touched, at_end=False),
+    }
+    values = {
+        "grasped": [1.0, 1, 0, 1],
+        "grasp_time": [1.0, 2, 0, 3],
+        "touched": [0.0, 1, 1, 0],
+        "hits": [2.0, 0, 9, 9],
+        "way": [4.0, 0, 2, 9],
+    }
+    whole = np.array([True, True, True, False])  # the last left the numbers: a failure, and in no mean
+    assert figures.of_episodes(said, {name: np.array(x) for name, x in values.items()}, whole) == {
+        "grasp_rate": 0.5,
+        "time_to_grasp_mean": 1.5,
+        "touched_mean": pytest.approx(2 / 3),
+        "hits_rate": 0.5,
+        "way_mean": 2.0,
+    }
+    sums = {"grasped": 3.0, "grasp_time": 6.0, "touched": 2.0, "way": 15.0}
+    found = dict(figures.of_sums(said, sums, episodes=4.0))
+    assert found == {"grasped": 0.75, "time_to_grasp": 2.0, "touched": 0.5}  # what is not of an episode's end stays away
+    assert dict(figures.of_sums(GRASPING, {"grasped": 0.0, "grasp_time": 0.0}, 1e-9))["time_to_grasp"] == 0
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,7 @@ class Tower:
 
     def metrics(self) -> dict[str, MetricTerm]:
         """Of the first object that is to be moved."""
-        first = {"object": self.objects[1], **self.held}
-        return {"grasped": MetricTerm(metrics.Grasped, params=first), "grasp_time": MetricTerm(metrics.GraspTime, params=first)}
+        return metrics.grasping(object=self.objects[1], **self.held)
 
     def terminations(self) -> dict[str, DoneTerm]:
         """The time is over, or an object has left the table."""

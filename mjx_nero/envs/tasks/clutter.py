@@ -12,7 +12,7 @@ import numpy as np
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -172,10 +172,7 @@ def _clutter(setup: Setup) -> EnvCfg:
             condition=Term(success.object_at_goal, params={"threshold": 0.02, **commanded}),
             distance=Term(success.object_distance, params=commanded),
         ),
-        metrics={
-            "grasped": MetricTerm(metrics.Grasped, params=held),
-            "grasp_time": MetricTerm(metrics.GraspTime, params=held),
-        },
+        metrics=metrics.grasping(**held),
         observations={
             "state": state,
             "privileged_state": {

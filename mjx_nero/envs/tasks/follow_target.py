@@ -4,6 +4,7 @@ import dataclasses
 import functools
 
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
+from mjx_nero.envs.tasks.reach import BUDGET
 from mjx_nero.mdp import commands, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
@@ -36,6 +37,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         success=SuccessCfg(
             condition=Term(success.ee_at_goal, params={"threshold": 0.02}),
             distance=Term(success.ee_distance),
+            follows=True,
         ),
         observations={
             "state": {
@@ -47,6 +49,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             },
         },
         events={},
+        budget=BUDGET,
         rewards={
             "position_tracking": RewardTerm(rewards.ee_goal_distance, weight=1.0, params={"std": 0.2}),
             "position_tracking_fine": RewardTerm(rewards.ee_goal_distance, weight=1.0, params={"std": 0.02}),
@@ -65,6 +68,7 @@ def static(robot: RobotCfg, setup: Setup) -> EnvCfg:
         success=SuccessCfg(
             condition=Term(success.ee_at_goal, params={"threshold": 0.005}),
             distance=Term(success.ee_distance),
+            follows=True,
         ),
     )
 

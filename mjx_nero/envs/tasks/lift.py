@@ -7,7 +7,7 @@ from mjx_nero.bounds import Range
 from mjx_nero.envs.task import CALM, EnvCfg, Presets, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -49,10 +49,7 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=5.0,
         actions=joint_actions(scale=0.5),
         scene=setup.scene,
-        metrics={
-            "grasped": MetricTerm(metrics.Grasped, params=setup.held),
-            "grasp_time": MetricTerm(metrics.GraspTime, params=setup.held),
-        },
+        metrics=metrics.grasping(**setup.held),
         command=CommandTerm(
             commands.uniform_position,
             params=dict(zip("xyz", setup.goal, strict=True)),

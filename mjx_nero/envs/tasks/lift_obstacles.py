@@ -6,7 +6,7 @@ import functools
 
 from mjx_nero.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, SuccessCfg, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import curriculum, metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, MetricTerm, RewardTerm, Term
@@ -53,7 +53,8 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=12.0,
         actions=velocity_actions(),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
-        training={**CALM, "num_timesteps": 170_000_000},
+        training=CALM,
+        budget=Budget(steps=170_000_000),
         command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),

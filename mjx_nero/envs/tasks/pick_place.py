@@ -6,7 +6,7 @@ import functools
 from mjx_nero.bounds import Range
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -43,10 +43,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         success=SuccessCfg(
             condition=Term(success.object_placed, params={"threshold": 0.01, "max_speed": 0.005, "clearance": 0.05}),
         ),
-        metrics={
-            "grasped": MetricTerm(metrics.Grasped, params=held),
-            "grasp_time": MetricTerm(metrics.GraspTime, params=held),
-        },
+        metrics=metrics.grasping(**held),
         observations={
             "state": {
                 "joint_positions": ObservationTerm(observations.joint_pos),

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import QUIET, EnvCfg, Presets, joint_actions
+from mjx_nero.envs.task import QUIET, Budget, EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks.building import Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
@@ -67,7 +67,8 @@ def default(robot: RobotCfg) -> EnvCfg:
         metrics=tower.metrics(),
         terminations=tower.terminations(),
         controllers=tower.controllers(),
-        training={**QUIET, "num_timesteps": 150_000_000},
+        training=QUIET,
+        budget=Budget(steps=150_000_000),
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
 from mjx_nero.sim import contacts, grasp
@@ -90,7 +90,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        training={"num_timesteps": 150_000_000},
+        budget=Budget(steps=150_000_000),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_off_table": DoneTerm(

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
@@ -14,6 +14,7 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
 
 STILL: Range = (0.0, 0.0)
+BUDGET = Budget(steps=60_000_000, steps_on_cpu=2_000_000, success=0.98)  # there is nothing to grasp
 # The recipe's runner settings (RSL-RL).
 RUNNER = {
     "num_epochs": 8,
@@ -78,6 +79,7 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
             if turned
             else Term(success.ee_at_goal, params=at_goal),
             distance=Term(success.ee_distance),
+            follows=True,
         ),
         observations={
             "state": {
@@ -101,6 +103,7 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
         },
         terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
         training=RUNNER,
+        budget=BUDGET,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from mjx_nero.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.tasks.reach import BUDGET
 from mjx_nero.mdp import commands, events, metrics, observations, obstacles, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
@@ -101,11 +102,13 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5, gripper=False),
         controllers=controllers(robot, "detour"),
-        training={"num_timesteps": 100_000_000},
+        budget=dataclasses.replace(BUDGET, steps=100_000_000),
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.goal, strict=True)), resample_s=ONCE),
         obstacles=between(setup),
         success=SuccessCfg(
-            condition=Term(success.AtGoalUntouched, params={"threshold": 0.02}), distance=Term(success.ee_distance)
+            condition=Term(success.AtGoalUntouched, params={"threshold": 0.02}),
+            distance=Term(success.ee_distance),
+            follows=True,
         ),
         metrics={"touched": MetricTerm(metrics.Touched)},
         observations={"state": state},

@@ -35,7 +35,7 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
         sensors={**cfg.sensors, "encoders": Term(sensors.Encoders), **_eyes(objects)},
         pushes={**cfg.pushes, **pushed},
         widening=Term(curriculum.BySuccess),
-        training={**cfg.training, "num_timesteps": _STEPS if objects else _STEPS // 2},
+        budget=dataclasses.replace(cfg.budget, steps=_STEPS if objects else _STEPS // 2),
     )
 
 

@@ -6,7 +6,7 @@ Preset ``three`` puts one more on top.
 import dataclasses
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, velocity_actions
 from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.actions import ContinuousGripper
@@ -76,7 +76,8 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         metrics=tower.metrics(),
         terminations=tower.terminations(),
         controllers=tower.controllers(),
-        training={**CALM, "num_timesteps": 180_000_000},
+        training=CALM,
+        budget=Budget(steps=180_000_000),
     )
 
 

@@ -4,12 +4,14 @@ import dataclasses
 import pathlib
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 
 from mjx_nero import config, control
+from mjx_nero.bounds import Bounds, OneOf, Seed
+from mjx_nero.config import flag
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
@@ -61,27 +63,28 @@ class EvalCfg:
 
     Attributes:
         robot: another than the environment's own, by name or folder.
-        agent: one of ``AGENTS``; None: the controller, if one is named, or if the task has one and no policy is given or ships.
-        policy: a policy's file; None: the one that ships.
+        agent: who acts (default: the policy, else the task's controller).
+        policy: policy file (default: the bundled one of the environment).
         any_robot: play a policy though it was trained for another model of the robot.
-        controller: one of the task's; ``expert``: the first of them.
-        backend: ``mjx``, ``mujoco`` (the C library on the CPU), or ``auto``: what ``impl`` says.
+        controller: instead of an agent: one of the task's controllers, or expert, the first of them.
+        episodes: played side by side.
+        backend: mjx, or mujoco: the C library on the CPU; auto: what impl says.
         impl: one of ``physics.impls()``.
-        record: how many of the episodes to keep for a video.
+        record: of how many of the episodes every step is kept, for a video, say.
         env_fields, control_fields: of the environment's and the controller's config by dotted name.
     """
 
     env_name: str
-    preset: str = "default"
-    robot: str | None = None
-    agent: str | None = None
-    policy: pathlib.Path | None = None
-    any_robot: bool = False
-    controller: str | None = None
-    episodes: int = 64
-    seed: int = 1
-    backend: str = "auto"
-    impl: str = "auto"
+    preset: str = flag("default")
+    robot: str | None = flag(None)
+    agent: Annotated[str, OneOf(*AGENTS)] | None = flag(None)
+    policy: pathlib.Path | None = flag(None)
+    any_robot: bool = flag(False)
+    controller: str | None = flag(None)
+    episodes: Annotated[int, Bounds(1, 1_000_000)] = flag(64)
+    seed: Seed = flag(1)
+    backend: Annotated[str, OneOf(*BACKENDS)] = flag("auto")
+    impl: str = flag("auto")
     record: int = 0
     env_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     control_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -138,11 +141,11 @@ def play(cfg: EvalCfg) -> Played:
         **episodes.summary(),
         "seconds": round(time.perf_counter() - begun, 2),
     }
-    if not env_cfg.scene.objects:
-        del result["dropped_rate"]
+    if all(term.time_out for term in env_cfg.terminations.values()):
+        del result["dropped_rate"]  # nothing can be
     if steering:
         result |= tracking(episodes, round(env_cfg.success.hold_s / env.dt))
-        if env_cfg.scene.objects:  # the way of an object is no error
+        if not env_cfg.success.follows:
             del result["settled_error_mean"], result["settled_error_max"]
         result["warning"] = steering.warning(episodes.memory)
     return Played(env, episodes, result)

@@ -15,14 +15,12 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn.play import figures, recorder
+from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Key, Scenery
 
 # (parameters, observation groups [n, ...], key) -> actions [n, ...]
 Act = Callable[[Any, dict[str, jax.Array], Key], jax.Array]
-
-
-# Metrics of which ``Episodes.summary`` speaks in words of its own; of a task's others it gives the mean.
-_KNOWN = ("success", "distance", "final_distance", "grasped", "grasp_time", "dropped", "nan", "overflow")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,19 +62,33 @@ class Episodes:
         metrics: name -> [n], each the sum over the episode's steps (see ``ManipulationEnv.finish``).
         returns: [n].
         lengths: [n] control steps.
-        qpos: [steps, k, nq] of the first k environments, where asked for.
-        scenery: [steps, k, ...], what else a picture of them shows (``ManipulationEnv.scenery``).
+        record: [steps, k, ...] of the first k environments, where asked for; after its end an episode stands still.
         distance: [steps, n], what the task's success is about [m]; an ended episode's stays.
         memory: the agent's, after the last step.
+        terms: the task's metrics, which say how theirs become figures.
     """
 
     metrics: dict[str, np.ndarray]
     returns: np.ndarray
     lengths: np.ndarray
-    qpos: np.ndarray
-    scenery: Scenery
+    record: Record
     distance: np.ndarray
     memory: Any
+    terms: figures.Terms = dataclasses.field(default_factory=dict)
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """[steps, k, nq]."""
+        return self.record.qpos
+
+    @property
+    def scenery(self) -> Scenery:
+        """[steps, k, ...], what a picture shows beside ``qpos``."""
+        return self.record.scenery
+
+    def episode(self, index: int) -> Record:
+        """A recorded episode to its end [steps, ...]."""
+        return self.record[: int(self.lengths[index]), index]
 
     def summary(self) -> dict:
         """Figures for people and for JSON: distances in m, times in s. An episode whose physics or policy left the numbers is a
@@ -88,17 +100,16 @@ class Episodes:
         return {
             "success_rate": float(success.mean()),
             "success_rate_95": [low, high],
-            "final_distance_mean": _mean(m["final_distance"][whole]),
+            "final_distance_mean": figures.mean(m["final_distance"][whole]),
             "final_distance_median": float(np.median(m["final_distance"][whole])) if whole.any() else None,
-            **self._grasps(),
+            **figures.of_episodes(self.terms, m, whole),
             "dropped_rate": float((m["dropped"] * whole).mean()),
-            "return_mean": _mean(self.returns[whole]),
-            "return_by_term": {name: _mean(value[whole]) for name, value in terms.items()},
+            "return_mean": figures.mean(self.returns[whole]),
+            "return_by_term": {name: figures.mean(value[whole]) for name, value in terms.items()},
             "episode_length_mean": float(self.lengths.mean()),
             "diverged": int((~whole).sum()),
             "nan_count": int(m["nan"].sum()),
             "overflow_count": int(m["overflow"].sum()),
-            **{f"{name}_mean": _mean(m[name][whole]) for name in m if name not in _KNOWN and not name.startswith("reward/")},
         }
 
     @property
@@ -112,17 +123,7 @@ class Episodes:
 
     def recorded(self, which: np.ndarray) -> "Episodes":
         """The same episodes, with the records of those named alone; ``which``: int [any], below the number of recorded ones."""
-        return dataclasses.replace(self, qpos=self.qpos[:, which], scenery=self.scenery[:, which])
-
-    def _grasps(self) -> dict[str, float | None]:
-        if not {"grasped", "grasp_time"} <= set(self.metrics):
-            return {}
-        grasped = (self.metrics["grasped"] > 0) & self._whole
-        return {"grasp_rate": float(grasped.mean()), "time_to_grasp_mean": _mean(self.metrics["grasp_time"][grasped])}
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if values.size else None
+        return dataclasses.replace(self, record=self.record[:, which])
 
 
 class Runner:
@@ -131,13 +132,14 @@ class Runner:
     Args:
         run: jitted, (parameters, keys of the episodes, key) -> what ``Episodes`` is made of.
         episodes: how many.
+        terms: the task's metrics.
     """
 
-    def __init__(self, run: Any, episodes: int):
-        self._run, self._episodes = run, episodes
+    def __init__(self, run: Any, episodes: int, terms: figures.Terms):
+        self._run, self._episodes, self._terms = run, episodes, terms
 
     def __call__(self, params: Any, seed: int) -> Episodes:
-        return _collect(*self._run(params, *_keys(seed, self._episodes)))
+        return _collect(*self._run(params, *_keys(seed, self._episodes)), self._terms)
 
     def compiler(self, params: Any) -> Callable[[], None]:
         """Traces the program; the call that comes back compiles it, in any thread."""
@@ -173,11 +175,6 @@ def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
     return state, dict.fromkeys((*state.metrics, "return", "length"), zeros), jnp.ones_like(zeros)
 
 
-def _frames(env: ManipulationEnv, state: State, record: int) -> tuple[jax.Array, Scenery, jax.Array]:
-    first = jax.tree.map(lambda x: x[:record], state)
-    return first.pipeline_state.qpos, jax.vmap(env.scenery)(first), state.metrics["distance"]
-
-
 def runner(
     env: ManipulationEnv,
     act: Act | Agent,
@@ -188,7 +185,7 @@ def runner(
     """Plays ``episodes`` at once, on the environment's physics: one compiled program, reused from call to call.
 
     Args:
-        record: how many of the episodes to keep qpos and scenery of.
+        record: of how many of the episodes every step is kept.
         start: (parameters, states after the reset) -> the states to start from.
     """
     agent = act if isinstance(act, Agent) else policy_agent(act)
@@ -199,7 +196,8 @@ def runner(
             (state, totals, active), memory = carry
             action, memory = agent.act(params, memory, state, key)
             episode = _accumulate(state, jax.vmap(env.step)(state, action), totals, active)
-            return (episode, memory), _frames(env, episode[0], record)
+            kept = recorder.of_batch(env, *jax.tree.map(lambda x: x[:record], (state, action, episode[0])))
+            return (episode, memory), (kept, episode[0].metrics["distance"])
 
         state, totals, active = _start(env, keys)
         state = start(params, state) if start else state
@@ -207,7 +205,7 @@ def runner(
         ((_, totals, _), memory), frames = jax.lax.scan(step, ((state, totals, active), agent.init(state)), keys)
         return totals, frames, memory
 
-    return Runner(run, episodes)
+    return Runner(run, episodes, env.cfg.metrics)
 
 
 def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
@@ -217,8 +215,8 @@ def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
     return jax.random.split(k_reset, episodes), key
 
 
-def _collect(totals: dict, frames: tuple, memory: Any) -> Episodes:
+def _collect(totals: dict, frames: tuple, memory: Any, terms: figures.Terms) -> Episodes:
     totals = {name: np.asarray(value, np.float64) for name, value in totals.items()}
     returns, lengths = totals.pop("return"), totals.pop("length")
-    qpos, scenery, distance = jax.device_get(frames)
-    return Episodes(totals, returns, lengths, qpos, scenery, distance, memory)
+    record, distance = jax.device_get(frames)
+    return Episodes(totals, returns, lengths, record, distance, memory, terms)

@@ -9,9 +9,12 @@ import jax
 
 from mjx_nero import bounds, config
 from mjx_nero.bounds import Bounds, Count, NonNegative, OneOf, Seed, Whole
+from mjx_nero.config import flag
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
+
+OnNan = Annotated[str, OneOf("stop", "rewind")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,28 +28,28 @@ class Asked:
 
 @dataclasses.dataclass(frozen=True)
 class RunCfg:
-    """One run of train.py."""
+    """One run of train.py. Flags are made of it. Where a run goes on, what is ``free`` may change, what is ``kept`` may not."""
 
     env_name: str
     preset: str
     env: Any  # EnvCfg
     hyperparameters: Any  # of the learner: its config
-    learner: str = "ppo"
+    learner: str = flag("ppo")  # who learns
     asked: Asked = Asked()
-    impl: str = "auto"
-    seed: Seed = 0
-    out: pathlib.Path | None = None
-    restore: pathlib.Path | None = None
-    eval_every: Whole = 0  # env steps; 0: twelve times a run
-    checkpoint_every: Whole = 0  # env steps; 0: five times a run
-    eval_episodes: Annotated[int, Bounds(1, 100_000)] = 256
-    checkpoint_minutes: NonNegative = 10.0  # at most between checkpoints; 0: env steps alone decide
-    keep: Count = 3  # checkpoints, the best apart
-    on_nan: Annotated[str, OneOf("stop", "rewind")] = "stop"  # "rewind": once, to the last checkpoint, slower from there
+    impl: str = flag("auto", free=True)
+    seed: Seed = flag(0, kept=True)
+    out: pathlib.Path | None = flag(None)  # run folder (default: runs/<env>_<time>)
+    restore: pathlib.Path | None = flag(None)  # run folder or checkpoint to go on from, or a policy to start from
+    eval_every: Whole = flag(0, free=True)  # env steps between evaluations; 0: 12 a run
+    checkpoint_every: Whole = flag(0, free=True)  # env steps between checkpoints; 0: 5 a run
+    eval_episodes: Annotated[int, Bounds(1, 100_000)] = dataclasses.field(default=256, metadata={"kept": True})
+    checkpoint_minutes: NonNegative = flag(10.0, free=True)  # the most minutes between checkpoints; 0: env steps alone decide
+    keep: Count = flag(3, free=True)  # checkpoints to keep beside the best
+    on_nan: OnNan = flag("stop", free=True)  # when training diverges: stop, or rewind once and go on slower
     auto: bool = False  # go on if ``out`` holds a checkpoint, start if not
-    max_minutes: NonNegative = 0.0  # of training, compilation apart; 0: no limit
-    num_devices: Annotated[int, Bounds(1, 4096)] = 1  # GPUs to spread the environments over
-    track: str = ""  # who is told of the metrics beside the folder: "wandb"; empty: nobody
+    max_minutes: NonNegative = flag(0.0, free=True)  # stop after so many minutes of training, compilation apart; 0: no limit
+    num_devices: Annotated[int, Bounds(1, 4096)] = flag(1, free=True)  # GPUs to spread the environments over
+    track: Annotated[str, OneOf("", "wandb")] = flag("")  # also tell this service how it goes (the extra track)
 
     def __post_init__(self):
         bounds.check(self)
@@ -96,22 +99,19 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
     Returns:
         the run, and a line that says so where there is no GPU.
     """
-    lifts, on_cpu = bool(run.env.scene.objects), jax.default_backend() == "cpu"
-    tasks_own = run.env.training.get("num_timesteps", 0)
-    # Few environments learn from fewer steps, which is what a CPU is short of.
-    enough = (10_000_000 if lifts else 2_000_000) if on_cpu else tasks_own or (100_000_000 if lifts else 60_000_000)
-    short = run.num_timesteps in (0, tasks_own)  # nobody has asked for another number
+    on_cpu, budget = jax.default_backend() == "cpu", run.env.budget
+    enough = budget.steps_on_cpu if on_cpu else budget.steps
     hyperparameters = dataclasses.replace(
         run.hyperparameters,
         num_envs=run.num_envs or (256 if on_cpu else 8192),
-        num_timesteps=enough if short else run.num_timesteps,
+        num_timesteps=run.num_timesteps or enough,
     )
     hyperparameters = learner.find(run.learner).fit(hyperparameters, run.num_devices * jax.process_count())
-    run = dataclasses.replace(run, hyperparameters=hyperparameters)
+    asked, run = run.num_timesteps, dataclasses.replace(run, hyperparameters=hyperparameters)
     if not on_cpu:
         return run, ""
     run = dataclasses.replace(run, eval_episodes=min(run.eval_episodes, 64))
-    if not short:
+    if asked:
         return run, ""
     run = dataclasses.replace(run, max_minutes=run.max_minutes or 10.0)
     note = (

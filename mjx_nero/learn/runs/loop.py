@@ -9,6 +9,7 @@ from typing import Any
 from mjx_nero.console import Show
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, machines
+from mjx_nero.learn.play import figures
 from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.learn.runs.checkpoints import Checkpoints
 from mjx_nero.learn.runs.compiled import Compiled
@@ -109,16 +110,16 @@ class Loop:
         while True:
             t = time.perf_counter()
             state, metrics = self.made.advance(state)
-            figures = {name: float(value) for name, value in metrics.items()}  # waits for the device
+            means = {name: float(value) for name, value in metrics.items()}  # waits for the device
             tally.steps_per_s = self.made.steps / (time.perf_counter() - t)
             tally.steps += self.made.steps
             tally.wall_s = time.perf_counter() - begun
-            if bad := self._not_finite(figures, state):
+            if bad := self._not_finite(means, state):
                 state = self._after_divergence(bad)
                 mean.take()
                 due = {name: _next(tally.steps, steps) for name, steps in every.items()}
                 continue
-            mean.add(self._counted(figures))
+            mean.add(self._counted(means))
             stop, tally.wall_s, unsaved = self._agree(time.perf_counter() - saved)
             ended = self._ended(stop)
             now = {name for name in due if tally.steps >= due[name] or ended}
@@ -153,9 +154,9 @@ class Loop:
             return "finished"
         return "time limit" if 0 < 60 * self.run.max_minutes <= self.tally.wall_s else ""
 
-    def _not_finite(self, figures: dict[str, float], state: Any) -> str | None:
+    def _not_finite(self, means: dict[str, float], state: Any) -> str | None:
         """The first quantity that is no number any more: a metric, or an array of the policy."""
-        bad = next((name for name, value in figures.items() if not math.isfinite(value)), None)
+        bad = next((name for name, value in means.items() if not math.isfinite(value)), None)
         return bad or checkpoint.not_finite(self.made.learner.policy(state))
 
     def _after_divergence(self, what: str) -> Any:
@@ -207,9 +208,9 @@ class Loop:
             "overflow_count": self.tally.overflow_count,
         }
         episodes = max(sums.get("episodes", 0.0), 1e-9)
-        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "grasped", "dropped", "final_distance", LEVEL) if n in sums}
-        if "grasp_time" in sums:
-            row["train/time_to_grasp"] = sums["grasp_time"] / max(sums["grasped"], 1e-9)
+        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "dropped", "final_distance", LEVEL) if n in sums}
+        terms = learner.env.unwrapped.cfg.metrics
+        row |= {f"train/{name}": value for name, value in figures.of_sums(terms, sums, episodes)}
         row |= {name: value / per * length for name, value in sums.items() if name.startswith("reward/")}
         return row | {f"{self.run.learner}/{name}": value for name, value in metrics.items() if not name.startswith("sum/")}
 

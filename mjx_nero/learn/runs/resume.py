@@ -20,9 +20,9 @@ from mjx_nero.learn.runs.folder import CONFIG
 
 # Fields of a run's environment that name files: another place than the folder of the run.
 _PATHS = ("identified", "robot.folder", "robot.name", "robot.mjcf")
-# What may change when a run goes on: how long, on what, and what it leaves behind.
-_FREE = ("impl", "eval_every", "checkpoint_every", "checkpoint_minutes", "keep", "on_nan", "max_minutes", "num_devices")
-_OWN = (*_FREE, "seed", "eval_episodes")
+# What may change when a run goes on: how long, on what, and what it leaves behind. What its config keeps of it.
+_FREE = config.marked(RunCfg, "free")
+_OWN = (*_FREE, *config.marked(RunCfg, "kept"))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop.batch import Batch, where
-from mjx_nero.learn.play import rollout
+from mjx_nero.learn.play import recorder, rollout
+from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Scenery
 
 CURVE = 400  # control steps that the curves show
@@ -53,6 +54,7 @@ class Session:
         self.running, self.speed = True, 1.0
         self.failure: BaseException | None = None
         self.successes: collections.deque[bool] = collections.deque(maxlen=EPISODES)
+        self.recorders: list[Callable[[Record], None]] = []  # each gets the record of every step, of all environments
         self.history: collections.deque[Frame] = collections.deque(maxlen=CURVE)
         self._batch = Batch(env, size)
         self._key = jax.random.PRNGKey(seed)
@@ -134,18 +136,21 @@ class Session:
         with self._lock:
             key = self._split()
             action, memory = self._act(self.params, self._memory, self._state, key)
-            self._state, last = self._step(self._state, action, key)
-            ended = np.asarray(last.done) > 0
+            self._state, record = self._step(self._state, action, key)
+            ended = np.asarray(record.done)
             if ended.any():
-                memory = where(last.done > 0, self._init(self._state), memory)
-                self.successes.extend(np.asarray(last.metrics["success"])[ended] > 0)
+                memory = where(record.done, self._init(self._state), memory)
+                self.successes.extend(np.asarray(self._state.metrics["success"])[ended] > 0)
             self._memory = memory
+            for consume in self.recorders:
+                consume(record)
             self._replace_goals()
-            self.frame = self._look(action)
+            self.frame = self._look(record.action)
             self.history.append(self.frame)
 
     def _step_all(self, state, action, key):
-        return self._batch.step(state, action, key)
+        after, last = self._batch.step(state, action, key)
+        return after, recorder.of_batch(self.env, state, action, last)
 
     def _replace_goals(self) -> None:
         if self._dragged.any():

@@ -1,0 +1,89 @@
+"""What is kept of a control step: a ``Record`` made of what ``step`` took and gave, before an episode that ended restarts."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from brax.envs.base import State
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.types import Scenery
+
+
+@struct.dataclass
+class Record:
+    """One control step: what the policy saw, what it did, and what came of it. Leading axes are steps and environments."""
+
+    obs: dict[str, Any]  # groups as the policy saw them, noise and delay included; of a group that stays apart, a dict of terms
+    action: Float[Array, "*n na"]  # as the policy gave it
+    targets: Float[Array, "*n nu"]  # what the drives were told [rad or m]
+    qpos: Float[Array, "*n nq"]  # after the step, as are all that follow
+    qvel: Float[Array, "*n nv"]
+    readings: dict[str, Array]  # of the scene's sensors
+    scenery: Scenery  # what a picture shows beside qpos
+    reward: Float[Array, "*n"]
+    terminated: Bool[Array, "*n"]
+    truncated: Bool[Array, "*n"]
+
+    def __getitem__(self, at: Any) -> "Record":
+        """That of some steps or environments."""
+        return jax.tree.map(lambda x: x[at], self)
+
+    @property
+    def done(self) -> Bool[Array, "*n"]:
+        """The step ended its episode."""
+        return self.terminated | self.truncated
+
+
+def of_step(env: ManipulationEnv, before: State, action: jax.Array, after: State) -> Record:
+    """The record of one environment's step.
+
+    Args:
+        before: the state that the policy acted in.
+        action: [na].
+        after: what ``step`` made of them; not restarted.
+    """
+    sim, truncated = after.pipeline_state, after.info["truncation"] > 0
+    return Record(
+        obs={name: before.obs[name] for name in env.cfg.observations},
+        action=action,
+        targets=sim.ctrl,
+        qpos=sim.qpos,
+        qvel=sim.qvel,
+        readings=sim.readings,
+        scenery=env.scenery(after),
+        reward=after.reward,
+        terminated=(after.done > 0) & ~truncated,
+        truncated=truncated,
+    )
+
+
+def of_batch(env: ManipulationEnv, before: State, action: jax.Array, after: State) -> Record:
+    """The records of a batch's step: as ``of_step``, with a leading axis."""
+    return jax.vmap(lambda *step: of_step(env, *step))(before, action, after)
+
+
+class Recorder:
+    """Keeps the records of a batch of environments, step after step, in the host's memory, and parts them into episodes."""
+
+    def __init__(self) -> None:
+        self._steps: list[Record] = []
+
+    def __call__(self, record: Record) -> None:
+        """Takes the records of a step [environments, ...]."""
+        self._steps.append(jax.tree.map(np.array, record))
+
+    def episodes(self) -> list[Record]:
+        """The episodes that have ended [steps, ...], by environment and in order; what still runs is left out."""
+        if not self._steps:
+            return []
+        all_steps = jax.tree.map(lambda *steps: np.stack(steps), *self._steps)
+        found = []
+        for i in range(all_steps.reward.shape[1]):
+            own, begin = all_steps[:, i], 0
+            for end in np.flatnonzero(own.done) + 1:
+                found.append(own[begin:end])
+                begin = end
+        return found
