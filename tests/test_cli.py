@@ -7,14 +7,19 @@ import os
 import pathlib
 import subprocess
 import sys
+from typing import Annotated
 
 import numpy as np
 import pytest
 
 import mjx_nero
-from mjx_nero import cli, config, control, env_cfg, list_envs, list_presets
+from mjx_nero import bounds, cli, config, control, env_cfg, list_envs, list_presets
 from mjx_nero.envs import registry
+from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import training
+from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.tools import eval as evaluate
+from mjx_nero.tools import train
 
 ROOT = pathlib.Path(__file__).parents[1]
 
@@ -76,6 +81,58 @@ def test_a_flag_and_its_fault_read_as_one_sentence():
         parser.parse(["--seed", "1e99"])
     with pytest.raises(mjx_nero.UserError, match=r"^--seed must be at least 0 and at most 4294967295, got '-1' \(see --help\)$"):
         parser.parse(["--seed=-1"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """
+    Attributes:
+        minutes: how long at most; 100% of it.
+    """
+
+    minutes: bounds.NonNegative = config.flag(2.5, free=True)
+    where: pathlib.Path | None = config.flag(None)
+    how: Annotated[str, bounds.OneOf("", "fast", "slow")] = config.flag("")
+    loudly: bool = config.flag(False)  # say more
+    seed: bounds.Seed = config.flag(0)
+    inner: int = 7
+
+
+def test_flags_are_made_of_a_config():
+    parser = cli.Parser(prog="x")
+    parser.add_seed(5)
+    parser.add_fields(Asked)
+    assert config.marked(Asked) == ("minutes", "where", "how", "loudly", "seed") and config.marked(Asked, "free") == ("minutes",)
+    nothing = {"minutes": 2.5, "where": None, "how": "", "loudly": False, "seed": 5}  # what is there already stays
+    assert cli.fields(parser.parse([])[0], Asked) == nothing
+    found = cli.fields(parser.parse(["--minutes", "1e1", "--where", "a/b", "--how", "fast", "--loudly"])[0], Asked)
+    assert found == {"minutes": 10.0, "where": pathlib.Path("a/b"), "how": "fast", "loudly": True, "seed": 5}
+    help = " ".join(parser.format_help().split())
+    assert "--minutes MINUTES how long at most; 100% of it (default: 2.5)" in help and "--loudly say more" in help
+    assert "--inner" not in help
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--minutes", "-1"], r"^--minutes must be at least 0, got '-1' \(see --help\)$"),
+        (["--minutes", "nan"], "^--minutes takes a finite number, got 'nan'"),
+        (["--how", "warm"], "invalid choice: 'warm'"),
+        (["--where", ""], "^--where takes a path"),
+    ],
+)
+def test_flags_of_a_config_keep_to_its_bounds(argv, message):
+    parser = cli.Parser(prog="x")
+    parser.add_fields(Asked)
+    with pytest.raises(mjx_nero.UserError, match=message):
+        parser.parse(argv)
+
+
+def test_a_run_and_what_is_played_have_flags_for_their_fields():
+    """What the programs read stands in the configs alone: every flag's default is the field's."""
+    for cls, parser in ((RunCfg, train._parser()), (evaluation.EvalCfg, evaluate._parser())):
+        args, _ = parser.parse([])
+        assert cli.fields(args, cls) == {f.name: f.default for f in dataclasses.fields(cls) if f.metadata.get("flag")}
 
 
 def test_an_empty_value_of_a_field_is_one():

@@ -13,6 +13,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from flax import struct
 
 import mjx_nero
 from mjx_nero import interop
@@ -27,6 +28,15 @@ from mjx_nero.types import UserError
 PAGE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "guides" / "deploy_onnx.md"
 # What a robot's computer has not: the program fails if it imports any of these.
 ABSENT = ("jax", "brax", "flax", "mujoco", "onnx", "yaml", "lxml")
+
+
+@struct.dataclass
+class Trained:
+    """A learner's state, as a checkpoint of PPO names its parts."""
+
+    normalizer: object
+    params: object
+    iteration: object
 
 
 def fresh(path, **network):
@@ -96,6 +106,18 @@ def test_metadata_of_the_shipped_policy(call, tmp_path):
     assert limit == {"name": "speed_limit", "type": "speed_limit", "of": ["gripper_joint1", "gripper_joint2"]}
     assert meta["action_clip"] is None
     assert (meta["control_dt"], meta["robot"], meta["env"]) == (0.02, "nero", "nero_lift")
+
+
+def test_a_checkpoint_is_exported_as_its_policy_is(call, tmp_path):
+    """Of a run: the policy's parameters among the learner's whole state."""
+    shipped = policy.load(policy.shipped("nero_reach"))
+    tree = Trained(*shipped.params, iteration=jnp.zeros((), jnp.int32))
+    checkpoint.save(tmp_path / "000000001000.safetensors", tree, {**shipped.meta, "kind": "checkpoint"})
+    for source, out in (("000000001000.safetensors", "a.onnx"), ("nero_reach", "b.onnx")):
+        status, _, err = call("mjx_nero", "export", source, "--out", out)
+        assert (status, err) == (0, "")
+    weights = [{t.name: t.raw_data for t in onnx.load(tmp_path / name).graph.initializer} for name in ("a.onnx", "b.onnx")]
+    assert weights[0] == weights[1]
 
 
 def test_velocities_and_delays_are_told():
