@@ -54,7 +54,7 @@ def played(env_name: str, preset: str, robot: str | None) -> dict[str, np.ndarra
             "qpos": sim.qpos,
             "qvel": sim.qvel,
             "fields": sim.fields,
-            "scenery": env.scenery(state),
+            "scenery": jax.vmap(env.scenery)(state),
             "exact": env.named_observations(state),
         }
 
