@@ -106,7 +106,7 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
         by: name of the learner.
         learnt: of ``Learner.describe``.
     """
-    terms = {group: list(members) for group, members in env.cfg.observations.items()}
+    terms = {name: list(group.terms) for name, group in env.cfg.observations.items()}
     return {
         "kind": "policy",
         "env": env_name,
@@ -196,7 +196,7 @@ def load_for(
             f"{path} is a policy for another model of {name} (other links, masses, joints or drives): pass the --robot that "
             "it was trained with, train one for this robot, or pass --any-robot to play it all the same"
         )
-    terms = {group: list(members) for group, members in env.cfg.observations.items()}
+    terms = {name: list(group.terms) for name, group in env.cfg.observations.items()}
     sizes = jax.tree.map(list, env.observation_size, is_leaf=_is_shape)
     same_terms = policy.meta["observations"]["state"] == terms["state"]
     if same_terms and policy.meta["action_size"] != env.action_size:

@@ -92,8 +92,8 @@ def dump(folder: pathlib.Path, names: list[str]) -> None:
 def compare(folder: pathlib.Path, other: pathlib.Path) -> int:
     """Prints what differs; the number of cases that do."""
     ours, theirs = ({path.name for path in each.glob("*.npz")} for each in (folder, other))
-    for name in sorted(ours ^ theirs):
-        print(f"{name}: in one folder alone")
+    if ours ^ theirs:
+        print(f"in one folder alone: {', '.join(sorted(ours ^ theirs))}")
     differing = len(ours ^ theirs)
     for name in sorted(ours & theirs):
         a, b = np.load(folder / name), np.load(other / name)

@@ -10,7 +10,7 @@ from mjx_nero.envs.task import CALM, EnvCfg, Presets, velocity_actions
 from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.actions import ContinuousGripper
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -70,7 +70,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
                 params={"objects": tuple(objects), "x": there.cube[0], "y": there.cube[1], "apart": apart},
             ),
         },
-        observations={"state": state, "privileged_state": {**exact(state), **seen}},
+        observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards={**tower.rewards(), "leaving": leaving},
         success=tower.success(),
         metrics=tower.metrics(),
