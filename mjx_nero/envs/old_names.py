@@ -38,7 +38,7 @@ def _renamed(name: str, value: Any, groups: Collection[str], weights: Collection
         yield from ((f"observations.{group}.{name}", group in listed) for group in groups)
     elif head in _MOVED:
         yield ".".join([_MOVED[head], *rest]), value
-    elif head == "curriculum" and rest and rest[0] in weights:
+    elif name == "curriculum" and isinstance(value, Mapping) or head == "curriculum" and rest and rest[0] in weights:
         yield ".".join([head, "weights", *rest]), value
     elif head == "observations" and len(rest) > 1 and rest[0] in groups and rest[1] not in _GROUP:
         yield ".".join([head, rest[0], "terms", *rest[1:]]), value
