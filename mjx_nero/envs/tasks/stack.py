@@ -39,7 +39,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))
     # Leaving is paid for as far as the fingers have let go: from where they hold a cube, half open already if it is wide.
     fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
-    leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.leave, **fingers})
+    leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.place, **fingers})
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
