@@ -27,7 +27,6 @@ COMMANDS = {
     "tune-gains": ("mjx_nero.tools.tuning", "main", "stiffness and damping from step responses"),
     "record": ("mjx_nero.tools.identification", "record_main", "a log of a simulated arm's drives"),
     "identify": ("mjx_nero.tools.identification", "identify_main", "a real arm's gains, friction, delay and offsets, from a log"),
-    "gripper-demo": ("mjx_nero.tools.gripper_demo", "main", "open and close a gripper, and plot its gap"),
 }
 
 

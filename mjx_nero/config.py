@@ -99,14 +99,19 @@ def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str)
 
 
 def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
-    """A copy of ``cfg`` with fields changed by dotted name; values are read as ``read`` does.
+    """A copy of ``cfg`` with fields changed by dotted name, old names included; values are read as ``read`` does.
 
     Raises:
         UserError: no such field (the message names the nearest ones), or a value of another type.
     """
-    for name, value in changes.items():
+    for name, value in current(cfg, changes).items():
         cfg = _replace(cfg, type(cfg), name.split("."), value, name)
     return cfg
+
+
+def current(cfg: Any, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields by the dotted names that they have now: a config whose fields once had others has a method ``current``."""
+    return cfg.current(fields) if hasattr(cfg, "current") else dict(fields)
 
 
 def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> Any:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from mjx_nero.errors import UserError as UserError
 
 Key = jax.Array  # a JAX random key
-TARGET = "target"  # in ``View.objects``: the one of ``EnvCfg.targets`` that the episode commands
+TARGET = "target"  # in ``View.objects``: the one of ``CommandTerm.targets`` that the episode commands
 LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
 
 
@@ -61,7 +61,7 @@ class Start:
     object_pos_w: dict[str, Float[Array, "3"]]  # [m]
     object_quat_w: dict[str, Float[Array, "4"]]  # wxyz
     goal_pos_w: Float[Array, "3"] = struct.field(default_factory=lambda: jnp.zeros(3))  # the first command, drawn before [m]
-    target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``EnvCfg.targets``
+    target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``CommandTerm.targets``
 
 
 @struct.dataclass
@@ -135,6 +135,6 @@ class View:
     # What the scene's sensors measured in this step, by name. ``touch``: the strongest contact with an obstacle, or of the robot
     # with itself [N].
     readings: dict[str, Array] = struct.field(default_factory=dict)
-    # Which of ``EnvCfg.targets`` is commanded; None: there are none.
+    # Which of ``CommandTerm.targets`` is commanded; None: there are none.
     target: Int[Array, ""] | None = None
     max_steps: int = struct.field(pytree_node=False, default=0)

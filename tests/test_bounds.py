@@ -26,19 +26,28 @@ from mjx_nero.mdp.terms import RewardTerm, Term
         ({"events.reset_object_position.params.y": (0.1, -0.1)}, "events.reset_object_position.params.y is a range and must run"),
         ({"rewards.reaching_object.params.std": 0.0}, "rewards.reaching_object.params.std must be above 0, got 0.0"),
         ({"rewards.reaching_object.weight": math.nan}, "rewards.reaching_object.weight takes a finite number, got nan"),
-        ({"observations.state.joint_pos.noise": -0.1}, "observations.state.joint_pos.noise must be at least 0, got -0.1"),
-        ({"observations.state.joint_pos.delay": (2, 1)}, "observations.state.joint_pos.delay is a range and must run"),
-        ({"observations.state.joint_pos.delay": (-1, 1)}, r".*joint_pos.delay\[0\] must be at least 0 and at most 256, got -1"),
         (
-            {"observations.state.joint_pos.delay": (0, 50_000_000)},
+            {"observations.state.terms.joint_pos.noise": -0.1},
+            ".*state.terms.joint_pos.noise must be at least 0, got -0.1",
+        ),
+        (
+            {"observations.state.terms.joint_pos.delay": (2, 1)},
+            ".*state.terms.joint_pos.delay is a range and must run",
+        ),
+        (
+            {"observations.state.terms.joint_pos.delay": (-1, 1)},
+            r".*delay\[0\] must be at least 0 and at most 256, got -1",
+        ),
+        (
+            {"observations.state.terms.joint_pos.delay": (0, 50_000_000)},
             r".*joint_pos.delay\[1\] must be at least 0 and at most 256, got",
         ),
-        ({"observations.state.joint_pos.history": 10**9}, ".*joint_pos.history must be at least 1 and at most 256"),
+        ({"observations.state.terms.joint_pos.history": 10**9}, ".*joint_pos.history must be at least 1 and at most 256"),
         ({"sim.dt": 1e-12}, "sim.dt must be at least 1e-06 and at most 1, got 1e-12"),
         ({"sim.contacts_per_env": 10**9}, "sim.contacts_per_env must be at least 1 and at most 100000, got 1000000000"),
         (
-            {"observations.state.joint_pos.hold": 1.5},
-            "observations.state.joint_pos.hold must be at least 0 and at most 1, got 1.5",
+            {"observations.state.terms.joint_pos.hold": 1.5},
+            "observations.state.terms.joint_pos.hold must be at least 0 and at most 1, got 1.5",
         ),
         ({"robot.arm.stiffness": (0.0,) * 7}, "robot.arm.stiffness\\[0\\] must be above 0, got 0.0"),
         ({"command.resample_s": 0.0}, "command.resample_s must be above 0, got 0.0"),
@@ -62,7 +71,7 @@ def test_a_bad_value_ends_a_command_in_one_line(call):
 
 def test_configs_are_read_only_all_the_way_down():
     cfg = env_cfg("nero_reach", "isaac")
-    for mapping in (cfg.training, cfg.rewards, cfg.observations["state"], cfg.scene.objects, cfg.actions["arm"].params):
+    for mapping in (cfg.training, cfg.rewards, cfg.observations["state"].terms, cfg.scene.objects, cfg.actions["arm"].params):
         with pytest.raises(TypeError, match="does not support item assignment"):
             mapping["num_epochs"] = 99
     assert env_cfg("cobotta_reach", "isaac").training["num_epochs"] == 8

@@ -8,7 +8,7 @@ import pytest
 from mjx_nero import UserError, bounds, config, control, env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.task import CALM, QUIET, EnvCfg
+from mjx_nero.envs.task import CALM, QUIET, CurriculumCfg, EnvCfg
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import PRESETS
 from mjx_nero.mdp import actions
@@ -286,8 +286,8 @@ def test_configs_are_frozen():
 
 def test_curriculum_must_name_a_reward():
     cfg = env_cfg("nero_lift", "isaac")
-    with pytest.raises(UserError, match="curriculum names speed: not one of reaching_object, lifting_object"):
-        dataclasses.replace(cfg, curriculum={"speed": cfg.curriculum["joint_vel"]})
+    with pytest.raises(UserError, match="curriculum.weights names speed: not one of reaching_object, lifting_object"):
+        dataclasses.replace(cfg, curriculum=CurriculumCfg({"speed": cfg.curriculum.weights["joint_vel"]}))
 
 
 # The recipe, number by number: (function of the package, weight, parameters).
@@ -306,13 +306,13 @@ RECIPE_OBSERVATIONS = ["joint_pos_rel", "joint_vel_rel", "object_position", "com
 def test_isaac_preset_is_the_recipe():
     cfg: EnvCfg = env_cfg("nero_lift", "isaac")
     assert {n: (t.func.__name__, t.weight, t.params) for n, t in cfg.rewards.items()} == RECIPE_REWARDS
-    assert {n: (t.func.__name__, t.params) for n, t in cfg.curriculum.items()} == {
+    assert {n: (t.func.__name__, t.params) for n, t in cfg.curriculum.weights.items()} == {
         "action_rate": ("step_weight", {"to": -1e-1, "num_steps": 10_000}),
         "joint_vel": ("step_weight", {"to": -1e-1, "num_steps": 10_000}),
     }
     assert list(cfg.observations) == ["state"]
-    assert [t.func.__name__ for t in cfg.observations["state"].values()] == RECIPE_OBSERVATIONS
-    assert all(t.noise == 0 for t in cfg.observations["state"].values())
+    assert [t.func.__name__ for t in cfg.observations["state"].terms.values()] == RECIPE_OBSERVATIONS
+    assert all(t.noise == 0 for t in cfg.observations["state"].terms.values())
     assert cfg.command.func.__name__ == "uniform_position" and cfg.command.resample_s == 5.0
     assert cfg.command.params == {"x": (0.3, 0.35), "y": (-0.2, 0.2), "z": (0.2, 0.35)}
     (event,) = cfg.events.values()

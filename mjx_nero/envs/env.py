@@ -82,9 +82,7 @@ class ManipulationEnv(Env):
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
-        self._viewer = Viewer(
-            model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.motion, self._obstacles, cfg.targets
-        )
+        self._viewer = Viewer(model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.command, self._obstacles)
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
@@ -182,7 +180,7 @@ class ManipulationEnv(Env):
             action=jnp.zeros(self.action_size),
             command=command,
             command_quat=command_quat,
-            memory={**({TARGET: start.target} if self.cfg.targets else {}), **({} if level is None else {LEVEL: level})},
+            memory={**({TARGET: start.target} if self.cfg.command.targets else {}), **({} if level is None else {LEVEL: level})},
         )
         if self.cfg.obstacles:  # between what is already there: the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
@@ -227,7 +225,7 @@ class ManipulationEnv(Env):
         if jnp.ndim(state.done):
             return jax.vmap(self.named_observations)(state)
         view, recall = self.view(state), terms.Recall(state.info["carry"].memory)
-        return {name: terms.by_name(group, view, recall, name) for name, group in self.cfg.observations.items()}
+        return {name: terms.by_name(group.terms, view, recall, name) for name, group in self.cfg.observations.items()}
 
     def scenery(self, state: State) -> Scenery:
         """What a picture of a state shows beside the joints' positions."""
@@ -236,16 +234,16 @@ class ManipulationEnv(Env):
         return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._object_looks(sim, carry))
 
     def _object_looks(self, sim: Sim, carry: Carry) -> dict[str, ObjectLook]:
-        """Drawn sizes and colours; of ``cfg.targets`` the commanded one in the goal's green."""
-        fields, model = sim.fields, self.physics_model
-        if not self.cfg.targets and not {"geom_size", "geom_rgba"} & set(fields):
+        """Drawn sizes and colours; of the command's targets the commanded one in the goal's green."""
+        fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
+        if not targets and not {"geom_size", "geom_rgba"} & set(fields):
             return {}
         out = {}
         for name in self.cfg.scene.objects:
             geom = model.geom(name).id
             size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
-            if name in self.cfg.targets:
-                commanded = carry.memory[TARGET] == self.cfg.targets.index(name)
+            if name in targets:
+                commanded = carry.memory[TARGET] == targets.index(name)
                 rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)
             out[name] = ObjectLook(size, rgba)
         return out
@@ -257,9 +255,9 @@ class ManipulationEnv(Env):
         view = sensed = self._viewer(sim, carry, carry.action)
         for name, term in cfg.sensors.items():
             sensed = recall.through(f"sensors.{name}", term.made, sensed)
-        sensed = toward(carry.memory.get(LEVEL), view, sensed)
-        seen = dict.fromkeys(cfg.sensed, sensed) if cfg.sensors else {}
-        obs = terms.observe(cfg.observations, view, key, cfg.corruption, recall, cfg.apart, seen)
+        if cfg.sensors:
+            sensed = toward(carry.memory.get(LEVEL), view, sensed)
+        obs = terms.observe(cfg.observations, view, sensed, key, recall)
         return obs, dataclasses.replace(carry, memory=recall.memory)
 
     @_precise
@@ -298,7 +296,7 @@ class ManipulationEnv(Env):
         sim, overflow = self.physics.step(state.pipeline_state, ctrl)
         state = self.advance(state, action, sim, overflow)
         rng, k_sample, k_obs = jax.random.split(state.info["carry"].rng, 3)
-        level, old = self._widened(state), (state.pipeline_state, state.info["carry"].replace(rng=rng))
+        level, old = self._next_level(state), (state.pipeline_state, state.info["carry"].replace(rng=rng))
         sim, carry = start or self.sample(k_sample, level)
         if level is not None:
             carry = dataclasses.replace(carry, memory={**carry.memory, LEVEL: level})
@@ -308,14 +306,15 @@ class ManipulationEnv(Env):
 
     @property
     def first_level(self) -> float | None:
-        """Of the first episodes in training: see ``EnvCfg.widening``."""
-        return None if self.cfg.widening is None else self.cfg.widening.made.start
+        """Of the first episodes in training: see ``CurriculumCfg.levels``."""
+        levels = self.cfg.curriculum.levels
+        return None if levels is None else levels.made.start
 
-    def _widened(self, state: State) -> Float[Array, ""] | None:
-        level = state.info["carry"].memory.get(LEVEL)
-        if level is None or self.cfg.widening is None:
+    def _next_level(self, state: State) -> Float[Array, ""] | None:
+        level, levels = state.info["carry"].memory.get(LEVEL), self.cfg.curriculum.levels
+        if level is None or levels is None:
             return level
-        return self.cfg.widening.made.step(level, state.metrics["success"])
+        return levels.made.step(level, state.metrics["success"])
 
     def act(self, state: State, action: Float[Array, " na"]) -> tuple[State, Float[Array, " nu"]]:
         """The drives' position targets for ``action`` [rad or m], and the state with what the action terms then remember.
@@ -362,7 +361,7 @@ class ManipulationEnv(Env):
         step, count, recall = carry.step + 1, state.info["count"] + 1, terms.Recall(carry.memory)
         view = self._viewer(sim, carry.replace(step=step), action)
 
-        rewards = terms.rewards(cfg.rewards, cfg.curriculum, view, count, self.dt, recall)
+        rewards = terms.rewards(cfg.rewards, cfg.curriculum.weights, view, count, self.dt, recall)
         bad |= ~jnp.isfinite(sum(rewards.values()))
         rewards = {name: jnp.where(bad, 0.0, value) for name, value in rewards.items()}
         terminated, truncated = terms.terminations(cfg.terminations, view, recall)

@@ -34,7 +34,7 @@ class Numbers:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """What was found of a joint's drive (see ``tools.identification.plant.Drives``)."""
+    """What was found of a joint's drive (see ``identify.plant.Drives``)."""
 
     stiffness: Positives
     damping: Positives

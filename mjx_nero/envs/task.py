@@ -6,8 +6,9 @@ from typing import Any
 
 from mjx_nero import bounds, config
 from mjx_nero.bounds import Count, NonNegative, Positive, Share, Steps
+from mjx_nero.envs import old_names
 from mjx_nero.mdp import actions, success
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import TARGET, UserError
@@ -81,25 +82,34 @@ class Budget:
 
 
 @dataclasses.dataclass(frozen=True)
+class CurriculumCfg:
+    """What grows harder in training.
+
+    Attributes:
+        weights: changes the weight of the reward of the same name (``mdp.curriculum``).
+        levels: scales randomization, sensors, late observations and actions, the targets' noise, and pushes by each training
+            environment's own successes, and rewards by ``curriculum.level_weight``. None: always full, as outside of training.
+    """
+
+    weights: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    levels: Term | None = None
+
+    def __post_init__(self):
+        config.freeze(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvCfg:
     """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
 
     Attributes:
         actions: from the policy's output to the drives' targets, in this order.
         action_clip: bounds every action to +-this before use; 0 leaves them alone.
-        apart: observation groups whose terms stay apart, a dict by name, instead of being concatenated.
-        motion: moves the goal: a path of ``mdp.commands``.
         randomization: model fields that every episode draws anew (``mdp.randomization``).
-        sensors: between the world and the observation groups ``sensed``, in this order (``mdp.sensors``). Unlike the noise of
-            observations, they are always on.
-        sensed: the groups that see by the sensors; the others see what is.
+        sensors: stand between the world and the observation groups that are ``sensed``, in this order (``mdp.sensors``). They are
+            always on, unlike the noise of observations.
         obstacles: where the scene's obstacles stand, drawn for every episode once its start and goal are (``mdp.obstacles``).
-        targets: objects of which every episode commands one, which the terms of a view call ``target``; an event says which
-            (``Start.target``), else it is the first.
         pushes: sudden changes of objects' velocities (``mdp.pushes``).
-        widening: how much of randomization, sensors, late observations and actions, the targets' noise, and pushes an environment
-            of ``wrappers.for_training`` has, and of rewards by ``curriculum.level_weight``, by its own successes
-            (``mdp.curriculum``); None: all of it, as everywhere else.
         identified: a file of ``python -m mjx_nero identify``, whose drives and delay take the place of the robot's own.
         controllers: those of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config by
             dotted name.
@@ -112,11 +122,11 @@ class EnvCfg:
 
     robot: RobotCfg
     command: CommandTerm
-    observations: Mapping[str, Mapping[str, ObservationTerm]]
+    observations: Mapping[str, ObservationGroup]
     rewards: Mapping[str, RewardTerm]
     terminations: Mapping[str, DoneTerm]
     events: Mapping[str, Term]
-    curriculum: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    curriculum: CurriculumCfg = CurriculumCfg()
     scene: SceneCfg = SceneCfg()
     sim: SimCfg = SimCfg()
     actions: Mapping[str, Term] = dataclasses.field(default_factory=joint_actions)
@@ -124,16 +134,10 @@ class EnvCfg:
     success: SuccessCfg = SuccessCfg()
     metrics: Mapping[str, MetricTerm] = dataclasses.field(default_factory=dict)
     episode_length_s: Positive = 5.0  # [s]
-    corruption: bool = True  # observation noise: on to train, off to play
-    apart: tuple[str, ...] = ()
-    motion: Term | None = None
     randomization: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     sensors: Mapping[str, Term] = dataclasses.field(default_factory=dict)
-    sensed: tuple[str, ...] = ("state",)
     obstacles: Term | None = None
-    targets: tuple[str, ...] = ()
     pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
-    widening: Term | None = None
     identified: str = ""
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -142,32 +146,44 @@ class EnvCfg:
     def __post_init__(self):
         config.freeze(self)
         bounds.check(self)
+        targets = self.command.targets
         for what, names, valid in (
-            ("curriculum", self.curriculum, self.rewards),
-            ("apart", self.apart, self.observations),
-            ("targets", self.targets, self.scene.objects),
+            ("curriculum.weights", self.curriculum.weights, self.rewards),
+            ("command.targets", targets, self.scene.objects),
         ):
             if unknown := [name for name in names if name not in valid]:
                 raise UserError(f"{what} names {', '.join(unknown)}: not one of {', '.join(valid)}")
-        if self.targets and TARGET in self.scene.objects:
+        if targets and TARGET in self.scene.objects:
             raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
-        seen = tuple(f"{group}." for group in ("sensors", *self.view_terms()))
         for name, term in self.terms().items():
-            commanded = (TARGET,) if self.targets and name.startswith(seen) else ()
-            there = (*self.scene.objects, *commanded)
-            listed = ", ".join(there) or "none"
-            wanted = term.params.get("object")
-            if wanted is not None and wanted not in there:
-                raise UserError(f"{name}.params.object is {wanted!r}, and the scene's objects are: {listed}")
-            if unknown := [each for each in term.params.get("objects", ()) if each not in there]:
-                raise UserError(f"{name}.params.objects names {', '.join(unknown)}, and the scene's objects are: {listed}")
-            heights = term.params.get("minimal_height")
-            if isinstance(heights, tuple) and len(heights) != len(self.targets):
-                raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(self.targets)} targets")
+            self._check_objects(name, term)
+
+    def _check_objects(self, name: str, term: Term) -> None:
+        """A term names objects that are there; ``name`` is its own."""
+        targets, seen = self.command.targets, tuple(f"{group}." for group in ("sensors", *self.view_terms()))
+        there = (*self.scene.objects, *((TARGET,) if targets and name.startswith(seen) else ()))
+        listed = ", ".join(there) or "none"
+        wanted = term.params.get("object")
+        if wanted is not None and wanted not in there:
+            raise UserError(f"{name}.params.object is {wanted!r}, and the scene's objects are: {listed}")
+        if unknown := [each for each in term.params.get("objects", ()) if each not in there]:
+            raise UserError(f"{name}.params.objects names {', '.join(unknown)}, and the scene's objects are: {listed}")
+        heights = term.params.get("minimal_height")
+        if isinstance(heights, tuple) and len(heights) != len(targets):
+            raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(targets)} targets")
+
+    def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Fields by dotted name with the names that they have now: see ``envs.old_names``."""
+        return old_names.current(fields, self.observations, self.curriculum.weights)
+
+    def uncorrupted(self) -> "EnvCfg":
+        """The task without observation noise, as policies are measured."""
+        groups = {name: dataclasses.replace(group, corruption=False) for name, group in self.observations.items()}
+        return dataclasses.replace(self, observations=groups)
 
     def view_terms(self) -> dict[str, Mapping[str, Term]]:
-        """The terms of a view by the dotted names of their groups."""
-        observed = {f"observations.{name}": group for name, group in self.observations.items()}
+        """The terms of a view by the dotted names of their groups; of observations as the episode's memory has them."""
+        observed = {f"observations.{name}": group.terms for name, group in self.observations.items()}
         ends = {"condition": self.success.condition, "distance": self.success.distance}
         return {
             **observed,

@@ -1,6 +1,6 @@
 """From the physics state and the carry to what the terms read."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +8,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_nero.mdp.terms import CommandTerm
 from mjx_nero.sim import kinematics
 from mjx_nero.sim.obstacles import Obstacles
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import TARGET, Carry, ObjectView, Sim, View
-
-Motion = Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, "3"]]
 
 
 class Viewer:
@@ -25,9 +24,8 @@ class Viewer:
         objects: names of the scene's.
         max_steps: control steps of an episode.
         dt: of a control step [s].
-        motion: ``(position, time) -> position`` of a moving goal; None: it stays.
+        command: says how the goal moves, and which of the objects may be commanded.
         obstacles: the scene's.
-        targets: of the objects, those that may be commanded.
 
     Attributes:
         objects: addresses in qpos and qvel by name.
@@ -40,9 +38,8 @@ class Viewer:
         objects: Iterable[str],
         max_steps: int,
         dt: float,
-        motion: Motion | None = None,
-        obstacles: Obstacles | None = None,
-        targets: Sequence[str] = (),
+        command: CommandTerm,
+        obstacles: Obstacles,
     ):
         self.qpos_ids = np.array([model.joint(j).qposadr[0] for j in robot.joints])
         self.dof_ids = np.array([model.joint(j).dofadr[0] for j in robot.joints])
@@ -51,8 +48,8 @@ class Viewer:
         self._gain = np.array(model.actuator_gainprm, np.float32)
         self._default = np.asarray(robot.home, np.float32)
         self._root = np.asarray(robot.base_pos, np.float32)
-        self._max_steps, self._dt, self._motion = max_steps, dt, motion
-        self._obstacles, self._targets = obstacles or Obstacles(model, ()), tuple(targets)
+        self._max_steps, self._dt, self._motion = max_steps, dt, command.motion
+        self._obstacles, self._targets = obstacles, command.targets
 
     def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
         """The view after a step that ``action`` caused; ``carry.action`` is the action before it."""

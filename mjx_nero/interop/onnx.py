@@ -132,7 +132,7 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
 def _observations(env: ManipulationEnv) -> list[dict[str, Any]]:
     """The terms of the group ``state``, in the order of the input."""
     sizes = jax.eval_shape(lambda key: env.named_observations(env.reset(key))["state"], jax.random.PRNGKey(0))
-    terms, out, start = env.cfg.observations["state"], [], 0
+    terms, out, start = env.cfg.observations["state"].terms, [], 0
     for name, term in terms.items():
         says = (inspect.getdoc(unwrapped(term.func)) or "").partition("\n")[0]
         size = int(np.prod(sizes[name].shape)) * term.history

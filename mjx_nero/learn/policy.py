@@ -41,7 +41,7 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
         by: name of the learner.
         learnt: of ``Learner.describe``.
     """
-    terms = {group: list(members) for group, members in env.cfg.observations.items()}
+    terms = {name: list(group.terms) for name, group in env.cfg.observations.items()}
     return {
         "kind": "policy",
         "env": env_name,

@@ -19,7 +19,7 @@ def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object:
     """The object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
     A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point. Several heights are those of
-    ``EnvCfg.targets``, for the object that the episode commands.
+    ``CommandTerm.targets``, for the object that the episode commands.
     """
     height = jnp.array(minimal_height)[view.target] if isinstance(minimal_height, tuple) else minimal_height
     return (view.objects[object].pos_w[2] > height) & (_ee_distance(view, object) < grasp_radius)

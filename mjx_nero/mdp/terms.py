@@ -80,7 +80,7 @@ class ObservationTerm(Term):
     """A part of an observation group.
 
     Attributes:
-        noise: uniform in +-``noise`` while the env's corruption is on.
+        noise: uniform in +-``noise`` while the group's corruption is on.
         delay: by how many control steps it is late, the least and the most (see ``memory.Delay``).
         hold: the chance that a step keeps the delay of the one before.
         history: so many last values in one.
@@ -98,9 +98,30 @@ class ObservationTerm(Term):
         return delay + ((History(self.history),) if self.history > 1 else ())
 
 
-def exact(group: Mapping[str, ObservationTerm]) -> dict[str, ObservationTerm]:
-    """The same observations without noise: what a critic may see."""
-    return {name: dataclasses.replace(term, noise=0.0) for name, term in group.items()}
+@dataclasses.dataclass(frozen=True)
+class ObservationGroup:
+    """Terms that a policy, a critic or another reader gets together, by name.
+
+    Attributes:
+        terms: by name, in this order.
+        corruption: adds the terms' noise: on to train, off to play.
+        apart: the terms stay apart, a dict of arrays of any shape by name, instead of being concatenated.
+        sensed: the terms read the world through the task's sensors; otherwise they read it as it is.
+    """
+
+    terms: Mapping[str, ObservationTerm]
+    corruption: bool = True
+    apart: bool = False
+    sensed: bool = True
+
+    def __post_init__(self):
+        config.freeze(self)
+
+
+def privileged(terms: Mapping[str, ObservationTerm], more: Mapping[str, ObservationTerm] | None = None) -> ObservationGroup:
+    """What a critic may see: the same terms without noise, and ``more``, all of the world as it is."""
+    exact = {name: dataclasses.replace(term, noise=0.0) for name, term in terms.items()}
+    return ObservationGroup({**exact, **(more or {})}, sensed=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,9 +153,18 @@ ONCE = 1e6  # [s], as ``CommandTerm.resample_s``: longer than any episode, so th
 
 @dataclasses.dataclass(frozen=True)
 class CommandTerm(Term):
-    """Draws the goal at every reset, and now and then."""
+    """Draws the goal at every reset, and now and then.
 
-    resample_s: Positive = dataclasses.field(default=5.0, kw_only=True)  # time between draws [s]
+    Attributes:
+        resample_s: time between draws [s].
+        motion: moves the goal from where it was drawn: a path of ``mdp.commands``. None: the goal stays.
+        targets: objects of which every episode commands one. The terms of a view call that one ``target``; an event says which it
+            is (``Start.target``), else it is the first.
+    """
+
+    resample_s: Positive = dataclasses.field(default=5.0, kw_only=True)
+    motion: Term | None = dataclasses.field(default=None, kw_only=True)
+    targets: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
 
 
 class Recall:
@@ -202,40 +232,50 @@ def by_name(group: Mapping[str, ObservationTerm], view: View, recall: Recall, na
 
 
 def observe(
-    groups: Mapping[str, Mapping[str, ObservationTerm]],
-    view: View,
-    key: Key,
-    corruption: bool,
-    recall: Recall,
-    apart: tuple[str, ...] = (),
-    seen: Mapping[str, View] | None = None,
-) -> dict[str, Any]:
-    """Each group's terms, concatenated in the order of the config; of the groups ``apart``, a dict by name.
+    groups: Mapping[str, ObservationGroup], view: View, sensed: View, key: Key, recall: Recall
+) -> dict[str, Array | dict[str, Array]]:
+    """Each group's terms, concatenated in the order of the config; of a group that stays ``apart``, a dict by name.
 
     Args:
-        seen: by group, the view that its terms get instead of ``view``.
+        sensed: what the groups read that see through the task's sensors.
     """
     out: dict[str, Any] = {}
-    level = recall.memory.get(LEVEL)
     for i, (name, group) in enumerate(groups.items()):
-        values = by_name(group, (seen or {}).get(name, view), recall, name)
-        for term in group:
-            for line in group[term].lines:
-                passed = recall.through(f"observations.{name}.{term}.{type(line).__name__.lower()}", line, values[term])
-                values[term] = toward(level, values[term], passed) if isinstance(line, Delay) else passed
-        k_group, noisy = jax.random.fold_in(key, i), corruption and any(term.noise for term in group.values())
-        if name in apart:
-            keys = jax.random.split(k_group, len(group)) if noisy else ()
-            for (term, value), k_term in zip(values.items(), keys, strict=False):
-                values[term] = value + group[term].noise * jax.random.uniform(k_term, value.shape, minval=-1.0, maxval=1.0)
-            out[name] = values
-            continue
-        out[name] = jnp.concatenate(list(values.values()))
-        if noisy:
-            # One draw for the group: many small ones would cost more time than the terms themselves.
-            noise = np.concatenate([np.full(values[term].shape, group[term].noise, np.float32) for term in group])
-            out[name] += noise * jax.random.uniform(k_group, noise.shape, minval=-1.0, maxval=1.0)
+        values = _late(by_name(group.terms, sensed if group.sensed else view, recall, name), group.terms, recall, name)
+        k_group = jax.random.fold_in(key, i) if group.corruption and any(term.noise for term in group.terms.values()) else None
+        out[name] = (_apart if group.apart else _joined)(values, group.terms, k_group)
     return out
+
+
+def _late(values: dict[str, Array], terms: Mapping[str, ObservationTerm], recall: Recall, group: str) -> dict[str, Array]:
+    """The values after the terms' delays and histories."""
+    level = recall.memory.get(LEVEL)
+    for name, term in terms.items():
+        for line in term.lines:
+            passed = recall.through(f"observations.{group}.{name}.{type(line).__name__.lower()}", line, values[name])
+            values[name] = toward(level, values[name], passed) if isinstance(line, Delay) else passed
+    return values
+
+
+def _apart(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: Key | None) -> dict[str, Array]:
+    """The values by name; with a key, with their noise."""
+    if key is None:
+        return values
+    keys = jax.random.split(key, len(terms))
+    return {
+        name: value + terms[name].noise * jax.random.uniform(k_term, value.shape, minval=-1.0, maxval=1.0)
+        for (name, value), k_term in zip(values.items(), keys, strict=True)
+    }
+
+
+def _joined(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: Key | None) -> Array:
+    """All values in one vector; with a key, with their noise."""
+    joined = jnp.concatenate(list(values.values()))
+    if key is None:
+        return joined
+    # One draw for the group: many small ones would cost more time than the terms themselves.
+    noise = np.concatenate([np.full(values[name].shape, term.noise, np.float32) for name, term in terms.items()])
+    return joined + noise * jax.random.uniform(key, noise.shape, minval=-1.0, maxval=1.0)
 
 
 def terminations(terms: Mapping[str, DoneTerm], view: View, recall: Recall) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

@@ -1,12 +1,8 @@
 """Towers: objects that belong at the goal, or onto one another; what the terms of ``place`` and ``stack`` have in common.
 
-``tower`` names them from the bottom up: ``("goal", "box")`` is a box at the goal, ``("blue", "red")`` the red one on the blue
-one, wherever that is. ``rise`` is from the centre of one object to that of the next one on it [m].
-
-An object *stands* while it is at its place, whoever holds it there, and those below it stand: ``within`` says how near that is,
-along the table, in height [m] and, at the goal, in angle [rad]. Rewards are sums over the objects that are to be moved, each from
-when those below it stand. What is paid for an object that is held is paid on while it stands, so nothing is lost by letting go of
-it there; for one that flies nothing is paid.
+An object *stands* while it is at its place, whoever holds it there, and those below it stand. Rewards are sums over the objects
+that are to be moved, each from when those below it stand. What is paid for an object that is held is paid on while it stands, so
+nothing is lost by letting go of it there; for one that flies nothing is paid.
 """
 
 import dataclasses
@@ -23,6 +19,38 @@ from mjx_nero.types import View
 GOAL = "goal"  # at the bottom of a tower
 Within = tuple[Positive, Positive, Positive]
 Scalar = Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where objects belong, how near is there, and how far away a hand is that holds or has left one.
+
+    Attributes:
+        tower: the objects from the bottom up: ``("goal", "box")`` is a box at the goal, ``("blue", "red")`` the red one on the
+            blue one, wherever that is.
+        rise: from the centre of an object to that of the next one on it [m].
+        within: how far from its place an object stands: along the table [m], in height [m], and at the goal in angle [rad].
+        minimal_height: an object that is held is this high [m] ...
+        grasp_radius: ... and this near to the grasp point [m] (see ``rewards.held``).
+        clearance: from an object to the grasp point of a hand that has left it [m].
+    """
+
+    tower: tuple[str, ...]
+    rise: float
+    within: Within
+    minimal_height: float
+    grasp_radius: Positive
+    clearance: NonNegative
+
+    @property
+    def steps(self) -> Iterator[tuple[str, str]]:
+        """Each object that is to be moved, after the one below it."""
+        return zip(self.tower, self.tower[1:], strict=False)
+
+    def holds(self, view: View, object: str, minimal_height: float | None = None) -> Bool[Array, ""]:
+        """Whether the object is held; with another height than ``minimal_height``."""
+        least = self.minimal_height if minimal_height is None else minimal_height
+        return held(view, minimal_height=least, grasp_radius=self.grasp_radius, object=object)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +84,11 @@ def turn_to_object(view: View, *, object: str, down: tuple[float, float, float, 
     return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), wanted))
 
 
-def _levels(view: View, tower: tuple[str, ...], rise: float, within: Within) -> Iterator[_Level]:
-    aside, height, angle = within
+def _levels(view: View, place: Place) -> Iterator[_Level]:
+    aside, height, angle = place.within
     due = jnp.ones((), bool)
-    for below, object in zip(tower, tower[1:], strict=False):
-        to = way(view, below=below, object=object, rise=rise)
+    for below, object in place.steps:
+        to = way(view, below=below, object=object, rise=place.rise)
         over = jnp.linalg.norm(to[:2]) < aside
         there = over & (jnp.abs(to[2]) < height)
         if below == GOAL:
@@ -72,24 +100,22 @@ def _levels(view: View, tower: tuple[str, ...], rise: float, within: Within) -> 
 # --- success
 
 
-def distance(view: View, *, tower: tuple[str, ...], rise: float) -> Scalar:
+def distance(view: View, *, place: Place) -> Scalar:
     """Of the object that is farthest from its place [m]."""
-    pairs = zip(tower, tower[1:], strict=False)
-    return jnp.max(jnp.stack([jnp.linalg.norm(way(view, below=below, object=object, rise=rise)) for below, object in pairs]))
+    ways = [way(view, below=below, object=object, rise=place.rise) for below, object in place.steps]
+    return jnp.max(jnp.stack([jnp.linalg.norm(to) for to in ways]))
 
 
-def built(
-    view: View, *, tower: tuple[str, ...], rise: float, within: Within, max_speed: Positive, clearance: NonNegative
-) -> Bool[Array, ""]:
+def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
     """All objects stand, are slower than ``max_speed`` [m/s], turn by less than ten of it [rad/s], and have been let go of: the
-    grasp point is at least ``clearance`` [m] from each."""
-    met = [level.stands for level in _levels(view, tower, rise, within)]
-    for name in tower:
+    grasp point is at least ``place.clearance`` from each."""
+    met = [level.stands for level in _levels(view, place)]
+    for name in place.tower:
         if name == GOAL:
             continue
         seen = view.objects[name]
         still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
-        met.append(still & (jnp.linalg.norm(view.ee_pos_w - seen.pos_w) > clearance))
+        met.append(still & (jnp.linalg.norm(view.ee_pos_w - seen.pos_w) > place.clearance))
     return jnp.all(jnp.stack(met))
 
 
@@ -100,157 +126,104 @@ def _sum(values: Iterable[Array]) -> Scalar:
     return sum(values, start=jnp.zeros(()))
 
 
-def reached(view: View, *, tower: tuple[str, ...], rise: float, within: Within, std: Positive) -> Scalar:
+def reached(view: View, *, place: Place, std: Positive) -> Scalar:
     """1 - tanh(distance from the grasp point to the object / std); 1 where it stands."""
-    near = {name: 1.0 - jnp.tanh(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / std) for name in tower[1:]}
-    levels = _levels(view, tower, rise, within)
+    near = {name: 1.0 - jnp.tanh(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / std) for name in place.tower[1:]}
+    levels = _levels(view, place)
     return _sum(level.due * jnp.where(level.stands, 1.0, near[level.object]) for level in levels)
 
 
-def _carried(view: View, level: _Level, minimal_height: float, grasp_radius: float) -> Bool[Array, ""]:
-    grasped = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=level.object)
+def _carried(view: View, level: _Level, place: Place) -> Bool[Array, ""]:
     # Over its place an object may be as low as it likes: else its last centimetre down would cost all that is paid.
-    lowered = level.over & held(view, minimal_height=-jnp.inf, grasp_radius=grasp_radius, object=level.object)
-    return level.due & (grasped | lowered | level.stands)
+    lowered = level.over & place.holds(view, level.object, minimal_height=-jnp.inf)
+    return level.due & (place.holds(view, level.object) | lowered | level.stands)
 
 
-def carried(
-    view: View, *, tower: tuple[str, ...], rise: float, within: Within, minimal_height: float, grasp_radius: Positive
-) -> Scalar:
-    """1 while the object is held (see ``rewards.held``) or stands."""
-    levels = _levels(view, tower, rise, within)
-    return _sum(_carried(view, level, minimal_height, grasp_radius) for level in levels)
+def carried(view: View, *, place: Place) -> Scalar:
+    """1 while the object is held or stands."""
+    return _sum(_carried(view, level, place) for level in _levels(view, place))
 
 
-def approached(
-    view: View,
-    *,
-    tower: tuple[str, ...],
-    rise: float,
-    within: Within,
-    minimal_height: float,
-    grasp_radius: Positive,
-    over: Positive,
-    std: Positive,
-    flat: NonNegative = 0.0,
-) -> Scalar:
+def approached(view: View, *, place: Place, over: Positive, std: Positive, flat: NonNegative = 0.0) -> Scalar:
     """1 - tanh(distance from the way to its place / std), while the object is held or stands.
 
     The way comes down a cone of 45 degrees from ``over`` above the place [m]: straight to it would be through the side of what is
     below. The distance is that along the table and that in height from the cone, together: 0 at the place alone.
 
     Args:
-        flat: so far from the middle of its place the cone ends there [m], and an object may come straight down. Without, one that
-            is a little beside its place is paid for as much height as that.
+        flat: radius of the cone's flat tip [m]; inside it only height counts. Zero: a point, so that an object a little beside
+            its place is paid for as much height as that.
     """
 
     def near(level: _Level) -> Scalar:
         aside = jnp.linalg.norm(level.way[:2])
         off = jnp.hypot(aside, level.way[2] + jnp.clip(aside - flat, 0.0, over))
-        return _carried(view, level, minimal_height, grasp_radius) * (1.0 - jnp.tanh(off / std))
+        return _carried(view, level, place) * (1.0 - jnp.tanh(off / std))
 
-    return _sum(near(level) for level in _levels(view, tower, rise, within))
+    return _sum(near(level) for level in _levels(view, place))
 
 
-def aligned(
-    view: View,
-    *,
-    tower: tuple[str, ...],
-    rise: float,
-    within: Within,
-    minimal_height: float,
-    grasp_radius: Positive,
-    std: Positive,
-) -> Scalar:
+def aligned(view: View, *, place: Place, std: Positive) -> Scalar:
     """1 - tanh(angle of the lowest object from the goal's orientation / std), while it is held or stands."""
-    level = next(_levels(view, tower, rise, within))
+    level = next(_levels(view, place))
     angle = jnp.linalg.norm(turn_to_goal(view, object=level.object))
-    return _carried(view, level, minimal_height, grasp_radius) * (1.0 - jnp.tanh(angle / std))
+    return _carried(view, level, place) * (1.0 - jnp.tanh(angle / std))
 
 
-def standing(view: View, *, tower: tuple[str, ...], rise: float, within: Within) -> Scalar:
+def standing(view: View, *, place: Place) -> Scalar:
     """1 while the object stands."""
-    return _sum(level.stands for level in _levels(view, tower, rise, within))
+    return _sum(level.stands for level in _levels(view, place))
 
 
-def _away(view: View, level: _Level, clearance: float) -> Scalar:
+def _away(view: View, level: _Level, place: Place) -> Scalar:
     """How far the grasp point is from the object, from 0 to 1; where that is on another, above or beside it.
 
     Below is not away there: down a tower a hand slides that hardly opens, to hold what is there; up it takes the object along.
     """
     off = view.ee_pos_w - view.objects[level.object].pos_w
     off = off if level.below == GOAL else off.at[2].max(0.0)
-    return jnp.minimum(jnp.linalg.norm(off) / clearance, 1.0)
+    return jnp.minimum(jnp.linalg.norm(off) / place.clearance, 1.0)
 
 
-def _let_go(
-    view: View,
-    tower: tuple[str, ...],
-    level: _Level,
-    at: Array,
-    open: tuple[float, ...],
-    hold: tuple[float, ...],
-    clearance: float,
-) -> Scalar:
+def _let_go(view: View, level: _Level, place: Place, at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
     """How far fingers that are ``at`` are opened, from 0 to 1; below the top of a tower, where they have work elsewhere, or how
     far they are away, if that is more."""
     opens, holds = jnp.array(open), jnp.array(hold)
     share = jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
-    return share if level.object == tower[-1] else jnp.maximum(share, _away(view, level, clearance))
+    return share if level.object == place.tower[-1] else jnp.maximum(share, _away(view, level, place))
 
 
-def told_to_open(
-    view: View,
-    *,
-    tower: tuple[str, ...],
-    rise: float,
-    within: Within,
-    open: tuple[float, ...],
-    hold: tuple[float, ...],
-    clearance: Positive,
-) -> Scalar:
+def told_to_open(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
     """How far the targets of the fingers are opened while the object stands, from 0 to 1: so a step to let go is paid at once.
     Below the top of a tower, or how far they are from it (see ``left``), if that is more: they have work elsewhere.
 
     Args:
         open, hold: targets of the gripper's drives, the last of all, wide open and where that begins to count [rad or m].
     """
-    levels = _levels(view, tower, rise, within)
-    return _sum(level.stands * _let_go(view, tower, level, view.ctrl, open, hold, clearance) for level in levels)
+    levels = _levels(view, place)
+    return _sum(level.stands * _let_go(view, level, place, view.ctrl, open, hold) for level in levels)
 
 
-def left(view: View, *, tower: tuple[str, ...], rise: float, within: Within, clearance: Positive) -> Scalar:
-    """How far the grasp point is from an object that stands, as a share of ``clearance`` [m], at most 1; where that is on another
-    one, above or beside it."""
-    return _sum(level.stands * _away(view, level, clearance) for level in _levels(view, tower, rise, within))
+def left(view: View, *, place: Place) -> Scalar:
+    """How far the grasp point is from an object that stands, as a share of ``place.clearance``, at most 1; where that is on
+    another one, above or beside it."""
+    return _sum(level.stands * _away(view, level, place) for level in _levels(view, place))
 
 
-def left_with_open_fingers(
-    view: View,
-    *,
-    tower: tuple[str, ...],
-    rise: float,
-    within: Within,
-    open: tuple[float, ...],
-    hold: tuple[float, ...],
-    clearance: Positive,
-) -> Scalar:
-    """As ``left``, times how far the fingers are opened, so that a hand which holds an object by its edge has not left it a
-    little; below the top of a tower as ``told_to_open``.
+def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
+    """``left`` times how far the fingers are open, so a hand that still holds the edge earns nothing; below the top of a tower as
+    ``told_to_open``.
 
     Args:
         open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
     """
 
     def gone(level: _Level) -> Scalar:
-        return _let_go(view, tower, level, view.joint_pos, open, hold, clearance) * _away(view, level, clearance)
+        return _let_go(view, level, place, view.joint_pos, open, hold) * _away(view, level, place)
 
-    return _sum(level.stands * gone(level) for level in _levels(view, tower, rise, within))
+    return _sum(level.stands * gone(level) for level in _levels(view, place))
 
 
-def completed(
-    view: View, *, tower: tuple[str, ...], rise: float, within: Within, max_speed: Positive, clearance: NonNegative
-) -> Scalar:
+def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:
     """1 while all is as it should be (see ``built``)."""
-    done = built(view, tower=tower, rise=rise, within=within, max_speed=max_speed, clearance=clearance)
-    return done.astype(jnp.float32)
+    return built(view, place=place, max_speed=max_speed).astype(jnp.float32)

@@ -173,7 +173,7 @@ def test_a_mistake_is_one_line(call, argv, message):
 @pytest.mark.parametrize(("env", "name"), [("cobotta_follow_target", "ik"), ("follow_target", "expert")])
 def test_help_lists_the_controllers_fields(call, env, name):
     code, out, _ = call("eval", "--help", "--env", env, "--robot", "cobotta_pro_900", "--controller", name)
-    assert code == 0 and "--control.position_tolerance 0.001" in out and "--env.motion.params.radius " in out
+    assert code == 0 and "--control.position_tolerance 0.001" in out and "--env.command.motion.params.radius " in out
 
 
 def test_zero_agent_stays_home_where_actions_are_targets(call, tmp_path):

@@ -173,9 +173,9 @@ def test_all_backends_know_all_pairs_of_shapes_but_a_plain_cylinders():
 
 def test_four_objects_are_one_of_each_shape_and_the_lighter_for_it():
     cfg = env_cfg("nero_clutter", "four")
-    assert cfg.targets == tuple(cfg.scene.objects) == ("box", "cylinder", "sphere", "capsule")
+    assert cfg.command.targets == tuple(cfg.scene.objects) == ("box", "cylinder", "sphere", "capsule")
     assert cfg.events["scatter"].params["count"] == (3, 4) and CFG.events["scatter"].params["count"] == (3, 6)
-    assert {name: item for name, item in CFG.scene.objects.items() if name in cfg.targets} == cfg.scene.objects
+    assert {name: item for name, item in CFG.scene.objects.items() if name in cfg.command.targets} == cfg.scene.objects
     assert cfg.sim.constraints_per_env < CFG.sim.constraints_per_env and cfg.robot == CFG.robot
 
 

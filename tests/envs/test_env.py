@@ -571,13 +571,13 @@ def test_a_linkage_starts_closed(offset):
 def test_observations_by_name(follow):
     state = follow.reset(jax.random.PRNGKey(0))
     named = follow.env.named_observations(state)
-    assert list(named) == ["state"] and list(named["state"]) == list(follow.env.cfg.observations["state"])
+    assert list(named) == ["state"] and list(named["state"]) == list(follow.env.cfg.observations["state"].terms)
     np.testing.assert_array_equal(jnp.concatenate(list(named["state"].values())), state.obs["state"])
     np.testing.assert_array_equal(named["state"]["target_orientation"], [0, 0, 1, 0])
 
 
 def test_observations_of_following(follow):
-    assert list(follow.env.cfg.observations["state"]) == [
+    assert list(follow.env.cfg.observations["state"].terms) == [
         "joint_positions",
         "end_effector_position",
         "end_effector_orientation",
@@ -611,7 +611,7 @@ def test_the_goal_of_a_long_episode_stays():
 
 
 def test_observations_of_pick_and_place(place):
-    assert list(place.env.cfg.observations["state"]) == [
+    assert list(place.env.cfg.observations["state"].terms) == [
         "joint_positions",
         "end_effector_position",
         "end_effector_orientation",

@@ -14,7 +14,7 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.task import joint_actions
 from mjx_nero.learn import checkpoint
 from mjx_nero.mdp import actions, events, observations, rewards
-from mjx_nero.mdp.terms import ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, cube
 
@@ -37,9 +37,10 @@ def two():
         },
         observations={
             **CFG.observations,
-            "parts": {"image": image, "blue": ObservationTerm(observations.object_position, params={"object": "blue"})},
+            "parts": ObservationGroup(
+                {"image": image, "blue": ObservationTerm(observations.object_position, params={"object": "blue"})}, apart=True
+            ),
         },
-        apart=("parts",),
     )
 
 
@@ -119,7 +120,7 @@ def test_shapes_start_where_they_touch_the_table(shape, size, quat, height):
         ({"scene.objects": {"cube": cube(0.03, 0.03), "link4": ObjectCfg()}}, "scene.objects.link4 needs another name"),
         ({"scene.objects": {}}, "observations.state.ee_to_object.params.object is 'cube', and the scene's objects are: none"),
         ({"events.reset_object_position.params.object": "ball"}, "events.reset_object_position.params.object is 'ball'"),
-        ({"apart": ("picture",)}, "apart names picture: not one of state, privileged_state"),
+        ({"command.targets": ("picture",)}, "command.targets names picture: not one of cube"),
     ],
 )
 def test_impossible_objects_are_refused_in_one_line(changes, message):
@@ -185,7 +186,7 @@ def test_observations_come_late_and_begin_anew_with_the_episode():
         "times": ObservationTerm(lambda view: view.time[None], history=3),
         "both": ObservationTerm(lambda view: view.time[None], delay=(1, 1), history=2),
     }
-    env = make("nero_lift", impl="native", observations={"state": state}, corruption=False)
+    env = make("nero_lift", impl="native", observations={"state": ObservationGroup(state, corruption=False)})
     train = wrappers.for_training(env)
     step, now = jax.jit(train.step), jax.jit(train.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
     carry = now.info["carry"]
@@ -219,7 +220,7 @@ def test_an_action_whose_reward_overflows_is_a_sick_one(batch):
 def test_products_are_exact_whatever_the_program_has_set():
     """Matrix products in the environment's program ask for full precision, though the program's default is less."""
     turn = ObservationTerm(lambda view: jnp.eye(3) @ view.ee_pos_w)
-    env = make("nero_lift", impl="native", observations={"state": {"turned": turn}})
+    env = make("nero_lift", impl="native", observations={"state": ObservationGroup({"turned": turn})})
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     with jax.default_matmul_precision("default"):
         for program in (

@@ -36,11 +36,11 @@ def test_the_recipes_numbers():
     weights = {name: term.weight for name, term in cfg.rewards.items()}
     assert weights == {"position_tracking": -0.2, "position_tracking_fine": 0.1, "action_rate": -1e-4, "joint_vel": -1e-4}
     assert cfg.rewards["position_tracking_fine"].params == {"std": 0.1}
-    assert {name: (term.params["to"], term.params["num_steps"]) for name, term in cfg.curriculum.items()} == {
+    assert {name: (term.params["to"], term.params["num_steps"]) for name, term in cfg.curriculum.weights.items()} == {
         "action_rate": (-5e-3, 4500),
         "joint_vel": (-1e-3, 4500),
     }
-    noise = {name: term.noise for name, term in cfg.observations["state"].items()}
+    noise = {name: term.noise for name, term in cfg.observations["state"].terms.items()}
     assert noise == {"joint_pos": 0.01, "joint_vel": 0.01, "pose_command": 0.0, "actions": 0.0}
     assert cfg.events["reset_robot_joints"].params == {"low": 0.5, "high": 1.5}
     assert env_cfg("nero_reach", "isaac").rewards["orientation_tracking"].weight == -0.1
@@ -107,7 +107,7 @@ def test_a_new_command_every_five_seconds(env, finish):
 
 def test_a_position_alone_leaves_orientation_out():
     cfg = env_cfg("so101_reach")
-    assert "pose_tracking" not in cfg.rewards and "ee_turn_to_goal" not in cfg.observations["state"]
+    assert "pose_tracking" not in cfg.rewards and "ee_turn_to_goal" not in cfg.observations["state"].terms
     assert cfg.success.condition.params == {"threshold": 0.02}
 
 

@@ -80,6 +80,19 @@ def test_a_shelf_is_below_the_goal_and_shut_towards_the_start():
     assert (upright[:, 2] > board[:, 2]).all()
 
 
+def test_every_length_of_an_obstacle_is_drawn_by_itself():
+    """No two of what differs from draw to draw go together, but what follows from one another."""
+    local, size = drawn("shelf")
+    board, top, thick, wide = local[:, 0, 2], size[:, 1, 2], size[:, 1, 0], size[:, 1, 1]
+    posts, edges = drawn("posts")
+    share = (posts[:, 1, 1] - posts[:, 0, 1]) / 2 / 0.25  # of the widths, which posts do not show
+    over = edges[:, 0, 2] - line(posts[:, 0, 0])
+    for name, each in {"shelf": (board, top, thick, wide), "posts": (share, over, edges[:, 0, 0], posts[:, 0, 0])}.items():
+        together = np.corrcoef(np.stack(each)) - np.eye(len(each))
+        assert np.abs(together).max() < 0.15, (name, together)  # of 500 independent pairs, 0.045 is one deviation
+    assert all(each.std() > 0.005 for each in (board, top, over))
+
+
 def test_nothing_is_higher_than_the_top():
     for kind in ("wall", "bar", "posts"):
         local, size = drawn(kind, top=0.22)

@@ -1,5 +1,6 @@
 """Terms of towers, and the events that lay their objects out, on hand-made views, against numbers worked out by hand."""
 
+import dataclasses
 import math
 
 import jax
@@ -48,6 +49,16 @@ def view(
 
 
 WITHIN = (0.02, 0.005, 0.25)
+
+
+def placed(params: dict) -> dict:
+    """The parameters of a term, those of its place in one."""
+    fields = {field.name for field in dataclasses.fields(towers.Place)}
+    given = {"minimal_height": 0.0, "grasp_radius": 1.0, "clearance": 0.05, "within": WITHIN}
+    place = towers.Place(**{**given, **{name: value for name, value in params.items() if name in fields}})
+    return {"place": place, **{name: value for name, value in params.items() if name not in fields}}
+
+
 STACK = {"tower": ("blue", "red"), "rise": 0.04, "within": WITHIN}
 THREE = {**STACK, "tower": ("blue", "red", "top")}
 PLACE = {**STACK, "tower": ("goal", "red")}
@@ -150,7 +161,7 @@ ASIDE = (0.4, 0.12, 0.06)
     ],
 )
 def test_rewards_and_distance(func, params, at, value):
-    got = func(at, **params)
+    got = func(at, **placed(params))
     assert got.shape == () and got.dtype == jnp.float32
     assert float(got) == pytest.approx(value, abs=2e-5)
 
@@ -177,7 +188,7 @@ BUILT = {**STACK, "max_speed": 0.005, "clearance": 0.05}
     ],
 )
 def test_built(params, at, met):
-    assert bool(towers.built(at, **params)) is met
+    assert bool(towers.built(at, **placed(params))) is met
 
 
 def test_ways_and_turns():
@@ -215,9 +226,9 @@ def test_rewards_pay_more_for_every_phase_and_nothing_for_shortcuts():
         view(at, hand=(0.4, 0.1, 0.09)),
         view(at),
     ]
-    paid = [sum(float(func(phase, **params)) for func, params in terms) for phase in phases]
+    paid = [sum(float(func(phase, **placed(params))) for func, params in terms) for phase in phases]
     assert all(np.diff(paid) > 0.05), paid
-    thrown = sum(float(func(view(over), **params)) for func, params in terms)
+    thrown = sum(float(func(view(over), **placed(params))) for func, params in terms)
     assert thrown < paid[1]
 
 

@@ -1,5 +1,7 @@
 """The GPU's solver and physics step against MuJoCo's C library. Without a GPU Warp runs the same source on the CPU, slowly."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -120,6 +122,39 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
     after, _ = jax.vmap(jax.vmap(warp.step))(*twice)
     np.testing.assert_allclose(after.qpos.reshape(n, -1), ours.qpos, rtol=0, atol=1e-6)
     assert jnp.isfinite(after.qvel).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nero_lift", "nero_lift_obstacles"])
+def test_the_engines_own_solver_steps_alike(name):
+    """``sim.solver`` chooses who solves, not what comes of it: objects that lie, are let fall or thrown, arms that lean on boxes.
+
+    On the GPU where there is one, else on the CPU.
+    """
+    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+
+    n = 8
+    env = make(name, impl="native", num_envs=n)
+    step = jax.jit(jax.vmap(env.step))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), n))
+    fields = tuple(state.pipeline_state.fields)
+    solvers = ("newton", "mujoco_warp")
+    cfgs = {solver: dataclasses.replace(env.cfg.sim, solver=solver, iterations=50) for solver in solvers}
+    steps = {solver: jax.jit(jax.vmap(WarpPhysics(env.physics_model, cfg, fields).step)) for solver, cfg in cfgs.items()}
+    moved = 0.0
+    for t, key in enumerate(jax.random.split(jax.random.PRNGKey(1), 40)):
+        action = jax.random.normal(key, (n, env.action_size))
+        if t % 13 == 12:
+            sim, ctrl = state.pipeline_state, jax.vmap(env.targets)(state, action)
+            (ours, lost), (theirs, _) = (steps[solver](sim, ctrl) for solver in solvers)
+            assert not lost.any()
+            np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=0, atol=2e-5)
+            np.testing.assert_allclose(ours.qvel, theirs.qvel, rtol=0, atol=2e-3)
+            for reading, value in ours.readings.items():
+                np.testing.assert_allclose(value, theirs.readings[reading], rtol=1e-2, atol=0.05)
+            moved = max(moved, float(jnp.abs(ours.qpos - sim.qpos).max()))
+        state = step(state, action)
+    assert moved > 1e-2
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def test_help_is_complete(call):
 
 
 def test_shared_flags_read_alike_in_every_command(call):
-    for program in (["train"], ["eval"], ["benchmark"], ["mjx_nero", "view"], ["mjx_nero", "gripper-demo"]):
+    for program in (["train"], ["eval"], ["benchmark"], ["mjx_nero", "view"]):
         code, out, _ = call(*program, "--help")
         said = " ".join(out.split())
         assert code == 0 and "--load FILE_OR_MODULE Python code that registers environments" in said

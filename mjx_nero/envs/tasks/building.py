@@ -54,16 +54,6 @@ class Tower:
     lifted: float = LIFTED
 
     @property
-    def place(self) -> dict[str, Any]:
-        """Where objects belong."""
-        return {"tower": self.objects, "rise": self.edge}
-
-    @property
-    def near(self) -> dict[str, Any]:
-        """... and how near is there."""
-        return {**self.place, "within": (self.aside, FLAT, self.angle)}
-
-    @property
     def there(self) -> Regions:
         """Where the robot works."""
         return regions.of(self.robot)
@@ -74,19 +64,16 @@ class Tower:
         return {"minimal_height": self.edge / 2 + self.lifted, "grasp_radius": regions.near(self.there)}
 
     @property
-    def clearance(self) -> float:
-        """From an object to the grasp point of a hand that has left it [m]."""
-        return round(self.edge / 2 + self.robot.pad[0] / 2 + AWAY, 4)
-
-    @property
-    def leave(self) -> dict[str, Any]:
-        """... and how far away a hand is that has left it."""
-        return {**self.near, "clearance": self.clearance}
+    def place(self) -> dict[str, towers.Place]:
+        """Where objects belong, and how near is there: what all terms of a tower take."""
+        away = round(self.edge / 2 + self.robot.pad[0] / 2 + AWAY, 4)
+        within = (self.aside, FLAT, self.angle)
+        return {"place": towers.Place(tower=self.objects, rise=self.edge, within=within, clearance=away, **self.held)}
 
     @property
     def done(self) -> dict[str, Any]:
         """All stand, at rest, and the hand is away."""
-        return {**self.leave, "max_speed": STILL}
+        return {**self.place, "max_speed": STILL}
 
     @property
     def builder(self) -> RobotCfg:
@@ -121,20 +108,20 @@ class Tower:
         The fingers' targets are paid for, from shut on, and a gripper that is told too firmly to hold costs: else nothing that
         noise tries for a step at a time shows that letting go pays.
         """
-        near, carried = self.near, {**self.near, **self.held}
-        way = {**carried, "over": round(0.75 * self.edge, 4), "flat": self.aside}
+        place = self.place
+        way = {**place, "over": round(0.75 * self.edge, 4), "flat": self.aside}
         fingers = {"open": self.robot.gripper.open, "hold": self.robot.gripper.close}
-        turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **carried})}
+        turned = {"aligning": RewardTerm(towers.aligned, weight=10.0, params={"std": 0.3, **place})}
         return {
-            "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **near}),
-            "holding_object": RewardTerm(towers.carried, weight=5.0, params=carried),
+            "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **place}),
+            "holding_object": RewardTerm(towers.carried, weight=5.0, params=place),
             "approaching": RewardTerm(towers.approached, weight=10.0, params={"std": 0.3, **way}),
             "approaching_near": RewardTerm(towers.approached, weight=10.0, params={"std": 0.1, **way}),
             "approaching_fine": RewardTerm(towers.approached, weight=15.0, params={"std": 0.03, **way}),
             **(turned if self.angle < math.pi else {}),
-            "standing": RewardTerm(towers.standing, weight=10.0, params=near),
-            "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**self.leave, **fingers}),
-            "leaving": RewardTerm(towers.left, weight=10.0, params=self.leave),
+            "standing": RewardTerm(towers.standing, weight=10.0, params=place),
+            "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**place, **fingers}),
+            "leaving": RewardTerm(towers.left, weight=10.0, params=place),
             "completed": RewardTerm(towers.completed, weight=15.0, params=self.done),
             "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
@@ -167,7 +154,7 @@ class Tower:
             raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
         # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
         below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
-        leave = max(there.travel, top + max(self.edge, below + self.clearance + LIFTED))
+        leave = max(there.travel, top + max(self.edge, below + self.place["place"].clearance + LIFTED))
         quick, late = list(QUICK), round(self.slow / (SimCfg().dt * SimCfg().decimation))  # control steps
         for phase in (CLOSES, OPENS):
             quick[phase] = 1 / (round(1 / quick[phase]) + late)

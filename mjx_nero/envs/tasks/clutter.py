@@ -12,7 +12,16 @@ import numpy as np
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import (
+    ONCE,
+    CommandTerm,
+    DoneTerm,
+    ObservationGroup,
+    ObservationTerm,
+    RewardTerm,
+    Term,
+    privileged,
+)
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -166,19 +175,22 @@ def _clutter(setup: Setup) -> EnvCfg:
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5),
         controllers={"pick_up": {"object": TARGET, **_fits(scene), **setup.grasp}},
-        targets=names,
-        command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", setup.there.hold, strict=True)), resample_s=ONCE),
+        command=CommandTerm(
+            commands.uniform_position,
+            params=dict(zip("xyz", setup.there.hold, strict=True)),
+            resample_s=ONCE,
+            targets=names,
+        ),
         success=SuccessCfg(
             condition=Term(success.object_at_goal, params={"threshold": 0.02, **commanded}),
             distance=Term(success.object_distance, params=commanded),
         ),
         metrics=metrics.grasping(**held),
         observations={
-            "state": state,
-            "privileged_state": {
-                **exact(state),
-                "object_velocity": ObservationTerm(observations.object_velocity, params=commanded),
-            },
+            "state": ObservationGroup(state),
+            "privileged_state": privileged(
+                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=commanded)}
+            ),
         },
         events={
             "scatter": Term(

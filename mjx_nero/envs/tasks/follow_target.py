@@ -6,7 +6,7 @@ import functools
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.envs.tasks.reach import BUDGET
 from mjx_nero.mdp import commands, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -32,21 +32,27 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         episode_length_s=12.0,
         actions=drive_targets(),
         controllers={"rmpflow": {}, "ik": {}},
-        command=CommandTerm(commands.pose, params={"x": x, "y": y, "z": z, "quat": robot.down}, resample_s=ONCE),
-        motion=Term(commands.circle, params={"radius": setup.radius, "frequency": 0.25}),
+        command=CommandTerm(
+            commands.pose,
+            params={"x": x, "y": y, "z": z, "quat": robot.down},
+            resample_s=ONCE,
+            motion=Term(commands.circle, params={"radius": setup.radius, "frequency": 0.25}),
+        ),
         success=SuccessCfg(
             condition=Term(success.ee_at_goal, params={"threshold": 0.02}),
             distance=Term(success.ee_distance),
             follows=True,
         ),
         observations={
-            "state": {
-                "joint_positions": ObservationTerm(observations.joint_pos),
-                "end_effector_position": ObservationTerm(observations.ee_position),
-                "end_effector_orientation": ObservationTerm(observations.ee_orientation),
-                "target_position": ObservationTerm(observations.goal_position),
-                "target_orientation": ObservationTerm(observations.goal_orientation),
-            },
+            "state": ObservationGroup(
+                {
+                    "joint_positions": ObservationTerm(observations.joint_pos),
+                    "end_effector_position": ObservationTerm(observations.ee_position),
+                    "end_effector_orientation": ObservationTerm(observations.ee_orientation),
+                    "target_position": ObservationTerm(observations.goal_position),
+                    "target_orientation": ObservationTerm(observations.goal_orientation),
+                }
+            ),
         },
         events={},
         budget=BUDGET,
@@ -55,16 +61,16 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "position_tracking_fine": RewardTerm(rewards.ee_goal_distance, weight=1.0, params={"std": 0.02}),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={},
         terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
     )
 
 
 def static(robot: RobotCfg, setup: Setup) -> EnvCfg:
     """The target stands still; success is to stay within 5 mm of it."""
+    moving = default(robot, setup)
     return dataclasses.replace(
-        default(robot, setup),
-        motion=None,
+        moving,
+        command=dataclasses.replace(moving.command, motion=None),
         success=SuccessCfg(
             condition=Term(success.ee_at_goal, params={"threshold": 0.005}),
             distance=Term(success.ee_distance),

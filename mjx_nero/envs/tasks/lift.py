@@ -4,10 +4,18 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import CALM, EnvCfg, Presets, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import (
+    CommandTerm,
+    DoneTerm,
+    ObservationGroup,
+    ObservationTerm,
+    RewardTerm,
+    Term,
+    privileged,
+)
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -56,13 +64,15 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
             resample_s=5.0,
         ),
         observations={
-            "state": {
-                "joint_pos": ObservationTerm(observations.joint_pos_rel),
-                "joint_vel": ObservationTerm(observations.joint_vel_rel),
-                "object_position": ObservationTerm(observations.object_position),
-                "target_object_position": ObservationTerm(observations.command),
-                "actions": ObservationTerm(observations.last_action),
-            },
+            "state": ObservationGroup(
+                {
+                    "joint_pos": ObservationTerm(observations.joint_pos_rel),
+                    "joint_vel": ObservationTerm(observations.joint_vel_rel),
+                    "object_position": ObservationTerm(observations.object_position),
+                    "target_object_position": ObservationTerm(observations.command),
+                    "actions": ObservationTerm(observations.last_action),
+                }
+            ),
         },
         events={
             "reset_object_position": Term(
@@ -80,10 +90,12 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={
-            "action_rate": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-            "joint_vel": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-        },
+        curriculum=CurriculumCfg(
+            weights={
+                "action_rate": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
+                "joint_vel": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
+            }
+        ),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
@@ -113,12 +125,14 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         recipe,
         actions=velocity_actions(hysteresis=0.5),
         observations={
-            "state": state,
-            "privileged_state": {
-                **exact(state),
-                "object_velocity": ObservationTerm(observations.object_velocity),
-                "object_orientation": ObservationTerm(observations.object_orientation),
-            },
+            "state": ObservationGroup(state),
+            "privileged_state": privileged(
+                state,
+                {
+                    "object_velocity": ObservationTerm(observations.object_velocity),
+                    "object_orientation": ObservationTerm(observations.object_orientation),
+                },
+            ),
         },
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
@@ -130,7 +144,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={},
+        curriculum=CurriculumCfg(),
         training=CALM,
     )
 

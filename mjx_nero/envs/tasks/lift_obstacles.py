@@ -6,10 +6,10 @@ import functools
 
 from mjx_nero.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, SuccessCfg, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import curriculum, metrics, rewards, success
-from mjx_nero.mdp.terms import ONCE, CommandTerm, MetricTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, MetricTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -55,11 +55,14 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
         training=CALM,
         budget=Budget(steps=170_000_000),
-        command=CommandTerm(plain.command.func, params=plain.command.params, resample_s=ONCE),
+        command=dataclasses.replace(plain.command, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),
         metrics={**plain.metrics, "touched": MetricTerm(metrics.Touched)},
-        observations={name: {**group, **reach_obstacles.seen()} for name, group in plain.observations.items()},
+        observations={
+            name: dataclasses.replace(group, terms={**group.terms, **reach_obstacles.seen()})
+            for name, group in plain.observations.items()
+        },
         events={**plain.events, **reach_obstacles.aside(robot, ways)},
         rewards={
             **plain.rewards,
@@ -70,8 +73,10 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         },
         # Until an environment succeeds a touch costs it a tenth: ten times what a hand at the cube earns would teach it
         # little but to keep away.
-        curriculum={"touching": Term(curriculum.level_weight, params={"start": -1.0})},
-        widening=Term(curriculum.BySuccess, params={"up": 0.5, "down": 0.1}),
+        curriculum=CurriculumCfg(
+            weights={"touching": Term(curriculum.level_weight, params={"start": -1.0})},
+            levels=Term(curriculum.BySuccess, params={"up": 0.5, "down": 0.1}),
+        ),
     )
 
 

@@ -6,7 +6,7 @@ import functools
 from mjx_nero.bounds import Range
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -45,14 +45,16 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
         ),
         metrics=metrics.grasping(**held),
         observations={
-            "state": {
-                "joint_positions": ObservationTerm(observations.joint_pos),
-                "end_effector_position": ObservationTerm(observations.ee_position),
-                "end_effector_orientation": ObservationTerm(observations.ee_orientation),
-                "cube_position": ObservationTerm(observations.object_position),
-                "cube_orientation": ObservationTerm(observations.object_orientation),
-                "cube_target_position": ObservationTerm(observations.goal_position),
-            },
+            "state": ObservationGroup(
+                {
+                    "joint_positions": ObservationTerm(observations.joint_pos),
+                    "end_effector_position": ObservationTerm(observations.ee_position),
+                    "end_effector_orientation": ObservationTerm(observations.ee_orientation),
+                    "cube_position": ObservationTerm(observations.object_position),
+                    "cube_orientation": ObservationTerm(observations.object_orientation),
+                    "cube_target_position": ObservationTerm(observations.goal_position),
+                }
+            ),
         },
         events={
             "reset_object_position": Term(
@@ -65,7 +67,6 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "goal_tracking_fine": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.05}),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={},
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_off_table": DoneTerm(

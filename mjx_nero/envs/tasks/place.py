@@ -7,7 +7,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import QUIET, Budget, EnvCfg, Presets, joint_actions
 from mjx_nero.envs.tasks.building import Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, exact
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -61,7 +61,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             ),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
-        observations={"state": state, "privileged_state": {**exact(state), **seen}},
+        observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards=tower.rewards(),
         success=tower.success(),
         metrics=tower.metrics(),

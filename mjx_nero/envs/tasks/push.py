@@ -6,7 +6,7 @@ import math
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -63,8 +63,10 @@ def default(robot: RobotCfg) -> EnvCfg:
             distance=Term(success.object_distance, params=object),
         ),
         observations={
-            "state": state,
-            "privileged_state": {**exact(state), "object_velocity": ObservationTerm(observations.object_velocity, params=object)},
+            "state": ObservationGroup(state),
+            "privileged_state": privileged(
+                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=object)}
+            ),
         },
         events={
             "reset_object_position": Term(events.object_position_uniform, params={**start, **object}),

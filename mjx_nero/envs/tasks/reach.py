@@ -4,10 +4,10 @@ import dataclasses
 import functools
 
 from mjx_nero.bounds import Range
-from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -82,12 +82,14 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
             follows=True,
         ),
         observations={
-            "state": {
-                "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-                "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-                "pose_command": ObservationTerm(observations.pose_command),
-                "actions": ObservationTerm(observations.last_action),
-            },
+            "state": ObservationGroup(
+                {
+                    "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+                    "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
+                    "pose_command": ObservationTerm(observations.pose_command),
+                    "actions": ObservationTerm(observations.last_action),
+                }
+            ),
         },
         events={"reset_robot_joints": Term(events.joints_by_scale, params={"low": setup.start[0], "high": setup.start[1]})},
         rewards={
@@ -97,10 +99,12 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum={
-            "action_rate": Term(curriculum.step_weight, params={"to": -5e-3, "num_steps": 4500}),
-            "joint_vel": Term(curriculum.step_weight, params={"to": -1e-3, "num_steps": 4500}),
-        },
+        curriculum=CurriculumCfg(
+            weights={
+                "action_rate": Term(curriculum.step_weight, params={"to": -5e-3, "num_steps": 4500}),
+                "joint_vel": Term(curriculum.step_weight, params={"to": -1e-3, "num_steps": 4500}),
+            }
+        ),
         terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
         training=RUNNER,
         budget=BUDGET,
@@ -112,7 +116,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     recipe = isaac(robot, setup)
     turned = setup.orientation is not None
     state = {
-        **recipe.observations["state"],
+        **recipe.observations["state"].terms,
         "ee_to_goal": ObservationTerm(observations.ee_to_goal),
         **({"ee_turn_to_goal": ObservationTerm(observations.ee_turn_to_goal)} if turned else {}),
         "target_error": ObservationTerm(observations.target_error),
@@ -123,7 +127,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     return dataclasses.replace(
         recipe,
         actions=velocity_actions(gripper=False),
-        observations={"state": state},
+        observations={"state": ObservationGroup(state)},
         rewards={**recipe.rewards, **fine},
         training=CALM,
     )

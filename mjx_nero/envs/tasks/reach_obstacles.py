@@ -9,7 +9,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.envs.tasks.reach import BUDGET
 from mjx_nero.mdp import commands, events, metrics, observations, obstacles, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObstacleCfg, SceneCfg
@@ -111,7 +111,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
             follows=True,
         ),
         metrics={"touched": MetricTerm(metrics.Touched)},
-        observations={"state": state},
+        observations={"state": ObservationGroup(state)},
         events=aside(robot, setup),
         rewards={
             "position_tracking": RewardTerm(rewards.ee_goal_distance, weight=0.2, params={"std": 0.3}),

@@ -9,11 +9,11 @@ import dataclasses
 
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import actions, curriculum, pushes, randomization, sensors
-from mjx_nero.mdp.terms import ObservationTerm, Term
+from mjx_nero.mdp.terms import ObservationGroup, Term
 from mjx_nero.sim import grasp, robot_file
 from mjx_nero.sim.robot import RobotCfg
 
-_STEPS = 200_000_000  # of a lift on a GPU: the widening takes some 50 M of them
+_STEPS = 200_000_000  # of a lift on a GPU: the curriculum takes some 50 M of them
 
 
 def randomized(cfg: EnvCfg) -> EnvCfg:
@@ -26,7 +26,7 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
     return dataclasses.replace(
         cfg,
         actions={**late, **first, **noise, **{n: t for n, t in cfg.actions.items() if n == "speed_limit"}},
-        observations={name: _late(group) if name in cfg.sensed else group for name, group in cfg.observations.items()},
+        observations={name: _late(group) if group.sensed else group for name, group in cfg.observations.items()},
         randomization={
             **cfg.randomization,
             **_arm(cfg.robot, bool(objects)),
@@ -34,18 +34,16 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
         },
         sensors={**cfg.sensors, "encoders": Term(sensors.Encoders), **_eyes(objects)},
         pushes={**cfg.pushes, **pushed},
-        widening=Term(curriculum.BySuccess),
+        curriculum=dataclasses.replace(cfg.curriculum, levels=Term(curriculum.BySuccess)),
         budget=dataclasses.replace(cfg.budget, steps=_STEPS if objects else _STEPS // 2),
     )
 
 
-def _late(group):
+def _late(group: ObservationGroup) -> ObservationGroup:
     """What the arm's bus tells comes up to a step late."""
-    told = ("joint_pos", "joint_vel")
-    return {
-        name: dataclasses.replace(term, delay=(0, 1), hold=0.9) if name in told and isinstance(term, ObservationTerm) else term
-        for name, term in group.items()
-    }
+    told = {name: group.terms[name] for name in ("joint_pos", "joint_vel") if name in group.terms}
+    late = {name: dataclasses.replace(term, delay=(0, 1), hold=0.9) for name, term in told.items()}
+    return dataclasses.replace(group, terms={**group.terms, **late})
 
 
 def _arm(robot: RobotCfg, grips: bool) -> dict[str, Term]:

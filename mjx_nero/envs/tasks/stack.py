@@ -10,7 +10,7 @@ from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, velocity_actions
 from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.actions import ContinuousGripper
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, exact
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -39,7 +39,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))
     # Leaving is paid for as far as the fingers have let go: from where they hold a cube, half open already if it is wide.
     fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
-    leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.leave, **fingers})
+    leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.place, **fingers})
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
         "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
@@ -70,7 +70,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
                 params={"objects": tuple(objects), "x": there.cube[0], "y": there.cube[1], "apart": apart},
             ),
         },
-        observations={"state": state, "privileged_state": {**exact(state), **seen}},
+        observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards={**tower.rewards(), "leaving": leaving},
         success=tower.success(),
         metrics=tower.metrics(),

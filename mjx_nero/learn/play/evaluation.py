@@ -119,7 +119,7 @@ def play(cfg: EvalCfg) -> Played:
     Raises:
         UserError: unknown names or fields, a policy that does not fit.
     """
-    env_cfg = dataclasses.replace(registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot), corruption=False)
+    env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
     env_cfg = config.override(env_cfg, cfg.env_fields)
     name = _controller_name(cfg, env_cfg)
     env_cfg = for_controllers(env_cfg) if name else env_cfg

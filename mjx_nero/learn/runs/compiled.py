@@ -47,7 +47,7 @@ class Evaluator:
 
     def __init__(self, run: RunCfg, learner: Learner):
         impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
-        env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl=impl, num_envs=run.eval_episodes)
+        env = ManipulationEnv(run.env.uncorrupted(), impl=impl, num_envs=run.eval_episodes)
         self._seed, self._policy = run.seed, learner.policy
         self._runner = rollout.runner(env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
 

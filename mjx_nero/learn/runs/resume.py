@@ -89,8 +89,9 @@ def same_run(
     if "num_envs" in flags:
         refuse("num-envs", run.num_envs, asked.num_envs)
     for prefix, own in (("env", run.env), (run.learner, run.hyperparameters)):
-        changed = config.flatten(config.override(own, dotted.get(prefix, {})))
-        for name in dotted.get(prefix, {}):
+        fields = config.current(own, dotted.get(prefix, {}))
+        changed = config.flatten(config.override(own, fields))
+        for name in fields:
             if name != "num_timesteps":
                 refuse(f"{prefix}.{name}", config.flatten(own)[name], changed[name])
     changes: dict[str, Any] = {name: getattr(asked, name) for name in (*_FREE, "track") if name in flags}
@@ -165,7 +166,7 @@ def _outside(asked: Asked) -> Iterator[str]:
 
 def _as_stored(cfg: Any, stored: Any) -> Any:
     """The config with the numbers that a run was begun with, where this version has others; not which files it reads."""
-    was = config.flatten(stored)
+    was = config.current(cfg, config.flatten(stored))
     now = config.flatten(config.to_dict(cfg))
     own = [name for name in config.flatten(cfg) if name in was and name not in _PATHS]
     return config.override(cfg, {name: was[name] for name in own if was[name] != now.get(name)})

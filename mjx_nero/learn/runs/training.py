@@ -149,7 +149,7 @@ def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
         run: its config.
     """
     screen = console.screen(stderr=True)
-    env = ManipulationEnv(dataclasses.replace(run.env, corruption=False), impl="native")
+    env = ManipulationEnv(run.env.uncorrupted(), impl="native")
     trained = policy.load(folder / "policy.safetensors")
     act = rollout.runner(env, lambda params, obs, _: trained.act(obs), video.episodes, record=video.episodes)
     try:

@@ -163,7 +163,8 @@ class WarpPhysics:
         drawn = self._world_fields(model, n)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
-        solve, (strongest, sense) = newton.make(model, data), self._sense(model, data)
+        solve = newton.make(model, data) if cfg.solver == "newton" else functools.partial(mujoco_warp.solve, model, data)
+        strongest, sense = self._sense(model, data)
 
         def run():
             data.overflow.zero_()

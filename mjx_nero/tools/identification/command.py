@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 from mjx_nero import cli, config, console, files
 from mjx_nero.envs import registry
-from mjx_nero.tools.identification import log as logs
-from mjx_nero.tools.identification.fit import identify
-from mjx_nero.tools.identification.plant import Plant
+from mjx_nero.identify import log as logs
+from mjx_nero.identify.fit import identify
+from mjx_nero.identify.plant import Plant
+from mjx_nero.identify.simulate import RecordCfg, record
 from mjx_nero.tools.identification.report import save, save_plot, table
-from mjx_nero.tools.identification.simulate import RecordCfg, record
 
 _DT = 0.005
 

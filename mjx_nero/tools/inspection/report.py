@@ -289,7 +289,7 @@ def _task(name: str, preset: str | None, cfg: EnvCfg) -> Task:
         if cfg.command.resample_s < cfg.episode_length_s
         else f"{_call(cfg.command)}, once an episode",
         # In the config's order: what JAX returns is sorted.
-        observations={g: {term: sizes[g][term].size for term in group} for g, group in cfg.observations.items()},
+        observations={g: {term: sizes[g][term].size for term in group.terms} for g, group in cfg.observations.items()},
         rewards={term: reward.weight for term, reward in cfg.rewards.items()},
         terminations={term: _call(done) + (", a time-out" if done.time_out else "") for term, done in cfg.terminations.items()},
         events={term: _call(event) for term, event in cfg.events.items()},

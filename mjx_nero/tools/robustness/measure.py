@@ -36,7 +36,7 @@ class Bench:
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
         seen = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._objects}
         wanted = varied(cfg).randomization
-        cfg = dataclasses.replace(cfg, corruption=False, actions={**late, **own}, sensors={**cfg.sensors, **seen})
+        cfg = dataclasses.replace(cfg.uncorrupted(), actions={**late, **own}, sensors={**cfg.sensors, **seen})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
         # All fields that some setting draws, so that one program plays them all.
         names = Randomization(self.env.physics_model, wanted).names

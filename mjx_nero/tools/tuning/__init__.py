@@ -4,12 +4,12 @@ In MuJoCo's C library, without contacts and without a limit on the targets' spee
 says how gains are chosen, from the ``load`` that each drive has to move; ``response`` shows what they do with it.
 """
 
+from mjx_nero.identify.load import Load, loads
+from mjx_nero.identify.model import drives_model
+from mjx_nero.identify.response import Response, respond, steps
 from mjx_nero.tools.tuning.command import main
-from mjx_nero.tools.tuning.load import Load, loads
-from mjx_nero.tools.tuning.model import drives_model
 from mjx_nero.tools.tuning.proposal import Tuning, gains, propose, tune
 from mjx_nero.tools.tuning.report import plot, table
-from mjx_nero.tools.tuning.response import Response, respond, steps
 
 __all__ = [
     "Load",

@@ -23,12 +23,12 @@ import math
 import numpy as np
 
 from mjx_nero.errors import UserError
+from mjx_nero.identify.load import Load, loads
+from mjx_nero.identify.model import drives_model
+from mjx_nero.identify.response import Response, respond, steps
 from mjx_nero.sim.gains import critical_damping
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SimCfg
-from mjx_nero.tools.tuning.load import Load, loads
-from mjx_nero.tools.tuning.model import drives_model
-from mjx_nero.tools.tuning.response import Response, respond, steps
 
 _RATIO = 0.8  # damping ratio at the heaviest pose that counts
 _RESERVE = 0.99  # of the effort, for the step: the limit itself is never met

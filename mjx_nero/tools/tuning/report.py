@@ -7,8 +7,8 @@ import yaml
 
 from mjx_nero import files
 from mjx_nero.console import Table
+from mjx_nero.identify.response import SECONDS
 from mjx_nero.tools.tuning.proposal import Tuning, gains
-from mjx_nero.tools.tuning.response import SECONDS
 
 
 def table(tuning: Tuning) -> tuple[Table, Table]:

@@ -1,6 +1,5 @@
 """The command line of ``view``, and what it starts."""
 
-import dataclasses
 import functools
 import pathlib
 import threading
@@ -153,9 +152,7 @@ def open_view(
     env_name = env_name or described.get("env_name", "nero_lift")
     preset = preset or described.get("preset", "default")
     cfg = registry.env_cfg(env_name, preset, robot)
-    env = ManipulationEnv(
-        config.override(dataclasses.replace(cfg, corruption=False), overrides or {}), impl="native", num_envs=num_envs
-    )
+    env = ManipulationEnv(config.override(cfg.uncorrupted(), overrides or {}), impl="native", num_envs=num_envs)
     makers = agents.known(env, env_name, list(policies), preset)
     chosen = _chosen(agent, list(makers), env_name)
     home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None

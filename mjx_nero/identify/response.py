@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mjx_nero.tools.tuning.model import driven, leaders, pose_model, ranges
+from mjx_nero.identify.model import driven, leaders, pose_model, ranges
 
 SECONDS = 5.0  # of a response: several time constants of the slowest drive in the package
 _SHARE = 0.1  # a step is at most this share of the joint's range: 5 mm on a finger's slide of 50 mm

@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mjx_nero.tools.tuning.model import driven, leaders, moves, pose_model, ranges
+from mjx_nero.identify.model import driven, leaders, moves, pose_model, ranges
 
 _POSES = 500
 

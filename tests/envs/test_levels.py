@@ -46,7 +46,7 @@ def drawn(env, state) -> dict[str, float]:
     return {name: float(jnp.abs(value - getattr(env.physics_model, name)).max()) for name, value in fields.items()}
 
 
-def test_success_widens_and_failure_narrows():
+def test_a_success_raises_the_level_and_a_failure_lowers_it():
     term = curriculum.BySuccess(start=0.2, up=0.1, down=0.02)
     assert float(term.step(jnp.array(0.2), jnp.array(1.0))) == pytest.approx(0.3)
     assert float(term.step(jnp.array(0.2), jnp.array(0.0))) == pytest.approx(0.18)
@@ -147,7 +147,7 @@ def test_a_start_drawn_ahead_is_the_next_episodes(batch, step):
 
 def test_levels_go_with_any_task_that_draws_objects():
     """A task with targets has both in the episode's memory."""
-    cfg = dataclasses.replace(env_cfg("nero_clutter"), widening=env_cfg("nero_lift", "sim2real").widening)
+    cfg = dataclasses.replace(env_cfg("nero_clutter"), curriculum=env_cfg("nero_lift", "sim2real").curriculum)
     env = ManipulationEnv(cfg, impl="native")
     memory = jax.eval_shape(lambda key: env.reset(key, 0.0), jax.random.PRNGKey(0)).info["carry"].memory
     assert {LEVEL, TARGET} <= set(memory)

@@ -14,8 +14,8 @@ import scipy.special
 from jaxtyping import Float
 
 from mjx_nero.errors import UserError
-from mjx_nero.tools.identification.log import Log
-from mjx_nero.tools.identification.plant import Drives, Plant
+from mjx_nero.identify.log import Log
+from mjx_nero.identify.plant import Drives, Plant
 
 HELD_OUT = 0.25  # of the log, its end
 _BEGINNING = 15.0  # [s]

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from mjx_nero.bounds import NonNegative, Positive, check
-from mjx_nero.tools.identification.excitation import RATE, sweeps
-from mjx_nero.tools.identification.log import Log
-from mjx_nero.tools.identification.plant import POSITIVE, Drives, Plant
+from mjx_nero.identify.excitation import RATE, sweeps
+from mjx_nero.identify.log import Log
+from mjx_nero.identify.plant import POSITIVE, Drives, Plant
 
 
 @dataclasses.dataclass(frozen=True)
