@@ -13,14 +13,14 @@ from mjx_nero.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """From ``low`` (where ``above`` is set, above it) to ``high``."""
+    """A range from ``low`` to ``high``; ``above`` excludes ``low`` itself."""
 
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
 
     def fault(self, value: float) -> str:
-        """What is wrong with a value; empty if nothing is."""
+        """Describes what is wrong with a value; empty if nothing is."""
         if self.low < value <= self.high or value == self.low and not self.above:
             return ""
         low = f"above {_text(self.low)}" if self.above else f"at least {_text(self.low)}"
@@ -117,7 +117,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def unwrapped(function: Any) -> Any:
-    """What a ``functools.partial`` is made of; others as they are."""
+    """Returns the function inside a ``functools.partial``; other functions unchanged."""
     while isinstance(function, functools.partial):
         function = function.func
     return function

@@ -81,7 +81,7 @@ class Parser(argparse.ArgumentParser):
                 self.add_argument(name, default=field.default, help=text, **_reader(kinds[field.name]))
 
     def add_video(self) -> None:
-        """What a video is like. Without these flags: as good as the machine draws within half a minute."""
+        """Adds flags of videos. The defaults give the best video that the machine draws within half a minute."""
         self.add_argument("--video-size", type=size, help="width and height in pixels, as in 1280x720 (default: by the machine)")
         text = "frames a second (default: 25, or what the machine draws)"
         self.add_argument("--video-fps", type=positive_float, default=0.0, help=text)
@@ -161,7 +161,7 @@ def load_guests(names: Sequence[str] = ()) -> None:
 
 @contextlib.contextmanager
 def _blamed(name: str) -> Iterator[None]:
-    """What goes wrong in outside code is its author's: one line that says where."""
+    """Turns an error in outside code into one line that says where it happened."""
     try:
         yield
     except Exception as error:
@@ -234,7 +234,7 @@ def setup_jax() -> None:
 
 
 def called_as(command: str) -> str:
-    """How the user called a command, to start a line to type: by its own program, the console script or the package."""
+    """Start of a command line to show: the program that the user called, the console script or the package."""
     name = pathlib.Path(sys.argv[0]).name
     if name == f"{command}.py":
         return f"python {name}"

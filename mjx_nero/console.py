@@ -1,4 +1,4 @@
-"""What programs tell people: lines and tables, in which no word is broken however narrow the terminal, and progress."""
+"""Output for people: lines, tables and progress. No word is broken, however narrow the terminal."""
 
 import contextlib
 import dataclasses
@@ -19,7 +19,7 @@ _BAR = (BarColumn(bar_width=14), TextColumn("{task.percentage:3.0f}%  {task.fiel
 
 
 def screen(stderr: bool = False, quiet: bool = False) -> Console:
-    """Where tables and lines go: as wide as the terminal, and wide enough for names where there is none."""
+    """Console for tables and lines, as wide as the terminal; without one, wide enough for names."""
     console = Console(stderr=stderr, quiet=quiet)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 160  # a pipe has no width of its own, and rich would take 80
@@ -93,7 +93,7 @@ class Table:
 
 
 def compiling(impl: str) -> str:
-    """What to say of the wait before training."""
+    """Announces the wait before training."""
     if impl == "native":  # a program that calls back is none that JAX keeps
         return "compiling (half a minute or so; programs that call MuJoCo's C library are compiled at every start) ..."
     return "compiling (a minute or two the first time, a few seconds once the compiled programs are kept) ..."
@@ -134,7 +134,7 @@ class Show:
         self._bar.__exit__(*error)
 
     def update(self, steps: int, wall: float, steps_per_s: float, success: float | None) -> None:
-        """After a chunk; the part that is done is that of the steps or that of the minutes, whichever is more."""
+        """Shows progress after a chunk: the share of steps or of minutes, whichever is larger."""
         left = time_left(self._total - steps, steps_per_s, self._max_minutes, wall)
         text = f"{steps / 1e6:.1f}/{self._total / 1e6:.1f} M steps  {steps_per_s:,.0f}/s"
         text += "" if success is None else f"  success {success:.2f}"

@@ -1,4 +1,4 @@
-"""What docstrings and comments say of fields and parameters, so that help texts need not say it again."""
+"""Reads descriptions of fields and parameters from docstrings and comments, for help texts."""
 
 import functools
 import inspect

@@ -46,7 +46,7 @@ class Carry:
 
 @struct.dataclass
 class DelayMemory:
-    """What ``mdp.memory.Delay`` remembers."""
+    """Memory of ``mdp.memory.Delay``."""
 
     rng: Key
     lag: Int[Array, ""]  # [control steps]
@@ -85,7 +85,7 @@ class ObstacleView:
 
 @struct.dataclass
 class ObjectLook:
-    """How an object is drawn, where that is not as the model says."""
+    """Size and colour of a drawn object that differ from the model's."""
 
     size: Float[Array, "*n 3"]  # MuJoCo's, of its kind of shape [m]
     rgba: Float[Array, "*n 4"]  # red, green, blue, alpha, each from 0 to 1
@@ -93,7 +93,7 @@ class ObjectLook:
 
 @struct.dataclass
 class Scenery:
-    """What a picture shows beside ``qpos``; leading axes are steps and environments."""
+    """Everything that a picture shows beside ``qpos``. Leading axes are steps and environments."""
 
     goal_pos_w: Float[Array, "*n 3"]  # [m]
     goal_quat_w: Float[Array, "*n 4"]

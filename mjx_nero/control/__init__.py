@@ -28,7 +28,7 @@ def register(name: str, kind: Any, cfg: Any) -> None:
     """Adds a controller: its class, which takes (robot, dt, config), and its config.
 
     Raises:
-        UserError: there is one of this name.
+        UserError: a controller has this name already.
     """
     if name in CONTROLLERS:
         raise UserError(f"there is a controller {name!r} already: choose another name")
@@ -36,7 +36,7 @@ def register(name: str, kind: Any, cfg: Any) -> None:
 
 
 def make(name: str, robot: RobotCfg, dt: float, overrides: Mapping[str, Any] | None = None) -> Controller:
-    """A controller by name.
+    """Makes a controller by name.
 
     Args:
         name: one of ``CONTROLLERS``.

@@ -22,14 +22,14 @@ Corners = Float[Array, "n 3"]
 
 @dataclasses.dataclass(frozen=True)
 class DetourCfg:
-    """Of the way and of the arm's motion; lengths in m.
+    """The way and the arm's motion; lengths in m.
 
     Attributes:
-        clearance: of the end effector above the highest obstacle, while it goes across.
-        speed: of the target along the way [m/s].
-        ramp: so far from a corner it is as fast as that, at the corner nearly at rest: a jerk would shake the object off.
-        lead: the target waits where it is further than this from the end effector.
-        rmpflow: of the arm's motion.
+        clearance: height of the end effector above the highest obstacle while it crosses.
+        speed: speed of the target along the way [m/s].
+        ramp: distance from a corner within which the target slows down, nearly to rest: a jerk would shake the object off.
+        lead: the target waits if it is further than this from the end effector.
+        rmpflow: files and integration of RMPflow.
     """
 
     clearance: float = 0.12
@@ -48,46 +48,46 @@ class Way:
 
     @classmethod
     def through(cls, *corners: Float[Array, "3"]) -> "Way":
-        """At its beginning."""
+        """Makes the way through these corners, with the target at its beginning."""
         return cls(jnp.stack(corners), jnp.zeros(()))
 
     @property
     def ends(self) -> Float[Array, " n"]:
-        """How far along it the corners are [m]."""
+        """Places of the corners along the way [m]."""
         return jnp.append(0.0, jnp.cumsum(jnp.linalg.norm(jnp.diff(self.corners, axis=0), axis=1)))
 
     @property
     def length(self) -> Float[Array, ""]:
-        """All of it [m]."""
+        """Length of the whole way [m]."""
         return self.ends[-1]
 
     def to_corner(self) -> Float[Array, ""]:
-        """From the target to the nearest corner [m]."""
+        """Distance from the target to the nearest corner [m]."""
         return jnp.min(jnp.abs(self.travelled - self.ends))
 
     def target(self) -> Float[Array, "3"]:
-        """Where it is."""
+        """Position of the target."""
         legs, lengths = jnp.diff(self.corners, axis=0), jnp.diff(self.ends)
         done = jnp.clip(self.travelled - self.ends[:-1], 0.0, lengths)
         return self.corners[0] + jnp.sum((done / jnp.maximum(lengths, 1e-6))[:, None] * legs, axis=0)
 
     def on(self, by) -> "Way":
-        """A little further along, up to the end [m]."""
+        """Moves the target further along, up to the end [m]."""
         return dataclasses.replace(self, travelled=jnp.minimum(self.travelled + by, self.length))
 
 
 def over(start: Float[Array, "3"], goal: Float[Array, "3"], view: View, clearance: float) -> Way:
-    """From start to goal, in between ``clearance`` above the highest of the obstacles' tops (they stand upright)."""
+    """Makes a way from start to goal, ``clearance`` above the highest obstacle in between. Obstacles stand upright."""
     tops = [jnp.where(box.pos_w[2] > 0, box.pos_w[2] + box.size[2] / 2, -jnp.inf) for box in view.obstacles.values()]
     height = jnp.maximum(jnp.max(jnp.stack(tops)) + clearance, jnp.maximum(start[2], goal[2]))
     return Way.through(start, start.at[2].set(height), goal.at[2].set(height), goal)
 
 
 class Detour:
-    """Brings the end effector to the goal, over the obstacles; how it is turned there is left to the arm.
+    """Brings the end effector to the goal, over the obstacles. Its orientation there is free.
 
     Args:
-        robot: its ``ee_site`` goes.
+        robot: robot whose ``ee_site`` moves.
         dt: control step [s].
         cfg: see ``DetourCfg``.
 
@@ -100,7 +100,7 @@ class Detour:
         self._arm = RmpFollower(robot, dt, cfg.rmpflow)
 
     def init(self, view: View) -> Way:
-        """The way from where the end effector is."""
+        """Plans the way from the end effector's position."""
         return over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance)
 
     def step(self, memory: Way, view: View) -> tuple[Way, Float[Array, " nu"]]:
@@ -109,7 +109,7 @@ class Detour:
         return memory, jnp.concatenate([targets, view.ctrl[self._n :]])
 
     def _follow(self, way: Way, view: View, offset, orientation) -> tuple[Way, Float[Array, " nj"]]:
-        """One step along a way; ``offset`` is from it to where the end effector has to be [m]."""
+        """Takes one step along a way; ``offset`` leads from the way to the end effector's place [m]."""
         position = way.target()
         goes = jnp.linalg.norm(position + offset - view.ee_pos_w) < self.cfg.lead
         # Under a constant acceleration up to ``ramp``; at a corner a tenth of the speed, or it would stay there.
@@ -126,22 +126,22 @@ class Detour:
 
 
 def _lengths(ways: Way) -> np.ndarray:
-    """Of a batch."""
+    """Lengths of a batch of ways."""
     return np.linalg.norm(np.diff(np.asarray(ways.corners), axis=-2), axis=-1).sum(-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class CarryCfg(DetourCfg):
-    """``DetourCfg``, and of the grasp.
+    """``DetourCfg`` and the grasp.
 
     Attributes:
         approach: height above the object from which the gripper comes down [m].
-        end_effector_offset: of the grasp point from the object's centre [m].
-        near: the end effector has arrived where it is so near to its place in the grasp [m].
-        settling: from then on until the gripper closes [s]: moving fingers would push the object out.
-        closing: from then on until the object is carried off [s]. The fingers take no less to close: quick ones would drive into
-            the object before contact stops them, and shoot it out.
-        object: what to carry.
+        end_effector_offset: offset of the grasp point from the object's centre [m].
+        near: distance from the grasp at which the end effector counts as arrived [m].
+        settling: wait before the gripper closes [s]: moving fingers would push the object out.
+        closing: time until the arm carries the object off [s]. The fingers take as long to close: quick ones would drive into the
+            object before contact stops them, and shoot it out.
+        object: name of the object to carry.
     """
 
     approach: float = 0.12
@@ -154,10 +154,10 @@ class CarryCfg(DetourCfg):
 
 @struct.dataclass
 class CarryMemory:
-    """Between two steps of ``Carry``."""
+    """Memory of ``Carry``."""
 
     way: Way  # to the object, then the object's to the goal
-    there: Int[Array, ""]  # steps since the end effector arrived at the object; 0: not yet
+    there: Int[Array, ""]  # steps since the end effector arrived at the object; 0: it has not
     grip: Float[Array, "3"]  # from the object to the grasp point
 
 
@@ -165,7 +165,7 @@ class Carry(Detour):
     """Picks the object up with the gripper straight down, and carries it to the goal over the obstacles.
 
     Args:
-        robot: what picks.
+        robot: robot that carries.
         dt: control step [s].
         cfg: see ``CarryCfg``.
     """
@@ -182,7 +182,7 @@ class Carry(Detour):
         self._offset = np.array(cfg.end_effector_offset, np.float32)
 
     def init(self, view: View) -> CarryMemory:  # type: ignore[override]
-        """The way to the object, from above."""
+        """Plans the way to the object, from above."""
         at = view.objects[self.cfg.object].pos_w + self._offset
         above = at + jnp.array([0.0, 0.0, self.cfg.approach])
         way = Way.through(view.ee_pos_w, above, above, at)  # as many corners as the way over obstacles
@@ -196,7 +196,7 @@ class Carry(Detour):
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)
         grip = memory.grip + jnp.where(holds, GRIP_FILTER, 0.0) * (slip - memory.grip)
-        # A hand that is to be turned as it is turns freely: nothing pulls it anywhere.
+        # Asking for its present orientation leaves the hand free to turn.
         turn = jnp.where(holds, view.ee_quat_w, jnp.asarray(self._down))
         way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), turn)
         there = memory.there + (arrived | (memory.there > 0))

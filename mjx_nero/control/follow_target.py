@@ -19,7 +19,7 @@ from mjx_nero.types import View
 
 @dataclasses.dataclass(frozen=True)
 class RmpCfg:
-    """Of RMPflow."""
+    """Files and integration of RMPflow."""
 
     descriptor: str = ""  # YAML file of joints and collision spheres; empty: the robot's own
     config: str = ""  # YAML file of the policies' parameters; empty: the robot's own
@@ -28,7 +28,7 @@ class RmpCfg:
 
 @struct.dataclass
 class IkMemory:
-    """Between two steps of ``IkFollower``."""
+    """Memory of ``IkFollower``."""
 
     q: Float[Array, " nj"]  # the set-point [rad]
     step: Int[Array, ""]
@@ -81,7 +81,7 @@ class IkFollower:
 class IkArm:
     """Keeps up with a slow target by inverse kinematics from the set-point on, without jumps, at the drives' speed limits.
 
-    Where the target is out of reach the arm comes as near as it gets.
+    If the target is out of reach, the arm comes as near as it can.
 
     Args:
         robot: its ``ee_site`` follows.
@@ -95,20 +95,20 @@ class IkArm:
         self._lead = np.array(robot.arm.lead, np.float32)
 
     def arm(self, q: Float[Array, " nj"], target: Target) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-        """The set-point after ``q`` on the way to ``target``, and the drives' targets [rad]: ahead by what the drives lag."""
+        """Returns the next set-point on the way to ``target``, and the drives' targets, ahead of it by their lag [rad]."""
         assert target.position is not None and target.orientation is not None
         after = rate_limit(self._ik.local(target.position, target.orientation, q).q, q, step=jnp.asarray(self._max_step))
         return after, after + self._lead * (after - q) / self.dt
 
 
 class RmpFollower:
-    """RMPflow towards the target, from the measured joint state at every step.
+    """Follows the target by RMPflow, from the measured joint state at every step.
 
     Args:
         robot: its ``ee_site`` follows.
         dt: control step [s].
         cfg: files and integration.
-        obstacles: what to keep clear of; None: the scene's.
+        obstacles: obstacles to avoid; None: the scene's.
 
     Raises:
         UserError: the robot has no RMPflow files, or they do not fit it.
@@ -122,7 +122,7 @@ class RmpFollower:
         self._n = len(robot.arm.joints)
 
     def init(self, view: View) -> Memory:
-        """Nothing to remember."""
+        """Returns an empty memory."""
         return ()
 
     def step(self, memory: Memory, view: View) -> tuple[Memory, Float[Array, " nu"]]:
@@ -137,5 +137,5 @@ class RmpFollower:
         return q + self._lead * qd
 
     def warning(self, memory: Memory) -> str:
-        """Nothing."""
+        """Returns no warning."""
         return ""

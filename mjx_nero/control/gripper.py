@@ -17,14 +17,14 @@ GRIP_FILTER = 0.05  # of how far the object is off in the grip: the share of a n
 
 
 class ParallelGripper:
-    """The gripper of a robot, as Isaac Sim's class of this name works it.
+    """A robot's gripper, with the interface of Isaac Sim's class of this name.
 
     With ``action_deltas``, ``open`` and ``close`` lead the *measured* positions by a constant step (+ opens, - closes), which a
     position drive turns into a roughly constant force. Without, they ask for the opened and the closed positions. All targets
     keep to the joints' ranges.
 
     Args:
-        robot: whose gripper.
+        robot: robot with the gripper.
         opened, closed: joint positions [rad or m]; None: the robot's own.
         action_deltas: [rad or m], one a joint, or None.
 
@@ -33,7 +33,7 @@ class ParallelGripper:
         opened, closed: [n].
 
     Raises:
-        UserError: a list has not one value a joint.
+        UserError: a list does not have one value a joint.
     """
 
     def __init__(
@@ -55,24 +55,24 @@ class ParallelGripper:
         self._speed = np.array(cfg.speed, np.float32)
 
     def open(self, positions: Positions) -> Positions:
-        """Targets that open, from measured ``positions``."""
+        """Returns targets that open, from measured ``positions``."""
         return self.step(positions, self.deltas) if self.deltas is not None else self._clip(self.opened)
 
     def close(self, positions: Positions) -> Positions:
-        """Targets that close, from measured ``positions``."""
+        """Returns targets that close, from measured ``positions``."""
         return self.step(positions, -self.deltas) if self.deltas is not None else self._clip(self.closed)
 
     def step(self, positions: Positions, deltas) -> Positions:
-        """Targets ``deltas`` away from the measured ``positions`` [rad or m]."""
+        """Returns targets ``deltas`` away from the measured ``positions`` [rad or m]."""
         return self._clip(positions + jnp.asarray(deltas, jnp.float32))
 
     def forward(self, closing: Bool[Array, ""], positions: Positions, targets: Positions, dt: float) -> Positions:
-        """Targets a control step of ``dt`` seconds on from ``targets``: towards open or closed, at the drives' speed limit."""
+        """Moves ``targets`` towards open or closed for ``dt`` seconds at the drives' speed limit."""
         wanted = jnp.where(closing, self.close(positions), self.open(positions))
         return rate_limit(wanted, targets, step=jnp.asarray(self._speed * dt))
 
     def gap(self, positions: Positions) -> Float[Array, ""]:
-        """Distance between the pads [m], by the robot's formula or as the pads are in its model.
+        """Computes the distance between the pads [m], by the robot's formula or from the pads in its model.
 
         Raises:
             UserError: there is neither.
@@ -80,7 +80,7 @@ class ParallelGripper:
         return self._formulas[0](positions)
 
     def positions(self, gap: Float[Array, ""]) -> Positions:
-        """Joint positions that leave ``gap`` [m] between the pads, within the joints' ranges. Raises as ``gap``."""
+        """Computes joint positions with ``gap`` [m] between the pads, within the joints' ranges. Raises as ``gap`` does."""
         return self._clip(self._formulas[1](gap))
 
     @functools.cached_property

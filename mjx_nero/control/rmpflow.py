@@ -32,7 +32,7 @@ from mjx_nero.values import unknown
 
 @struct.dataclass
 class Obstacles:
-    """Capsules and boxes in the world [m]; a sphere is a capsule whose ends coincide. Taken to stand still."""
+    """Capsules and boxes in the world [m], assumed at rest. A sphere is a capsule whose ends coincide."""
 
     pt1: Float[Array, "n 3"]
     pt2: Float[Array, "n 3"]
@@ -43,7 +43,7 @@ class Obstacles:
 
     @classmethod
     def none(cls) -> "Obstacles":
-        """Nothing in the way; costs less than obstacles far off."""
+        """Makes an empty set, which costs less than distant obstacles."""
         return cls.spheres(np.zeros((0, 3)), 0.0)
 
     @classmethod
@@ -65,7 +65,7 @@ class Obstacles:
 
     @classmethod
     def seen(cls, view: View) -> "Obstacles":
-        """Those of the scene."""
+        """Makes the obstacles of the scene."""
         if not view.obstacles:
             return cls.none()
         boxes = view.obstacles.values()
@@ -77,13 +77,13 @@ class Obstacles:
 
 @struct.dataclass
 class Target:
-    """Where the controlled frame is to go, in the world. What is None is left free.
+    """Target of the controlled frame in the world. None leaves a part free.
 
-    The velocity (None: at rest) is an extension of ours: the leaves damp the motion relative to it. Damped against the world, as
-    the original has it, the frame lags behind a moving target (at 0.157 m/s on a circle by 50 mm instead of 1 mm).
+    The velocity (None: at rest) is our extension: the leaves damp motion relative to it. The original damps motion relative to
+    the world, so the frame lags behind a moving target: by 50 mm instead of 1 mm on a circle at 0.157 m/s.
 
-    A target out of reach is approached as far as the arm goes. Within some 0.2 m of it the orientation matters more than the last
-    bit of the way, and is kept; leave it free to come as near as can be.
+    The arm approaches a target out of reach as far as it can. Within about 0.2 m of it, orientation counts more than the rest of
+    the way; leave orientation free to come as near as possible.
     """
 
     position: Float[Array, "3"] | None = None  # [m]
@@ -95,7 +95,7 @@ class RmpFlow:
     """The policy of one robot: pure functions of its joints, a target and obstacles.
 
     Args:
-        robot: its arm joints are controlled; all others stay at the model's zero.
+        robot: robot whose arm joints move; all others stay at the model's zero.
         frame: body or site to steer; None: the robot's grasp point.
         descriptor, config: YAML files; None: the robot's own, in ``assets/<robot>/rmpflow``.
         maximum_substep_size: longest step of the integration [s].
@@ -160,7 +160,7 @@ class RmpFlow:
         self._set_limits(config)
 
     def _set_base(self, base) -> None:
-        """The cylinders around it, in the world."""
+        """Places the cylinders around the base in the world."""
         cylinders = self.config.body_cylinders
         ends = np.array([(c.pt1, c.pt2) for c in cylinders]).reshape(-1, 2, 3)
         turn = np.zeros(9)
@@ -169,7 +169,7 @@ class RmpFlow:
         self._cylinder_radius = np.array([c.radius for c in cylinders], np.float32)
 
     def _set_limits(self, config: pathlib.Path) -> None:
-        """The joints' ranges, less the parameters' buffers."""
+        """Sets the joints' ranges, less the parameters' buffers."""
         buffers = np.array(self.config.joint_limit_buffers, np.float32)
         lower, upper = self.chain.lower + buffers, self.chain.upper - buffers
         for name, low, high in zip(self.joints, lower, upper, strict=True):
@@ -182,7 +182,7 @@ class RmpFlow:
     def acceleration(
         self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles
     ) -> Float[Array, " nj"]:
-        """The policy: joint accelerations [rad/s^2] at positions [rad] and velocities [rad/s]."""
+        """Computes joint accelerations [rad/s^2] at positions [rad] and velocities [rad/s]."""
         # Without obstacles the spheres beyond the controllers' meet nothing.
         count = 4 + (len(self._radius) if len(obstacles) else self._controllers)
         x, xd, curvature, jac = self._nodes(q, qd, count)
@@ -197,7 +197,7 @@ class RmpFlow:
     def step(
         self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles, dt: float
     ) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-        """Positions [rad] and velocities [rad/s] ``dt`` later, by explicit Euler substeps: set-points for the drives.
+        """Computes positions [rad] and velocities [rad/s] ``dt`` later by explicit Euler substeps: set-points for the drives.
 
         Args:
             dt: control step [s]; a Python number. A target with a velocity moves on meanwhile.
@@ -217,11 +217,11 @@ class RmpFlow:
         return jax.lax.fori_loop(0, n, substep, (q, qd))
 
     def spheres(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
-        """Centres in the world and radii of the spheres that keep clear of obstacles [m]; the controllers' first."""
+        """Returns centres in the world and radii of the spheres that avoid obstacles [m]; the controllers' first."""
         return self._nodes(q, jnp.zeros_like(q), len(self._frame))[0][4:], jnp.asarray(self._radius)
 
     def _nodes(self, q, qd, count: int) -> tuple[Array, Array, Array, Array]:
-        """Of the first ``count`` nodes: values and velocities [n, 3], Jdot qd [n, 3], J [n, 3, nj]."""
+        """Values and velocities [n, 3], Jdot qd [n, 3] and J [n, 3, nj] of the first ``count`` nodes."""
         frame, vector = self._frame[:count], jnp.asarray(self._vector[:count])
         is_point = jnp.asarray(self._is_point[:count, None])
 
@@ -235,7 +235,7 @@ class RmpFlow:
         return x, xd, curvature, jac
 
     def _frame_leaves(self, target: Target, x: Float[Array, "4 3"], xd: Float[Array, "4 3"]) -> rmp.Rmp:
-        """On the steered frame's origin and its three axes."""
+        """Leaves on the steered frame's origin and its three axes."""
         p, distance = self.config.rmp_params, None
         nodes = [rmp.Rmp(jnp.zeros((1, 3)), jnp.zeros((1, 3, 3))), rmp.Rmp(jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)))]
         if target.position is not None:
@@ -253,7 +253,7 @@ class RmpFlow:
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
 
     def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> rmp.Rmp:
-        """On the spheres' centres: all of them with all obstacles, the controllers' with the base as well."""
+        """Leaves on the spheres' centres: all with all obstacles, the controllers' with the base, too."""
         pt1 = jnp.concatenate([self._cylinders[:, 0], obstacles.pt1])
         pt2 = jnp.concatenate([self._cylinders[:, 1], obstacles.pt2])
         radius = jnp.concatenate([self._cylinder_radius, obstacles.radius])
@@ -275,7 +275,7 @@ class RmpFlow:
         return rmp.Rmp(pushes.force.sum(axis=1), pushes.metric.sum(axis=1))
 
     def _joint_leaves(self, q, qd) -> rmp.Rmp:
-        """On the joints themselves; the metric is diagonal."""
+        """Leaves on the joints themselves; their metric is diagonal."""
         p = self.config.rmp_params
         leaves = [rmp.cspace_target_rmp(p.cspace_target_rmp, q, qd, self.default_q)]
         leaves.append(rmp.joint_velocity_cap_rmp(p.joint_velocity_cap_rmp, qd))

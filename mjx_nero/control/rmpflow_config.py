@@ -225,13 +225,13 @@ def load(cls: type[Cfg], path: pathlib.Path) -> Cfg:
 
 
 def load_pair(descriptor: pathlib.Path, config: pathlib.Path, arm: Iterable[str]) -> tuple[DescriptorCfg, RmpFlowCfg]:
-    """Both files, in agreement with each other and with the arm, their values a joint in the order of ``arm``.
+    """Reads both files and checks that they fit each other and the arm. Values a joint have the order of ``arm``.
 
     Args:
         arm: names of the joints to control.
 
     Raises:
-        UserError: see ``load``; or joints that are not those of the arm, or lists of another length.
+        UserError: see ``load``; or the joints are not the arm's, or a list has another length.
     """
     arm = tuple(arm)
     robot, cfg = load(DescriptorCfg, descriptor), load(RmpFlowCfg, config)

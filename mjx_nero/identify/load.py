@@ -1,4 +1,4 @@
-"""What drives have to move over the workspace."""
+"""Inertia and weight that drives move over the workspace."""
 
 import dataclasses
 

@@ -7,7 +7,7 @@ from mjx_nero.types import UserError
 
 
 def missing(error: ModuleNotFoundError, extra: str) -> UserError:
-    """What to tell the user whose installation lacks a module that an extra brings."""
+    """Returns the message for an installation that lacks the module of an extra."""
     name = (error.name or "").partition(".")[0]
     return UserError(f"this needs {name}, of the extra {extra!r}: pip install 'mjx-nero[{extra}]'")
 

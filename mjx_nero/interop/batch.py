@@ -45,5 +45,5 @@ class Batch:
 
 
 def where(mask: jax.Array, new, old):
-    """Of two trees of arrays [n, ...] the one's rows where ``mask`` [n] holds, else the other's."""
+    """Takes rows of one tree of arrays [n, ...] where ``mask`` [n] holds, else those of another."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)

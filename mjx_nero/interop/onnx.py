@@ -94,7 +94,7 @@ def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
-    """What a runtime needs beside the graph; docs/guides/deploy_onnx.md says what each field means."""
+    """Collects what a runtime needs beside the graph; docs/guides/deploy_onnx.md explains every field."""
     robot, drives = env.cfg.robot, (env.cfg.robot.arm, env.cfg.robot.gripper)
 
     def both(field: str) -> list[float]:

@@ -28,7 +28,7 @@ class VecEnv(vec_env.VecEnv):
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Of the next ``reset``."""
+        """Sets the seed of the next ``reset``."""
         self._seed = seed
         return [seed] * self.num_envs
 
@@ -63,7 +63,7 @@ class VecEnv(vec_env.VecEnv):
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Of all environments."""
+        """Sets an attribute of all environments."""
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:

@@ -1,1 +1,1 @@
-"""What a user starts: one module or folder a command."""
+"""The commands: one module or folder each."""

@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``--help`` lists the fields of."""
+    """Configs whose fields ``--help`` lists."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
     name = next(iter(env.controllers), "") if args.controller == evaluation.EXPERT else args.controller
     return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}

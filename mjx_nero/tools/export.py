@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _shipped() -> dict[str, pathlib.Path]:
-    """By environment, or environment and preset, joined by an underscore."""
+    """Bundled policies by environment, or by environment and preset joined with an underscore."""
     names = registry.list_envs()
     paths = [policy.shipped(name, preset) for name in names for preset in registry.list_presets(name)]
     return {path.stem: path for path in paths if path.is_file()}

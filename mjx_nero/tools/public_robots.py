@@ -125,7 +125,7 @@ def _failure(command: str, *words: object) -> str:
 
 
 def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
-    """What an import says of the gripper, and what it warns of."""
+    """Collects what an import says of the gripper, and its warnings."""
     robot, report = files.read_yaml(out / "robot.yaml"), figures(out / "report.json")
     return {
         "gripper": list(robot["gripper"] or ()),

@@ -152,7 +152,7 @@ def task_of(env: str) -> str:
 
 
 def _table(lines: Sequence[tuple[str, ...]]) -> str:
-    """Without the columns in which nothing stands."""
+    """Writes a table without its empty columns."""
     shown = [i for i in range(len(_COLUMNS)) if any(line[i] for line in lines)]
     rows = [_COLUMNS, ("---",) * len(_COLUMNS), *lines]
     return "".join(f"| {' | '.join(row[i] for i in shown)} |\n" for row in rows)

@@ -21,7 +21,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``--help`` lists the fields of."""
+    """Configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
     return {"env": cfg, args.learner: learner.cfg_for(args.learner, args.preset, cfg.training)}
 

@@ -1,4 +1,4 @@
-"""What this machine does in a second: python -m mjx_nero benchmark --env nero_lift --num-envs 1024,4096 --impl native,jax
+"""Speed of this machine: python -m mjx_nero benchmark --env nero_lift --num-envs 1024,4096 --impl native,jax
 
 ``throughput`` has steps, resets, training and controllers of many environments; ``learning`` the time to success of several
 seeds; ``inverse_kinematics`` poses; ``drawing`` frames. ``command`` takes the flags, keeps the rows and shows them.

@@ -99,7 +99,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def command(argv: Sequence[str]) -> str:
-    """How the benchmark was called, without the folders of files."""
+    """Command line of this benchmark, without the folders of files."""
     return shlex.join(["python", "-m", "mjx_nero", "benchmark", *map(_without_folders, argv)])
 
 
@@ -135,7 +135,7 @@ def _parser() -> cli.Parser:
 
 
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``--help`` lists the fields of."""
+    """Configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
     return {"env": cfg, args.learner: run_cfg.learner_cfg(cfg, args.preset, args.learner)}
 

@@ -67,7 +67,7 @@ def measure_learning(run: RunCfg, seeds: int, target: float) -> Iterator[Row]:
 
 
 def summary(rows: list[Row]) -> Row:
-    """How many seeds reached the target; median and worst of seconds and env steps, None where such a seed did not."""
+    """Counts the seeds that reached the target; median and worst seconds and env steps, None if that seed did not reach it."""
     found: Row = {"seed": "all", "seeds": len(rows), "reached": sum(row["reached"] for row in rows)}
     for name, digits in (("seconds", 2), ("env_steps", None)):
         values = [row[name] if row["reached"] else math.inf for row in rows]

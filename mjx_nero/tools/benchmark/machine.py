@@ -1,4 +1,4 @@
-"""What the figures were measured on."""
+"""The machine that figures were measured on."""
 
 import contextlib
 import os
@@ -32,7 +32,7 @@ def machine() -> Row:
 
 
 def name(machine: Row) -> str:
-    """For titles: the accelerators, or the processor where there is none."""
+    """Name for titles: the accelerators, or the processor without one."""
     many = f"{machine['devices']} x " if machine["devices"] > 1 else ""
     if machine["platform"] == "cpu":
         return f"{machine['cpu']}, {machine['cores']} cores"
@@ -40,7 +40,7 @@ def name(machine: Row) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of the packages that decide a result; the commit, where the package is a checkout."""
+    """Versions of Python and of the packages that decide a result, and the commit of a checkout."""
     found = run_folder.versions()
     del found["device"]
     for package in ("jaxlib", "numpy"):

@@ -1,4 +1,4 @@
-"""What a robot or an environment is made of: python -m mjx_nero inspect nero --move --render nero.png"""
+"""Prints and draws a robot or an environment: python -m mjx_nero inspect nero --move --render nero.png"""
 
 from mjx_nero.sim.contacts import constraint_rows, contact_pairs
 from mjx_nero.tools.inspection.motion import moves

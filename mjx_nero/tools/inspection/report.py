@@ -61,7 +61,7 @@ class Actuator:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What an environment adds to its robot; texts for people."""
+    """An environment's part of the report; texts for people."""
 
     env: str
     preset: str

@@ -1,4 +1,4 @@
-"""What was found, for people."""
+"""The report as tables."""
 
 from collections.abc import Sequence
 

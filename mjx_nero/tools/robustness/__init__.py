@@ -1,4 +1,4 @@
-"""How far a policy gets where the world is another than it was trained in: ``python -m mjx_nero robustness``."""
+"""Success of a policy in worlds that differ from its training: ``python -m mjx_nero robustness``."""
 
 from mjx_nero.tools.robustness.command import main
 

@@ -1,4 +1,4 @@
-"""What is varied, and how: one parameter at a time, and all at once, as the preset ``sim2real`` draws them."""
+"""The sweeps: one parameter at a time, and all at once as the preset ``sim2real`` draws them."""
 
 import dataclasses
 from collections.abc import Mapping
