@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from mjx_nero.learn.play import evaluation, rollout
+from mjx_nero.learn.play import evaluation
 
 HOME = np.array([0.5, 0.0, 0.54])  # of the Cobotta's flange
 
@@ -33,10 +33,9 @@ def at(x: float, y: float, z: float) -> dict:
 def test_tracking_by_hand():
     """Six steps of two episodes: the mean over the last two steps, mean and largest over the second half."""
     distance = np.array([[9.0, 9.0], [9.0, 9.0], [9.0, 9.0], [4.0, 0.0], [1.0, 3.0], [1.0, 3.0]])
-    played = rollout.Episodes({}, np.zeros(0), np.zeros(0), None, distance=distance, memory=())
     want = {"position_error_mean": 2.0, "settled_error_mean": 2.0, "settled_error_max": 4.0}
-    assert evaluation.tracking(played, 2) == want
-    assert evaluation.tracking(played, 4)["position_error_mean"] == pytest.approx((9 + 9 + 4 + 0 + 1 + 3 + 1 + 3) / 8)
+    assert evaluation.tracking(distance, 2) == want
+    assert evaluation.tracking(distance, 4)["position_error_mean"] == pytest.approx((9 + 9 + 4 + 0 + 1 + 3 + 1 + 3) / 8)
 
 
 # --- following

@@ -36,7 +36,7 @@ def made(cfg=CFG):
 
 
 def test_features_of_every_term_by_hand():
-    """Terms are normalised, the picture goes through its layers, the joints stay as they are, and all stand side by side."""
+    """Terms are normalised, the picture goes through its layers, the joints stay as they are; side by side, by name."""
     nets, (normalizer, params) = made()
     obs, layers = drawn(), params.policy["encoders"]["picture"]["params"]
     seen = {name: (x - normalizer.mean["state"][name]) / normalizer.std["state"][name] for name, x in obs["state"].items()}
@@ -48,7 +48,7 @@ def test_features_of_every_term_by_hand():
     plain = networks.make_networks({"state": (15,)}, 7, dataclasses.replace(CFG, encoders=(), max_observation=0.0))
     still = running_statistics.init_state({"state": jnp.zeros(15)})
     trunk = {"params": params.policy["params"]}
-    want = plain.policy_network.apply(still, trunk, {"state": jnp.concatenate([picture, seen["joint_pos"]], axis=-1)})
+    want = plain.policy_network.apply(still, trunk, {"state": jnp.concatenate([seen["joint_pos"], picture], axis=-1)})
     for found, expected in zip(nets.policy_network.apply(normalizer, params.policy, obs), want, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-6)
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_nero import config, control
 from mjx_nero.bounds import Bounds, OneOf, Seed
@@ -144,7 +145,7 @@ def play(cfg: EvalCfg) -> Played:
     if all(term.time_out for term in env_cfg.terminations.values()):
         del result["dropped_rate"]  # nothing can be
     if steering:
-        result |= tracking(episodes, round(env_cfg.success.hold_s / env.dt))
+        result |= tracking(episodes.distance, round(env_cfg.success.hold_s / env.dt))
         if not env_cfg.success.follows:
             del result["settled_error_mean"], result["settled_error_max"]
         result["warning"] = steering.warning(episodes.memory)
@@ -161,11 +162,15 @@ def _impl(backend: str, impl: str) -> str:
     return impl
 
 
-def tracking(played: rollout.Episodes, last: int) -> dict[str, float]:
-    """Distances to the goal [m]: over the last ``last`` steps, and over the second half of the episodes, when all has settled."""
-    half = played.distance[len(played.distance) // 2 :]
+def tracking(distance: np.ndarray, last: int) -> dict[str, float]:
+    """Distances to the goal over the last ``last`` steps, and over the second half of the episodes, when all has settled [m].
+
+    Args:
+        distance: [steps, episodes], of ``Episodes``.
+    """
+    half = distance[len(distance) // 2 :]
     return {
-        "position_error_mean": float(played.distance[-last:].mean()),
+        "position_error_mean": float(distance[-last:].mean()),
         "settled_error_mean": float(half.mean()),
         "settled_error_max": float(half.max()),
     }

@@ -83,7 +83,7 @@ class Recorder:
         found = []
         for i in range(all_steps.reward.shape[1]):
             own, begin = all_steps[:, i], 0
-            for end in np.flatnonzero(own.done) + 1:
+            for end in (np.flatnonzero(own.done) + 1).tolist():
                 found.append(own[begin:end])
                 begin = end
         return found

@@ -79,7 +79,7 @@ class Episodes:
     @property
     def qpos(self) -> np.ndarray:
         """[steps, k, nq]."""
-        return self.record.qpos
+        return np.asarray(self.record.qpos)
 
     @property
     def scenery(self) -> Scenery:
@@ -139,7 +139,8 @@ class Runner:
         self._run, self._episodes, self._terms = run, episodes, terms
 
     def __call__(self, params: Any, seed: int) -> Episodes:
-        return _collect(*self._run(params, *_keys(seed, self._episodes)), self._terms)
+        totals, frames, memory = self._run(params, *_keys(seed, self._episodes))
+        return _collect(totals, frames, memory, self._terms)
 
     def compiler(self, params: Any) -> Callable[[], None]:
         """Traces the program; the call that comes back compiles it, in any thread."""

@@ -20,11 +20,11 @@ FLAT = "flat"
 class Encoder(Protocol):
     """Turns a term, normalised, into features. A Flax module is one."""
 
-    def init(self, key: Key, x: jax.Array) -> Any:
+    def init(self, key: Key, x: jax.Array, /) -> Any:
         """Fresh variables. ``x``: a term [batch, *shape]."""
         ...
 
-    def apply(self, variables: Any, x: jax.Array) -> jax.Array:
+    def apply(self, variables: Any, x: jax.Array, /) -> Any:
         """Features [..., n] of a term [..., *shape]."""
         ...
 

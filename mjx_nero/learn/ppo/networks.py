@@ -75,9 +75,9 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
 
 
 def _encoders(size: Mapping[str, Any], cfg: NetworkCfg) -> dict[str, encoders.Encoder]:
-    """One for each term of a group, in their order."""
+    """One for each term of a group, in the order of their names: what goes through a tree of JAX keeps no other."""
     chosen = dict(cfg.encoders)
-    return {term: encoders.make(chosen.get(term, encoders.FLAT), tuple(shape), cfg) for term, shape in size.items()}
+    return {term: encoders.make(chosen.get(term, encoders.FLAT), tuple(size[term]), cfg) for term in sorted(size)}
 
 
 def _width(group: Mapping[str, encoders.Encoder], size: Mapping[str, Any]) -> int:
