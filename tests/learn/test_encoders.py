@@ -10,7 +10,7 @@ from brax.training.acme import running_statistics
 from flax import linen
 from kinematic import Kinematic
 
-from mjx_nero import ManipulationEnv, UserError, env_cfg
+from mjx_nero import UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.ppo import encoders, networks
@@ -106,8 +106,8 @@ def test_encoders_that_are_none_are_refused(chosen, message):
 
 def test_ppo_learns_through_encoders():
     """One update changes the encoder's layers, of actor and critic."""
-    cfg = dataclasses.replace(env_cfg("nero_lift"), apart=("state", "privileged_state"))
-    env = ManipulationEnv(cfg, impl="jax")
+    apart = {f"observations.{group}.apart": True for group in ("state", "privileged_state")}
+    env = make("nero_lift", impl="jax", **apart)
     env.physics = Kinematic()
     network = NetworkCfg(actor=(8,), critic=(8,), encoders=(("joint_pos", "mlp"),), encoder_layers=(4,))
     learner = Learner(wrappers.for_training(env), PpoCfg(num_envs=8, unroll_length=4, num_minibatches=4, network=network))
