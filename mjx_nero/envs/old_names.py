@@ -36,6 +36,8 @@ def _renamed(name: str, value: Any, groups: Collection[str], weights: Collection
     elif name in _LISTS:
         listed = values.read(tuple[str, ...], value, name)
         yield from ((f"observations.{group}.{name}", group in listed) for group in groups)
+    elif name == "training.num_timesteps":
+        yield "budget.steps", value
     elif head in _MOVED:
         yield ".".join([_MOVED[head], *rest]), value
     elif name == "curriculum" and isinstance(value, Mapping) or head == "curriculum" and rest and rest[0] in weights:

@@ -3,7 +3,7 @@
 import pytest
 
 from mjx_nero import UserError, config, env_cfg
-from mjx_nero.learn import resume
+from mjx_nero.learn.runs import resume
 
 
 def groups(cfg, field):
@@ -26,6 +26,7 @@ def test_fields_of_groups():
         ("nero_lift", "isaac", "curriculum.joint_vel.params.to", "curriculum.weights.joint_vel.params.to", -0.5),
         ("nero_lift", "isaac", "curriculum", "curriculum.weights", {}),
         ("nero_follow_target", "default", "motion.params.radius", "command.motion.params.radius", 0.5),
+        ("nero_push", "default", "training.num_timesteps", "budget.steps", 5_000_000),
         ("nero_clutter", "default", "targets", "command.targets", ("pill", "capsule", "sphere", "cylinder", "bar", "box")),
     ],
 )
