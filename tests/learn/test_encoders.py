@@ -94,7 +94,7 @@ def test_encoders_of_ones_own(monkeypatch):
     ("chosen", "message"),
     [
         ((("picture", "cnm"),), "no encoder 'cnm'; valid: flat, mlp"),
-        ((("image", "mlp"),), "network.encoders names image, and terms that stay apart are: picture, joint_pos; an encoder"),
+        ((("image", "mlp"),), "network.encoders names image, and terms that stay apart are: joint_pos, picture; an encoder"),
     ],
 )
 def test_encoders_that_are_none_are_refused(chosen, message):
