@@ -10,6 +10,7 @@ from flax import struct
 
 import mjx_nero
 from mjx_nero.learn import checkpoint, policy
+from mjx_nero.learn.play.recorder import Recorder
 from mjx_nero.tools import view
 from mjx_nero.tools.view import agents
 from mjx_nero.tools.view.orders import Orders
@@ -101,6 +102,20 @@ def test_curves_and_success(following):
     assert set(curves["rewards"]) == set(following.env.cfg.rewards)
     assert curves["observations"]["joint_pos"].shape == (9,) and curves["actions"]["action"].shape == (7,)
     assert len(following.history) == 121
+
+
+def test_every_step_is_handed_to_the_recorders(following):
+    """Two environments with episodes of 60 steps: what is recorded ends where they do, though the view goes on."""
+    keep = Recorder()
+    following.reset()
+    following.recorders.append(keep)
+    for _ in range(70):
+        following.step()
+    following.recorders.remove(keep)
+    found = keep.episodes()
+    assert [len(episode.reward) for episode in found] == [60, 60]
+    assert all(episode.truncated[-1] and episode.obs["state"].shape == (60, 47) for episode in found)
+    assert all((np.abs(episode.qpos[-1] - following.frame.qpos[0]) > 1e-3).any() for episode in found)
 
 
 def test_thirty_frames_a_second_leave_a_core_time(following):
