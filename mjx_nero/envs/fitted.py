@@ -100,12 +100,13 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
     return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
 
 
-# Tasks that take all they need from the robot: the same for any, by name or imported.
+# Tasks that take all they need from the robot: ``nero_place`` and ``place --robot nero`` are one task. Of the others an arm may have
+# numbers of its own, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
     "push": push.presets(),
-    "place": place.presets(),
-    "stack": stack.presets(),
+    "place": _presets(_tower, **place.presets()),
+    "stack": _presets(_tower, **stack.presets()),
 }
 ENVS: Envs = {
     "reach": (None, reach.presets()),
@@ -115,5 +116,4 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
-    **{name: (None, _presets(_tower, **FITTING[name])) for name in ("place", "stack")},
 }
