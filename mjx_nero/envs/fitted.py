@@ -100,8 +100,8 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
     return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
 
 
-# Tasks that take all they need from the robot: ``nero_place`` and ``place --robot nero`` are one task. Of the others an arm may have
-# numbers of its own, as ``nero_lift`` has those of its recipe.
+# Tasks that take all they need from the robot: ``nero_place`` and ``place --robot nero`` are one task. Of the others an arm may
+# have numbers of its own, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
     "push": push.presets(),
