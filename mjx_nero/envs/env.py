@@ -18,7 +18,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero import bounds, values
+from mjx_nero.config import bounds, values
 from mjx_nero.envs import identified
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import (

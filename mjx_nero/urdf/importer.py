@@ -23,6 +23,7 @@ from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
 
 
+# Long: the stages of an import, one after another.
 def import_urdf(
     path: pathlib.Path | str,
     out: pathlib.Path | str,

@@ -147,6 +147,7 @@ def four(robot: RobotCfg) -> EnvCfg:
     return _clutter(fitted(robot, ("box", "cylinder", "sphere", "capsule")))
 
 
+# Long: a task is one list, to be read as one.
 def _clutter(setup: Setup) -> EnvCfg:
     """Lift's rewards for the commanded object; the others may be touched, but not leave the table."""
     scene, names, commanded = setup.scene, tuple(setup.scene.objects), {"object": TARGET}

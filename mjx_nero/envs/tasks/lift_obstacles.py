@@ -4,7 +4,7 @@ between."""
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles

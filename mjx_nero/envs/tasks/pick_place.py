@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
@@ -25,7 +25,7 @@ class Setup:
 
 
 def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
-    """Success: the cube within 1 cm of its place, at rest and let go of. One list, however long, as in ``lift``."""
+    """Success: the cube within 1 cm of its place, at rest and let go of."""
     rest = setup.scene.objects["cube"].rest_height
     held = {"minimal_height": rest + 0.01, "grasp_radius": setup.grasp_radius}
     place = rest - robot.base_pos[2]  # of the robot's frame, as all commands are

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from typing import Any
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.envs.tasks.reach import BUDGET
