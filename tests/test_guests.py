@@ -151,7 +151,7 @@ class Drift:
         """Nothing to do."""
         self.prepared.append((num_envs, num_devices))
 
-    def memory(self, num_devices=1):
+    def footprint(self, num_devices=1):
         """A megabyte of its own, of which there are 20."""
         return Footprint(outside=2.0**20, free=20 * 2.0**20)
 
