@@ -15,11 +15,11 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from mjx_nero import cli
 from mjx_nero.envs import registry
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.sim import render
+from mjx_nero.tools import cli
 
 HERE = pathlib.Path(__file__).parent
 STEPS = 150  # of an episode are shown: the cube is up by then

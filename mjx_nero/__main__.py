@@ -4,8 +4,9 @@ import importlib
 from collections.abc import Sequence
 from typing import NoReturn
 
-from mjx_nero import cli, values
+from mjx_nero.config import values
 from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
 
 # command -> (module, function of the arguments, what it does)
 COMMANDS = {

@@ -84,7 +84,7 @@ class ObstacleView:
 
 
 @struct.dataclass
-class ObjectLook:
+class Appearance:
     """Size and colour of a drawn object that differ from the model's."""
 
     size: Float[Array, "*n 3"]  # MuJoCo's, of its kind of shape [m]
@@ -98,7 +98,7 @@ class Scenery:
     goal_pos_w: Float[Array, "*n 3"]  # [m]
     goal_quat_w: Float[Array, "*n 4"]
     obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
-    objects: dict[str, ObjectLook] = struct.field(default_factory=dict)  # by name, those that differ from the model
+    objects: dict[str, Appearance] = struct.field(default_factory=dict)  # by name, those that differ from the model
 
     def __getitem__(self, at: Any) -> "Scenery":
         """That of some steps or environments."""

@@ -48,8 +48,9 @@ import jax.numpy as jnp  # noqa: E402
 from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero import __main__, cli  # noqa: E402
+from mjx_nero import __main__  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
+from mjx_nero.tools import cli  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))

@@ -22,5 +22,5 @@ class Kinematic:
     def prepare(self, num_envs, num_devices=1):
         pass
 
-    def memory(self, num_devices=1):
+    def footprint(self, num_devices=1):
         return Footprint()

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 import mjx_nero
-from mjx_nero import bounds, cli, config, control, env_cfg, list_envs, list_presets
+from mjx_nero import config, control, env_cfg, list_envs, list_presets
+from mjx_nero.config import bounds
 from mjx_nero.envs import registry
 from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import training
 from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.tools import cli, train
 from mjx_nero.tools import eval as evaluate
-from mjx_nero.tools import train
 
 ROOT = pathlib.Path(__file__).parents[1]
 

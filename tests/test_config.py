@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from mjx_nero import UserError, bounds, config, control, env_cfg, list_envs, list_presets, list_robots, make
+from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, list_robots, make
+from mjx_nero.config import bounds
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.task import CALM, QUIET, CurriculumCfg, EnvCfg

@@ -13,11 +13,11 @@ import yaml
 from PIL import Image
 
 import mjx_nero
-from mjx_nero import cli
 from mjx_nero.__main__ import COMMANDS
 from mjx_nero.envs import registry
 from mjx_nero.learn import header
 from mjx_nero.sim import robot_file
+from mjx_nero.tools import cli
 
 ROOT = pathlib.Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import pytest
 
-from mjx_nero import UserError, cli, list_envs, make, register
+from mjx_nero import UserError, list_envs, make, register
 from mjx_nero.envs import registry
 from mjx_nero.sim import physics
 from mjx_nero.sim.physics import Footprint
+from mjx_nero.tools import cli
 from mjx_nero.types import Sim
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "guides" / "your_own_task.md"
@@ -150,7 +151,7 @@ class Drift:
         """Nothing to do."""
         self.prepared.append((num_envs, num_devices))
 
-    def memory(self, num_devices=1):
+    def footprint(self, num_devices=1):
         """A megabyte of its own, of which there are 20."""
         return Footprint(outside=2.0**20, free=20 * 2.0**20)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from mjx_nero import config
 from mjx_nero.control.controller import Controller
-from mjx_nero.control.detour import Carry, CarryCfg, Detour, DetourCfg
+from mjx_nero.control.detour import CarryPast, CarryPastCfg, Detour, DetourCfg
 from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
@@ -19,7 +19,7 @@ CONTROLLERS: dict[str, tuple[Any, Any]] = {
     "rmpflow": (RmpFollower, RmpCfg()),
     "pick_place": (PickPlace, PickPlaceCfg()),
     "detour": (Detour, DetourCfg()),
-    "carry": (Carry, CarryCfg()),
+    "carry": (CarryPast, CarryPastCfg()),
     "pick_up": (PickUp, PickUpCfg()),
 }
 

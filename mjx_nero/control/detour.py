@@ -131,7 +131,7 @@ def _lengths(ways: Way) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class CarryCfg(DetourCfg):
+class CarryPastCfg(DetourCfg):
     """``DetourCfg`` and the grasp.
 
     Attributes:
@@ -154,25 +154,25 @@ class CarryCfg(DetourCfg):
 
 @struct.dataclass
 class CarryMemory:
-    """Memory of ``Carry``."""
+    """Memory of ``CarryPast``."""
 
     way: Way  # to the object, then the object's to the goal
     there: Int[Array, ""]  # steps since the end effector arrived at the object; 0: it has not
     grip: Float[Array, "3"]  # from the object to the grasp point
 
 
-class Carry(Detour):
+class CarryPast(Detour):
     """Picks the object up with the gripper straight down, and carries it to the goal over the obstacles.
 
     Args:
         robot: robot that carries.
         dt: control step [s].
-        cfg: see ``CarryCfg``.
+        cfg: see ``CarryPastCfg``.
     """
 
-    cfg: CarryCfg
+    cfg: CarryPastCfg
 
-    def __init__(self, robot: RobotCfg, dt: float, cfg: CarryCfg = CarryCfg()):
+    def __init__(self, robot: RobotCfg, dt: float, cfg: CarryPastCfg = CarryPastCfg()):
         super().__init__(robot, dt, cfg)
         self._gripper, self._down = ParallelGripper(robot), np.array(robot.down, np.float32)
         self._settled = max(1, round(cfg.settling / dt))

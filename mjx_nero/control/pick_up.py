@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
-from mjx_nero.bounds import Positive
+from mjx_nero.config.bounds import Positive
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.mdp.actions import rate_limit

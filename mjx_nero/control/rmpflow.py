@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from mjx_nero.config.values import unknown
 from mjx_nero.control import rmp
 from mjx_nero.control import rmpflow_config as cfg
 from mjx_nero.math import rotate, rotation_matrix
@@ -27,7 +28,6 @@ from mjx_nero.sim import scene
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
-from mjx_nero.values import unknown
 
 
 @struct.dataclass

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from mjx_nero import files
-from mjx_nero.bounds import NonNegative, Positive, Share
+from mjx_nero.config.bounds import NonNegative, Positive, Share
+from mjx_nero.config.values import read, unknown
 from mjx_nero.errors import UserError
-from mjx_nero.values import read, unknown
 
 Cfg = TypeVar("Cfg")
 Gain = NonNegative

@@ -18,7 +18,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero import bounds, values
+from mjx_nero.config import bounds, values
 from mjx_nero.envs import identified
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
@@ -29,7 +29,7 @@ from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import linkage, obstacles, scene, touch
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, TARGET, Carry, Key, ObjectLook, Scenery, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, TARGET, Appearance, Carry, Key, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
 _LONGEST = 1_000_000  # control steps of an episode
@@ -231,9 +231,9 @@ class ManipulationEnv(Env):
         """What a picture of a state shows beside the joints' positions."""
         sim, carry = state.pipeline_state, state.info["carry"]
         goal, _ = self._viewer.goal(carry)
-        return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._object_looks(sim, carry))
+        return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._appearances(sim, carry))
 
-    def _object_looks(self, sim: Sim, carry: Carry) -> dict[str, ObjectLook]:
+    def _appearances(self, sim: Sim, carry: Carry) -> dict[str, Appearance]:
         """Drawn sizes and colours; of the command's targets the commanded one in the goal's green."""
         fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
         if not targets and not {"geom_size", "geom_rgba"} & set(fields):
@@ -245,7 +245,7 @@ class ManipulationEnv(Env):
             if name in targets:
                 commanded = carry.memory[TARGET] == targets.index(name)
                 rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)
-            out[name] = ObjectLook(size, rgba)
+            out[name] = Appearance(size, rgba)
         return out
 
     @_precise

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import (
@@ -30,13 +30,15 @@ OPEN = 2.0  # times a cube's edge
 SLOW = 0.3  # [s] to close on it
 
 
-def lift_setup(robot: RobotCfg) -> lift.Setup:
+def lift_setup(robot: RobotCfg) -> lift.LiftSetup:
     """The cube anywhere in ``pick``, the goal anywhere in ``hold``."""
     there = regions.of(robot)
-    return lift.Setup(scene=regions.scene(robot, "sphere"), cube=there.cube, goal=there.hold, grasp_radius=regions.near(there))
+    return lift.LiftSetup(
+        scene=regions.scene(robot, "sphere"), cube=there.cube, goal=there.hold, grasp_radius=regions.near(there)
+    )
 
 
-def pick_place_setup(robot: RobotCfg) -> pick_place.Setup:
+def pick_place_setup(robot: RobotCfg) -> pick_place.PickPlaceSetup:
     """The cube anywhere in the right half of ``pick``, its place in the left one; an edge apart."""
     there, edge = regions.of(robot), grasp.cube_for(robot).size[0]
 
@@ -45,7 +47,7 @@ def pick_place_setup(robot: RobotCfg) -> pick_place.Setup:
         middle, apart = (low + high) / 2, min(edge, (high - low) / 2) / 2
         return regions.span(low, middle - apart), regions.span(middle + apart, high)
 
-    return pick_place.Setup(
+    return pick_place.PickPlaceSetup(
         scene=regions.scene(robot, "cube"),
         cube=(there.cube[0], split(there.cube[1])[0]),
         goal=(there.place[0], split(there.place[1])[1]),
@@ -55,12 +57,12 @@ def pick_place_setup(robot: RobotCfg) -> pick_place.Setup:
     )
 
 
-def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
+def follow_target_setup(robot: RobotCfg) -> follow_target.FollowTargetSetup:
     """The target on circles within ``pick``; of a robot that cannot grasp, within ``workspace``."""
     box = np.array(robot.pick or regions.box(robot, "workspace", "where it can work"))
     half = np.ptp(box, axis=1) / 2
     (x, y, z), radius = (round(float(v), 4) for v in box.mean(1)), round(float(half[1:].min() / 2), 4)
-    return follow_target.Setup(
+    return follow_target.FollowTargetSetup(
         frame=robot.ee_site,
         center=(x, y, z),
         spread=(round(float(half[0] / 2), 4), round(float(half[1] / 2), 4), 0.0),
@@ -69,7 +71,7 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.Setup:
     )
 
 
-def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.Setup], EnvCfg]) -> EnvCfg:
+def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.LiftSetup], EnvCfg]) -> EnvCfg:
     setup = lift_setup(robot)
     return factory(_ready(robot), setup)
 
@@ -92,7 +94,7 @@ def _pick_place(robot: RobotCfg) -> EnvCfg:
     return dataclasses.replace(cfg, controllers={"pick_place": fields})
 
 
-def _follow_target(robot: RobotCfg, factory: Callable[[RobotCfg, follow_target.Setup], EnvCfg]) -> EnvCfg:
+def _follow_target(robot: RobotCfg, factory: Callable[[RobotCfg, follow_target.FollowTargetSetup], EnvCfg]) -> EnvCfg:
     return dataclasses.replace(factory(robot, follow_target_setup(robot)), controllers={"ik": regions.ik(robot)})
 
 
@@ -100,12 +102,13 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
     return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
 
 
-# Tasks that take all they need from the robot: the same for any, by name or imported.
+# Tasks that take all they need from the robot: ``nero_place`` and ``place --robot nero`` are one task. Of the others an arm may
+# have numbers of its own, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
     "push": push.presets(),
-    "place": place.presets(),
-    "stack": stack.presets(),
+    "place": _presets(_tower, **place.presets()),
+    "stack": _presets(_tower, **stack.presets()),
 }
 ENVS: Envs = {
     "reach": (None, reach.presets()),
@@ -115,5 +118,4 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
-    **{name: (None, _presets(_tower, **FITTING[name])) for name in ("place", "stack")},
 }

@@ -6,8 +6,9 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from mjx_nero import files, values
-from mjx_nero.bounds import LATEST, Positive
+from mjx_nero import files
+from mjx_nero.config import values
+from mjx_nero.config.bounds import LATEST, Positive
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.mdp.terms import Term

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from mjx_nero import values
+from mjx_nero.config import values
 from mjx_nero.mdp.terms import ObservationGroup
 
 _MOVED = {"motion": "command.motion", "targets": "command.targets", "widening": "curriculum.levels"}

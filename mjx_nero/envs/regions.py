@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import Box, RobotCfg

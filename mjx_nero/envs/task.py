@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mjx_nero import bounds, config
-from mjx_nero.bounds import Count, NonNegative, Positive, Share, Steps
+from mjx_nero import config
+from mjx_nero.config import bounds
+from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
 from mjx_nero.mdp import actions, success
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, RewardTerm, Term

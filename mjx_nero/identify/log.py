@@ -16,8 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjx_nero import files
+from mjx_nero.config.values import hint, short
 from mjx_nero.errors import UserError
-from mjx_nero.values import hint, short
 
 MAX_BYTES, MAX_ROWS = 64_000_000, 500_000
 _LARGEST = 1e4  # of a number: an arm's angles, metres and seconds are below

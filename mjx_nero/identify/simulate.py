@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from mjx_nero.bounds import NonNegative, Positive, check
+from mjx_nero.config.bounds import NonNegative, Positive, check
 from mjx_nero.identify.excitation import RATE, sweeps
 from mjx_nero.identify.log import Log
 from mjx_nero.identify.plant import POSITIVE, Drives, Plant

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mjx_nero
-from mjx_nero import bounds, values
+from mjx_nero.config import bounds, values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import missing, need

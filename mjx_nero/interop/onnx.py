@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_nero.bounds import unwrapped
+from mjx_nero.config.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn.policy import Policy

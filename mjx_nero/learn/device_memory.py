@@ -47,8 +47,8 @@ def check(learner: Learner) -> None:
     Raises:
         UserError: it does not.
     """
-    Pool(_limit(learner), *learner.memory()).check(learner)
-    physics = learner.env.unwrapped.physics.memory(learner.num_devices)
+    Pool(_limit(learner), *learner.footprint()).check(learner)
+    physics = learner.env.unwrapped.physics.footprint(learner.num_devices)
     if physics.outside:
         Pool(physics.free, 0.0, _SCRATCH * physics.outside).check(learner)
 
@@ -61,7 +61,7 @@ def check_compiled(learner: Learner, program: Any) -> None:
     """
     used = program_bytes(program)
     if used is not None:
-        fixed, _ = learner.memory()
+        fixed, _ = learner.footprint()
         per_env = (used - fixed) * learner.num_devices / learner.num_envs
         Pool(_limit(learner), fixed, per_env).check(learner)
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_nero import files
+from mjx_nero.config.values import short
 from mjx_nero.errors import UserError
-from mjx_nero.values import short
 
 MAX_HEAD = 2_000_000  # bytes
 MAX_FILE = 20_000_000_000  # bytes; a checkpoint holds its environments

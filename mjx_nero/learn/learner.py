@@ -75,7 +75,7 @@ class Learner(Protocol):
         """What a policy file says of the policy beside the environment, enough for ``Kind.policy``; plain JSON."""
         ...
 
-    def memory(self) -> tuple[float, float]:
+    def footprint(self) -> tuple[float, float]:
         """About what ``run`` takes of a device's memory [bytes]: in any case, and for each environment there."""
         ...
 

@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from mjx_nero.bounds import NonNegative, Positive, Share, Steps
+from mjx_nero.config.bounds import NonNegative, Positive, Share, Steps
 from mjx_nero.mdp import memory as memories
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.types import LEVEL, Key, UserError

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.types import Key
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]

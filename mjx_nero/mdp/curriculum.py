@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mjx_nero.bounds import Share
+from mjx_nero.config.bounds import Share
 
 Tree = TypeVar("Tree")
 Level = Float[Array, ""] | None

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_nero import math
-from mjx_nero.bounds import Counts, NonNegative, Positive, Range
+from mjx_nero.config.bounds import Counts, NonNegative, Positive, Range
 from mjx_nero.types import Key, Start, UserError
 
 

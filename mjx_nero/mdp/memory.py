@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from mjx_nero.bounds import Share, Steps
+from mjx_nero.config.bounds import Share, Steps
 from mjx_nero.types import DelayMemory, Key
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero.bounds import Count, Positive
+from mjx_nero.config.bounds import Count, Positive
 from mjx_nero.mdp.rewards import Heights, held
 from mjx_nero.mdp.success import touched
 from mjx_nero.mdp.terms import MetricTerm

@@ -6,10 +6,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
-from mjx_nero.bounds import Positive, PositiveRange, Range
+from mjx_nero.config.bounds import Positive, PositiveRange, Range
 from mjx_nero.types import Key, ObstacleView, UserError, View
 
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
@@ -60,14 +60,13 @@ def across(
     room: Positive,
     object: str | None = None,
 ) -> dict[str, ObstacleView]:
-    """One of ``kinds`` between start and goal, turned to face the straight way from one to the other:
+    """One of ``kinds`` between start and goal, turned to face the straight way from one to the other; nothing where these are too
+    close for it.
 
     - ``wall``: a slab that stands on the table,
     - ``bar``: a beam in the air,
     - ``posts``: two posts that stand side by side, too close to each other to pass between them, or with room for it,
     - ``shelf``: a board below the goal, with an upright end that faces the start.
-
-    Where start and goal are too close for any of it, nothing stands there.
 
     Args:
         kinds: drawn from, each as likely.
@@ -91,28 +90,23 @@ def across(
     thick, wide = _uniform(k[0], thickness), _uniform(k[1], width)
     keep = (room + thick / 2) / jnp.maximum(length, 1e-6)
     at = start + (keep + (1 - 2 * keep) * jax.random.uniform(k[2])) * (goal - start)
-    ceiling = view.root_pos_w[2] + top
-    site = _Site(
-        goal=goal,
-        along=along,
-        side=jnp.array([-along[1], along[0], 0.0]),
-        at=at,
-        high=jnp.minimum(at[2] + _uniform(k[3], above), ceiling),
-        ceiling=ceiling,
-        thick=thick,
-        wide=wide,
-        board=thickness[0],
-        room=room,
-    )
+    side, ceiling = jnp.array([-along[1], along[0], 0.0]), view.root_pos_w[2] + top
+    high = jnp.minimum(at[2] + _uniform(k[3], above), ceiling)
+    site = _Site(goal, along, side, at, high, ceiling, thick=thick, wide=wide, board=thickness[0], room=room)
     made = [_MAKERS[kind](site, k[4:6]) for kind in kinds]
-    kind = jax.random.randint(k[6], (), 0, len(kinds))
-    fits = length > 2 * room + thick
-    out, facing = {}, math.axis_angle(jnp.asarray(_UP), jnp.arctan2(along[1], along[0]))
-    for i, name in enumerate(names):
-        centre, edges = (jnp.stack([boxes[i][part] for boxes in made])[kind] for part in (0, 1))
-        there = fits & (centre[2] > 0)
-        out[name] = ObstacleView(pos_w=jnp.where(there, centre, _PARKED), quat_w=facing, size=jnp.where(there, edges, _SMALL))
-    return out
+    kind, fits = jax.random.randint(k[6], (), 0, len(kinds)), length > 2 * room + thick
+    facing = math.axis_angle(jnp.asarray(_UP), jnp.arctan2(along[1], along[0]))
+    chosen = {}
+    for name, *boxes in zip(names, *made, strict=True):
+        centre, edges = (jnp.stack(parts)[kind] for parts in zip(*boxes, strict=True))
+        chosen[name] = _shown(centre, edges, facing, fits)
+    return chosen
+
+
+def _shown(centre: Float[Array, "3"], edges: Float[Array, "3"], facing: Float[Array, "4"], fits: Bool[Array, ""]) -> ObstacleView:
+    """A box where it fits, else one that is not there."""
+    there = fits & (centre[2] > 0)
+    return ObstacleView(pos_w=jnp.where(there, centre, _PARKED), quat_w=facing, size=jnp.where(there, edges, _SMALL))
 
 
 def _wall(site: _Site, keys: Key) -> tuple[Box, Box]:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_nero.bounds import NonNegative, PositiveRange
+from mjx_nero.config.bounds import NonNegative, PositiveRange
 from mjx_nero.types import Key, View
 
 

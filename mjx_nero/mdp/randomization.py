@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_nero.bounds import NonNegative, NonNegativeRange, PositiveRange
+from mjx_nero.config.bounds import NonNegative, NonNegativeRange, PositiveRange
 from mjx_nero.types import Key, UserError
 
 Drawn = dict[str, tuple[np.ndarray, Array]]

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
-from mjx_nero.bounds import Count, Positive
+from mjx_nero.config.bounds import Count, Positive
 from mjx_nero.mdp import success
 from mjx_nero.types import View
 

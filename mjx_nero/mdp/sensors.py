@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.bounds import NonNegative, Share, Steps
+from mjx_nero.config.bounds import NonNegative, Share, Steps
 from mjx_nero.mdp.memory import Delay
 from mjx_nero.types import Key, View
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
-from mjx_nero.bounds import Count, Positive
+from mjx_nero.config.bounds import Count, Positive
 from mjx_nero.types import Key, UserError, View
 
 

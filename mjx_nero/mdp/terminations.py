@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from mjx_nero.bounds import Positive
+from mjx_nero.config.bounds import Positive
 from mjx_nero.types import View
 
 

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mjx_nero import bounds, config
-from mjx_nero.bounds import NonNegative, OneOf, Past, Positive, Share, Steps
+from mjx_nero import config
+from mjx_nero.config import bounds
+from mjx_nero.config.bounds import NonNegative, OneOf, Past, Positive, Share, Steps
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History
 from mjx_nero.types import LEVEL, Key, UserError, View

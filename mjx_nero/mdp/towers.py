@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
-from mjx_nero.bounds import NonNegative, Positive
+from mjx_nero.config.bounds import NonNegative, Positive
 from mjx_nero.mdp.rewards import held
 from mjx_nero.types import View
 

@@ -10,8 +10,8 @@ import mujoco
 from lxml import etree
 
 from mjx_nero import files
+from mjx_nero.config.values import hint, short
 from mjx_nero.types import UserError
-from mjx_nero.values import hint, short
 
 MAX_XML = 5_000_000  # bytes
 MAX_MESHES = 500  # files

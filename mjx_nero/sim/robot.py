@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from mjx_nero.bounds import NonNegative, Positive, Range
+from mjx_nero.config.bounds import NonNegative, Positive, Range
 
 Box = tuple[Range, Range, Range]  # x, y and z [m]
 

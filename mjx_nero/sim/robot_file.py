@@ -10,12 +10,12 @@ import mujoco
 import yaml
 
 from mjx_nero import files
-from mjx_nero.bounds import Bounds
+from mjx_nero.config.bounds import Bounds
+from mjx_nero.config.values import hint, hints, short
+from mjx_nero.config.values import read as read_value
 from mjx_nero.sim import model_file
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
-from mjx_nero.values import hint, hints, short
-from mjx_nero.values import read as read_value
 
 NAME = "robot.yaml"
 MAX_NUMBER = 1e6

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import config
-from mjx_nero.bounds import Bounds, NonNegative, OneOf, Positive
+from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive
 from mjx_nero.sim import robot_file, touch
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError

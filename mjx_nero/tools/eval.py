@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mjx_nero import cli, console, control, files
+from mjx_nero import console, control, files
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.learn.play import evaluation
 from mjx_nero.sim import render
+from mjx_nero.tools import cli
 
 RECORDED = 1000  # episodes at most, among which those that fail are looked for
 

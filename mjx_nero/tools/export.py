@@ -3,11 +3,12 @@
 import pathlib
 from collections.abc import Sequence
 
-from mjx_nero import cli, config, files
+from mjx_nero import config, files
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need, onnx
 from mjx_nero.learn import policy
+from mjx_nero.tools import cli
 from mjx_nero.types import UserError
 
 TOLERANCE = 1e-5  # of actions: joint targets then agree to microradians

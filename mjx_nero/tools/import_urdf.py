@@ -4,9 +4,11 @@ import pathlib
 import shlex
 from collections.abc import Mapping, Sequence
 
-from mjx_nero import cli, console, values
+from mjx_nero import console
+from mjx_nero.config import values
 from mjx_nero.console import Table
 from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
 from mjx_nero.urdf import files
 from mjx_nero.urdf.importer import import_urdf
 from mjx_nero.urdf.report import Report

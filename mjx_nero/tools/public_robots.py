@@ -10,8 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mjx_nero import cli, files, values
+from mjx_nero import files
+from mjx_nero.config import values
 from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
 
 EPISODES = 16
 ENOUGH = 14  # of them succeed

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_nero import cli, console, files
+from mjx_nero import console, files
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import for_controllers
 from mjx_nero.errors import UserError
@@ -16,6 +16,7 @@ from mjx_nero.learn import policy
 from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.sim.physics import warp_available
+from mjx_nero.tools import cli
 from mjx_nero.tools.benchmark import learning, machine
 
 Row = dict[str, Any]

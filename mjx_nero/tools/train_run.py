@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from mjx_nero import cli, console
+from mjx_nero import console
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
 from mjx_nero.learn.runs import resume, seeds, track, training
@@ -15,6 +15,7 @@ from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.learn.runs.checkpoints import saved
 from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.sim import render
+from mjx_nero.tools import cli
 
 
 def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], flags: Collection[str]) -> None:

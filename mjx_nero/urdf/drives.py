@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import files
+from mjx_nero.config.values import hint, read, short
 from mjx_nero.sim import grasp
 from mjx_nero.sim.gains import critical_damping
 from mjx_nero.sim.robot_file import COLUMNS, MAX_NUMBER
@@ -15,7 +16,6 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint
-from mjx_nero.values import hint, read, short
 
 FREQUENCY = 20.0  # [rad/s] natural frequency of the arm's drives: a tenth of what 100 physics steps a second can follow
 STRETCH = 0.05  # [rad, m] position error at which a drive gives its full effort, at the least

@@ -53,6 +53,7 @@ class Hand:
     grip: Vec = dataclasses.field(default_factory=lambda: np.zeros(3))
 
 
+# Long: its steps share what they find.
 def gripper(
     tree: Tree,
     parts: dict[str, Body],

@@ -31,7 +31,7 @@ STAND_IN = (0.9, 0.6, 0.2, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Drawn:
+class Visual:
     """A visual geom: of MuJoCo's type ``kind`` and size (a mesh: the name of its file), at ``pose`` in the link [4, 4]."""
 
     kind: str
@@ -48,7 +48,7 @@ class Look:
     ``exact`` are those collisions that are primitives already. ``guessed``: a stand-in, for want of meshes.
     """
 
-    drawn: list[Drawn]
+    drawn: list[Visual]
     surfaces: list[tuple[Points, float]]
     exact: list[primitives.Primitive | None]
     guessed: bool = False
@@ -167,17 +167,17 @@ class Looks:
         self._spans[shape.file, shape.size] = float(np.ptp(corners, axis=0).max())
         return stem, parts
 
-    def _draw(self, item: tuple[Shape, str, list[meshes.Part]], link: str) -> list[Drawn]:
+    def _draw(self, item: tuple[Shape, str, list[meshes.Part]], link: str) -> list[Visual]:
         shape, stem, parts = item
         exact = _exact(shape)
         if exact is not None:
-            return [Drawn(exact.kind, exact.size, exact.pose, shape.rgba or GREY)]
+            return [Visual(exact.kind, exact.size, exact.pose, shape.rgba or GREY)]
         if shape.kind == "cylinder":
-            return [Drawn("cylinder", (shape.size[0], shape.size[1] / 2), shape.origin, shape.rgba or GREY)]
+            return [Visual("cylinder", (shape.size[0], shape.size[1] / 2), shape.origin, shape.rgba or GREY)]
         key = (shape.file, shape.size)
         if key not in self._written:
             self._written[key] = self._write(stem, parts, shape.size, link)
-        return [Drawn("mesh", (), shape.origin, shape.rgba or rgba, name) for name, rgba in self._written[key]]
+        return [Visual("mesh", (), shape.origin, shape.rgba or rgba, name) for name, rgba in self._written[key]]
 
     def _write(self, stem: str, parts: list[meshes.Part], scale: tuple, link: str) -> list[tuple[str, tuple[float, ...]]]:
         self._spend(parts)
@@ -227,7 +227,7 @@ class Looks:
             shape = primitives.Primitive("capsule", (radius, max(length / 2 - radius, 5e-4)), place)
         self._notes.add("guessed", "link", name, f"{shape.kind} of radius {radius:.3f} m in place of its meshes")
         mesh = _mesh(shape)
-        drawn = Drawn(shape.kind, shape.size, shape.pose, STAND_IN)
+        drawn = Visual(shape.kind, shape.size, shape.pose, STAND_IN)
         return Look([drawn], [(primitives.sample(mesh), shape.volume)], [shape], guessed=True)
 
 

@@ -17,12 +17,13 @@ from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
 from mjx_nero.urdf.cloud import Cloud
-from mjx_nero.urdf.geometry import Drawn, Looks
+from mjx_nero.urdf.geometry import Looks, Visual
 from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
 
 
+# Long: the stages of an import, one after another.
 def import_urdf(
     path: pathlib.Path | str,
     out: pathlib.Path | str,
@@ -142,7 +143,7 @@ class _Model:
         self.joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
         self.site = _free("ee", [link for b in parts.values() for link in b.links])
 
-    def xml(self, drawn: Mapping[str, list[Drawn]], rotors: Mapping[str, float]) -> str:
+    def xml(self, drawn: Mapping[str, list[Visual]], rotors: Mapping[str, float]) -> str:
         at_home = positions(self.parts, {n: np.array([v]) for n, v in self.at_home.items()}, 1)
         return mjcf.document(
             self.tree.name,

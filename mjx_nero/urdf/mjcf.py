@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree
 
 from mjx_nero.urdf import primitives
-from mjx_nero.urdf.geometry import Drawn
+from mjx_nero.urdf.geometry import Visual
 from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
 
 TABLE, CUBE = 1, 2  # contact bits of the scenes
@@ -25,7 +25,7 @@ def document(
     title: str,
     parts: Mapping[str, Body],
     masses: Mapping[str, Mass],
-    drawn: Mapping[str, list[Drawn]],
+    drawn: Mapping[str, list[Visual]],
     collisions: Mapping[str, list[tuple[str, primitives.Primitive, int]]],
     site: tuple[str, str, Pose],
     armature: Mapping[str, float],
@@ -129,7 +129,7 @@ def _joint(element: etree._Element, joint: Joint, span: tuple[float, float], arm
     etree.SubElement(element, "joint", **row)
 
 
-def _drawn(element: etree._Element, item: Drawn, at: Pose) -> None:
+def _drawn(element: etree._Element, item: Visual, at: Pose) -> None:
     shape = {"mesh": item.mesh} if item.mesh else {"size": _text(item.size)}
     look = {"group": "2", "contype": "0", "conaffinity": "0", "mass": "0", "rgba": _text(item.rgba)}
     etree.SubElement(element, "geom", type=item.kind, **shape, **look, **_pose(at @ item.pose))

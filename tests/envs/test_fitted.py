@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.gripper import ParallelGripper
-from mjx_nero.envs import regions
+from mjx_nero.envs import regions, registry
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.arms.so_arm100 import SO_ARM100
@@ -60,6 +60,13 @@ def test_the_packages_arms_lift_as_in_their_own_task(robot, own):
     assert list(fitted.rewards) == list(tuned.rewards) and fitted.observations == tuned.observations
     size = fitted.scene.objects["cube"].size[0]
     assert 0.3 * fitted.robot.opening < size <= 0.6 * fitted.robot.opening
+
+
+@pytest.mark.parametrize("robot", ["nero", "cobotta_pro_900"])
+def test_what_fits_any_robot_is_one_task_by_either_name(robot):
+    for task, presets in registry.fitted.FITTING.items():
+        for preset in presets:
+            assert env_cfg(task, preset, robot=robot) == env_cfg(f"{OWN[robot]}_{task}", preset), (task, preset)
 
 
 def test_an_imported_arm_has_its_regions_in_the_task(hand):

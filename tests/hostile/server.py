@@ -40,7 +40,8 @@ def child(argv: list[str], folder: pathlib.Path) -> None:
 
     sys.addaudithook(watch)
     sys.argv = ["mjx-nero", *argv]
-    from mjx_nero import __main__, cli
+    from mjx_nero import __main__
+    from mjx_nero.tools import cli
 
     cli.run(__main__.main)
 

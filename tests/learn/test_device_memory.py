@@ -21,7 +21,7 @@ def learner(num_envs=512, **fields):
 
 
 def needed(learner):
-    fixed, per_env = learner.memory()
+    fixed, per_env = learner.footprint()
     return fixed + per_env * learner.num_envs
 
 
@@ -45,13 +45,13 @@ def test_a_group_of_several_axes_takes_the_product_of_its_sides():
     """Sixteen steps of a picture of 10 x 20 more, kept and copied: 16 x 200 x 4 bytes, ten per cent and the minibatch."""
     vector, picture = (learner(unroll_length=16, num_minibatches=1) for _ in range(2))
     picture.sizes = {**vector.sizes, "picture": (10, 20)}
-    more = picture.memory()[1] - vector.memory()[1]
+    more = picture.footprint()[1] - vector.footprint()[1]
     assert more == pytest.approx((1.1 + 1.0) * 16 * 200 * 4)
 
 
 def test_too_many_environments_are_told_how_many_fit(monkeypatch):
     small = learner()
-    fixed, per_env = small.memory()
+    fixed, per_env = small.footprint()
     monkeypatch.setattr(device_memory, "_limit", lambda _: fixed + 101.5 * per_env)
     with pytest.raises(UserError, match=r"^512 environments need about 0.0 GB .* pass --num-envs 100 or fewer$"):
         device_memory.check(small)

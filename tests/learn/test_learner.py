@@ -80,7 +80,7 @@ class Search:
     def describe(self):
         return {}
 
-    def memory(self):
+    def footprint(self):
         return 0.0, 4.0
 
 

@@ -426,7 +426,7 @@ def test_a_saved_run_with_physics_goes_on_bit_for_bit(reaching, tmp_path):
 @pytest.mark.slow
 def test_memory_on_mjx_is_estimated(reaching_on_mjx):
     learner, _, run = reaching_on_mjx
-    fixed, per_env = learner.memory()
+    fixed, per_env = learner.footprint()
     used = device_memory.program_bytes(run)
     assert used / 1.5 < fixed + per_env * learner.num_envs < used * 1.5
 

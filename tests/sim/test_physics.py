@@ -337,9 +337,9 @@ def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
     """A run of four devices on two machines: two are here."""
     warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
     made = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
-    made.memory()  # makes what it counts, before devices are not what they are
+    made.footprint()  # makes what it counts, before devices are not what they are
     monkeypatch.setattr(warp, "get_cuda_devices", lambda: [types.SimpleNamespace(free_memory=free) for free in (5e9, 3e9, 1e9)])
-    assert made.memory(2).free == 3e9 and made.memory(4).free == 1e9 and made.memory().outside > 1000
+    assert made.footprint(2).free == 3e9 and made.footprint(4).free == 1e9 and made.footprint().outside > 1000
 
 
 @pytest.mark.gpu

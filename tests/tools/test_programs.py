@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero import cli
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.learn.runs import logs, training
 from mjx_nero.sim import render
 from mjx_nero.sim.physics.native import NativePhysics
+from mjx_nero.tools import cli
 from mjx_nero.types import UserError
 
 

@@ -62,7 +62,7 @@ ROBOT = COBOTTA_PRO_900 = RobotCfg(
 )
 
 # The tutorial's cube in front of the arm, which reaches 0.9 m.
-LIFT = lift.Setup(
+LIFT = lift.LiftSetup(
     scene=SceneCfg(
         objects={"cube": cube(0.0515, mass=0.1)},
         table_center=(0.35, 0.0),
@@ -74,7 +74,7 @@ LIFT = lift.Setup(
     goal=((0.4, 0.6), (-0.2, 0.2), (0.2, 0.4)),
 )
 # The tutorial's frame and target.
-FOLLOW_TARGET = follow_target.Setup(
+FOLLOW_TARGET = follow_target.FollowTargetSetup(
     frame="flange",
     center=(0.5, 0.0, 0.5),
     spread=(0.05, 0.15, 0.1),
@@ -82,7 +82,7 @@ FOLLOW_TARGET = follow_target.Setup(
     scene=SceneCfg(objects={}, goal="cube", goal_edge=0.0515, table_size=(1.2, 1.4), look_at=(0.25, 0.0, 0.4), view_distance=1.7),
 )
 # Around the tutorial's goal, (-0.3, 0.6).
-PICK_PLACE = pick_place.Setup(
+PICK_PLACE = pick_place.PickPlaceSetup(
     scene=SceneCfg(
         objects={"cube": cube(0.0515, mass=0.1)},
         goal="cube",
@@ -98,15 +98,15 @@ PICK_PLACE = pick_place.Setup(
     episode_length_s=20.0,
 )
 # The arm gets everywhere in its workspace with its fingers tilted forward by 30 degrees from straight down.
-REACH = reach.Setup(
+REACH = reach.ReachSetup(
     orientation=(reach.STILL, (math.pi * 5 / 6, math.pi * 5 / 6), reach.STILL),
     scene=reach.scene(LIFT.scene),
 )
 
-REACH_OBSTACLES = reach_obstacles.Setup(
+REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
     start=(0.5, -0.27), goal=((0.4, 0.6), (0.14, 0.3), (0.15, 0.45)), top=0.35, scene=LIFT.scene
 )
-LIFT_OBSTACLES = lift_obstacles.Setup(
+LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.4, 0.55), (-0.28, -0.2)), goal=((0.4, 0.55), (0.18, 0.28), (0.2, 0.35)), top=0.25, scene=LIFT.scene
 )
 

@@ -41,19 +41,19 @@ ROBOT = NERO = RobotCfg(
 )
 
 # The Isaac Lab recipe's numbers; the cube's region is the recipe's start (0.2, 0) plus its offsets.
-LIFT = lift.Setup(
+LIFT = lift.LiftSetup(
     scene=SceneCfg(objects={"cube": cube(0.03, mass=0.03)}),
     cube=((0.3, 0.4), (-0.1, 0.2)),
     goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
 )
-FOLLOW_TARGET = follow_target.Setup(
+FOLLOW_TARGET = follow_target.FollowTargetSetup(
     frame="ee",
     center=(0.32, 0.0, 0.17),  # with its wrist's range the arm points straight down up to about z = 0.25
     spread=(0.02, 0.08, 0.02),
     radius=0.05,
     scene=SceneCfg(objects={}, goal="cube"),
 )
-PICK_PLACE = pick_place.Setup(
+PICK_PLACE = pick_place.PickPlaceSetup(
     scene=SceneCfg(goal="cube"),
     cube=((0.3, 0.4), (-0.1, 0.0)),
     goal=((0.3, 0.4), (0.08, 0.2)),
@@ -61,7 +61,7 @@ PICK_PLACE = pick_place.Setup(
     episode_length_s=20.0,
 )
 # The arm gets everywhere in its workspace with its fingers tilted forward by 30 degrees from straight down.
-REACH = reach.Setup(orientation=((math.pi, math.pi), (-math.pi / 6, -math.pi / 6), reach.STILL))
+REACH = reach.ReachSetup(orientation=((math.pi, math.pi), (-math.pi / 6, -math.pi / 6), reach.STILL))
 # The Isaac Lab recipe's drives for reaching, but for the speed: at its 10 rad/s every change of an action drives the joints into
 # their effort limits, and learning takes several times as long.
 REACH_NERO = dataclasses.replace(
@@ -76,10 +76,10 @@ REACH_NERO = dataclasses.replace(
 )
 
 # Wider apart than the recipe's regions, for what is to stand between.
-REACH_OBSTACLES = reach_obstacles.Setup(
+REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
     start=(0.33, -0.2), goal=((0.3, 0.4), (0.14, 0.24), (0.2, 0.35)), top=0.3, scene=LIFT.scene
 )
-LIFT_OBSTACLES = lift_obstacles.Setup(
+LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.3, 0.38), (-0.22, -0.16)), goal=((0.3, 0.36), (0.14, 0.22), (0.18, 0.28)), top=0.18, scene=LIFT.scene
 )
 

@@ -31,7 +31,7 @@ ROBOT = PIPER = RobotCfg(
     gripper=NERO.gripper,
 )
 
-LIFT = lift.Setup(  # Nero's regions
+LIFT = lift.LiftSetup(  # Nero's regions
     scene=SceneCfg(objects={"cube": cube(0.03, mass=0.03)}),
     cube=((0.3, 0.4), (-0.1, 0.2)),
     goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
@@ -39,7 +39,7 @@ LIFT = lift.Setup(  # Nero's regions
 # The recipe's box, its level gripper, which points along +x, and its home, which does nearly so: from the other one, fingers
 # down, learning ends with the wrist bent the wrong way.
 REACH_PIPER = dataclasses.replace(PIPER, arm=dataclasses.replace(PIPER.arm, home=(0.0,) * 6))
-REACH = reach.Setup(
+REACH = reach.ReachSetup(
     position=((0.3, 0.4), (0.1, 0.15), (0.3, 0.3)),
     orientation=(reach.STILL, (math.pi / 2, math.pi / 2), reach.STILL),
     decimation=1,

@@ -72,13 +72,13 @@ ROBOT = SO_ARM100 = RobotCfg(
 
 # The recipe's regions. It gives goals in the turned base's frame, where -y is ahead; ours is the unturned one.
 SCENE = SceneCfg(table_center=(0.2, 0.0), table_size=(0.8, 0.9), look_at=(0.14, 0.0, 0.13), view_distance=0.8)
-LIFT = lift.Setup(
+LIFT = lift.LiftSetup(
     scene=SCENE,
     cube=((0.1, 0.3), (-0.2, 0.2)),
     goal=((0.1, 0.3), (-0.1, 0.1), (0.2, 0.35)),
     grasp_radius=0.02,  # the jaws are narrow: what they hold off their middle slips out at the side
 )
-REACH = reach.Setup(
+REACH = reach.ReachSetup(
     scene=reach.scene(SCENE),
     position=((0.1, 0.25), (-0.1, 0.1), (0.1, 0.3)),
 )

@@ -18,13 +18,13 @@ ROBOT = SO_ARM101 = dataclasses.replace(
 
 # The recipe keeps the SO-ARM100's goals, which for this unturned arm lie at its right side, and partly beyond its reach (92% of
 # those for lifting, 87% of those for reaching are within). Ours lie ahead, as the SO-ARM100's do.
-LIFT = lift.Setup(
+LIFT = lift.LiftSetup(
     scene=SCENE,
     cube=((0.1, 0.3), (-0.2, 0.2)),
     goal=((0.15, 0.3), (-0.1, 0.1), (0.2, 0.35)),
     grasp_radius=0.02,
 )
-REACH = reach.Setup(scene=reach.scene(SCENE))
+REACH = reach.ReachSetup(scene=reach.scene(SCENE))
 
 ENVS: Envs = {
     "so101_lift": (SO_ARM101, with_recipe(lift.presets(LIFT))),

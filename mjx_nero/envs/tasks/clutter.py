@@ -52,7 +52,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class ClutterSetup:
     """What differs from robot to robot; lengths in m.
 
     Attributes:
@@ -98,7 +98,7 @@ def across(item: ObjectCfg) -> float:
     return min(first, *rest[:1]) if item.shape == "box" else 2 * first
 
 
-def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> Setup:
+def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> ClutterSetup:
     """What follows from the robot's gripper, and from where it can grasp and hold.
 
     Raises:
@@ -117,7 +117,7 @@ def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> Setup:
     scene = regions.scene(robot, "sphere")
     size = scene.table_size[0] + 2 * pitch, scene.table_size[1] + 2 * pitch
     (low, high), foot = there.cube[0], robot.base_pos[0] + FOOT + pitch + jitter
-    return Setup(
+    return ClutterSetup(
         scene=dataclasses.replace(scene, objects=objects, table_size=size),
         robot=robot,
         there=dataclasses.replace(there, cube=(regions.span(max(low, min(high, foot)), high), there.cube[1])),
@@ -147,7 +147,8 @@ def four(robot: RobotCfg) -> EnvCfg:
     return _clutter(fitted(robot, ("box", "cylinder", "sphere", "capsule")))
 
 
-def _clutter(setup: Setup) -> EnvCfg:
+# Long: a task is one list, to be read as one.
+def _clutter(setup: ClutterSetup) -> EnvCfg:
     """Lift's rewards for the commanded object; the others may be touched, but not leave the table."""
     scene, names, commanded = setup.scene, tuple(setup.scene.objects), {"object": TARGET}
     heights = tuple(round(SIZES[1] * item.rest_height + LIFTED, 4) for item in scene.objects.values())

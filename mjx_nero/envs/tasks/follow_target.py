@@ -12,7 +12,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class FollowTargetSetup:
     """What differs from robot to robot: the frame that follows, and where the target is: a box about ``center`` [m]."""
 
     frame: str
@@ -22,7 +22,7 @@ class Setup:
     scene: SceneCfg
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def default(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
     """The target runs round a vertical circle, four seconds a turn; success is to stay within 2 cm of it."""
     x, y, z = ((c - s, c + s) for c, s in zip(setup.center, setup.spread, strict=True))
     return EnvCfg(
@@ -65,7 +65,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def static(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def static(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
     """The target stands still; success is to stay within 5 mm of it."""
     moving = default(robot, setup)
     return dataclasses.replace(
@@ -79,6 +79,6 @@ def static(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def presets(setup: Setup) -> Presets:
+def presets(setup: FollowTargetSetup) -> Presets:
     """Preset -> robot -> config; the default first."""
     return {"default": functools.partial(default, setup=setup), "static": functools.partial(static, setup=setup)}

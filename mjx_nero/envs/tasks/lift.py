@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
@@ -21,7 +21,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class LiftSetup:
     """What differs from robot to robot: the cube, where it lies and where it has to go [m], robot root frame.
 
     Attributes:
@@ -46,7 +46,7 @@ class Setup:
         return {**self.lifted, "grasp_radius": self.grasp_radius}
 
 
-def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     """The Isaac Lab recipe's MDP, its numbers word for word.
 
     Kept to compare with. Its lifting reward is open to a shortcut: a cube knocked into the air scores like a held one.
@@ -108,7 +108,7 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     """The preset that learns to grasp: height and tracking count only for a held cube, and relative positions are observed."""
     recipe, held = isaac(robot, setup), setup.held
     state = {
@@ -149,7 +149,7 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     """The default with all that differs between a simulated arm and a real one: see ``sim2real``.
 
     Its gripper has no hysteresis: it has not been trained with it.
@@ -157,7 +157,7 @@ def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
     return sim2reals.randomized(dataclasses.replace(default(robot, setup), actions=velocity_actions()))
 
 
-def presets(setup: Setup) -> Presets:
+def presets(setup: LiftSetup) -> Presets:
     """Preset -> robot -> config; the default first."""
     return {
         "default": functools.partial(default, setup=setup),

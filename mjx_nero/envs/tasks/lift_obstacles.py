@@ -4,7 +4,7 @@ between."""
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
@@ -15,7 +15,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class LiftObstaclesSetup:
     """What differs from robot to robot. None: from the robot's ``pick``, ``hold`` and gripper.
 
     Attributes:
@@ -33,7 +33,7 @@ class Setup:
     scene: SceneCfg | None = None
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
     """Success: the cube within 2 cm of the goal for the last half second, without one touch in the whole episode."""
     there = regions.of(robot)
     (x, y), (goal_x, goal_y, z) = there.cube, there.hold
@@ -42,9 +42,11 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     goal = setup.goal or (goal_x, regions.span(goal_y[1] - share * (goal_y[1] - goal_y[0]), goal_y[1]), z)
     scene = reach_obstacles.with_obstacles(setup.scene or regions.scene(robot, "sphere"))
     arm = dataclasses.replace(robot, gravity_compensation=True)
-    plain = lift.default(arm, lift.Setup(scene=scene, cube=cube, goal=goal, grasp_radius=regions.near(there)))
+    plain = lift.default(arm, lift.LiftSetup(scene=scene, cube=cube, goal=goal, grasp_radius=regions.near(there)))
     middle = (sum(cube[0]) / 2 - robot.base_pos[0], sum(cube[1]) / 2 - robot.base_pos[1])
-    ways = reach_obstacles.Setup(start=middle, goal=goal, room=setup.room, top=setup.top or round(0.8 * z[0], 4), scene=scene)
+    ways = reach_obstacles.ReachObstaclesSetup(
+        start=middle, goal=goal, room=setup.room, top=setup.top or round(0.8 * z[0], 4), scene=scene
+    )
     ways = reach_obstacles.completed(robot, ways)
     done = {"threshold": 0.02, "object": "cube"}
     return dataclasses.replace(
@@ -80,6 +82,6 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def presets(setup: Setup | None = None) -> Presets:
+def presets(setup: LiftObstaclesSetup | None = None) -> Presets:
     """Preset -> robot -> config; the default first."""
-    return {"default": functools.partial(default, setup=setup or Setup())}
+    return {"default": functools.partial(default, setup=setup or LiftObstaclesSetup())}

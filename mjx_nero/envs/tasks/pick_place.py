@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
@@ -12,7 +12,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class PickPlaceSetup:
     """What differs from robot to robot: where the cube starts, where it has to go, how high it travels [m], and how long that may
     take [s]."""
 
@@ -24,8 +24,8 @@ class Setup:
     grasp_radius: float = 0.04  # how near to the grasp point the cube counts as held [m]
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
-    """Success: the cube within 1 cm of its place, at rest and let go of. One list, however long, as in ``lift``."""
+def default(robot: RobotCfg, setup: PickPlaceSetup) -> EnvCfg:
+    """Success: the cube within 1 cm of its place, at rest and let go of."""
     rest = setup.scene.objects["cube"].rest_height
     held = {"minimal_height": rest + 0.01, "grasp_radius": setup.grasp_radius}
     place = rest - robot.base_pos[2]  # of the robot's frame, as all commands are
@@ -77,6 +77,6 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def presets(setup: Setup) -> Presets:
+def presets(setup: PickPlaceSetup) -> Presets:
     """Preset -> robot -> config; the default first."""
     return {"default": functools.partial(default, setup=setup)}

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, observations, rewards, success, terminations
@@ -35,7 +35,7 @@ def scene(like: SceneCfg) -> SceneCfg:
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class ReachSetup:
     """What differs from robot to robot.
 
     Attributes:
@@ -55,7 +55,7 @@ class Setup:
     episode_length_s: float = 12.0
 
 
-def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def isaac(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
     """The Isaac Lab recipe's MDP."""
     box = setup.position or robot.workspace
     if box is None:
@@ -111,7 +111,7 @@ def isaac(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def default(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
     """The recipe with the error observed, and rewarded down to the last centimetre."""
     recipe = isaac(robot, setup)
     turned = setup.orientation is not None
@@ -133,14 +133,14 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def sim2real(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def sim2real(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
     """The default with all that differs between a simulated arm and a real one: see ``sim2real``."""
     return sim2reals.randomized(default(robot, setup))
 
 
-def presets(setup: Setup | None = None) -> Presets:
+def presets(setup: ReachSetup | None = None) -> Presets:
     """Preset -> robot -> config; the default first."""
-    setup = setup or Setup()
+    setup = setup or ReachSetup()
     return {
         "default": functools.partial(default, setup=setup),
         "isaac": functools.partial(isaac, setup=setup),

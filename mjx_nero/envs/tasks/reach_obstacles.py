@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from typing import Any
 
-from mjx_nero.bounds import Range
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.envs.tasks.reach import BUDGET
@@ -20,7 +20,7 @@ HAND = 0.08  # [m] from a finger's pad to the far side of the hand, and some mor
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class ReachObstaclesSetup:
     """What differs from robot to robot. None: from the robot's ``workspace`` and gripper.
 
     Attributes:
@@ -38,11 +38,11 @@ class Setup:
     scene: SceneCfg | None = None
 
 
-def completed(robot: RobotCfg, setup: Setup) -> Setup:
+def completed(robot: RobotCfg, setup: ReachObstaclesSetup) -> ReachObstaclesSetup:
     """The setup with all that it leaves open."""
     x, y, z = regions.box(robot, "workspace", "where it can work")
     by = SHARE * (y[1] - y[0])
-    return Setup(
+    return ReachObstaclesSetup(
         start=setup.start or ((x[0] + x[1]) / 2, y[0] + by / 2),
         goal=setup.goal or (x, regions.span(y[1] - by, y[1]), z),
         room=setup.room or round(robot.opening / 2 + HAND, 4),
@@ -51,7 +51,7 @@ def completed(robot: RobotCfg, setup: Setup) -> Setup:
     )
 
 
-def between(setup: Setup, object: str | None = None) -> Term:
+def between(setup: ReachObstaclesSetup, object: str | None = None) -> Term:
     """Draws what stands between start and goal; ``object`` is what goes there, None: the end effector."""
     params = {"thickness": (0.02, 0.04), "width": (0.15, 0.3), "above": (0.0, 0.08), "top": setup.top, "room": setup.room}
     return Term(obstacles.across, params={**params, "names": NAMES, "object": object})
@@ -67,7 +67,7 @@ def seen() -> dict[str, ObservationTerm]:
     return {f"obstacle_{name}": ObservationTerm(observations.obstacle, params={"obstacle": name}) for name in NAMES}
 
 
-def aside(robot: RobotCfg, setup: Setup) -> dict[str, Term]:
+def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
     """The arm starts turned to the start, by chance a little beside it."""
     assert setup.start is not None
     turn = regions.turn_to(robot, *setup.start)
@@ -82,7 +82,7 @@ def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str
     return {name: fields} if (robot.xml.parent / "rmpflow").is_dir() else {}
 
 
-def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
+def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:
     """Success: within 2 cm of the goal for the last half second, without one touch in the whole episode."""
     setup = completed(robot, setup)
     assert setup.goal is not None and setup.scene is not None
@@ -126,6 +126,6 @@ def default(robot: RobotCfg, setup: Setup) -> EnvCfg:
     )
 
 
-def presets(setup: Setup | None = None) -> Presets:
+def presets(setup: ReachObstaclesSetup | None = None) -> Presets:
     """Preset -> robot -> config; the default first."""
-    return {"default": functools.partial(default, setup=setup or Setup())}
+    return {"default": functools.partial(default, setup=setup or ReachObstaclesSetup())}

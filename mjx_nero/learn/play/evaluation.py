@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_nero import config, control
-from mjx_nero.bounds import Bounds, OneOf, Seed
 from mjx_nero.config import flag
+from mjx_nero.config.bounds import Bounds, OneOf, Seed
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 from mjx_nero import config
-from mjx_nero.bounds import Bounds, NonNegative, Positive, Share
+from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
+from mjx_nero.config.values import hints, read, short
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
-from mjx_nero.values import hints, read, short
 
 PRECISIONS = ("default", "bfloat16", "tensorfloat32", "float32", "high", "highest")
 Rate = Annotated[float, Bounds(0.0, 1.0, above=True)]

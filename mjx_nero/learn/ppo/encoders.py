@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import jax
 from flax import linen
 
-from mjx_nero import values
+from mjx_nero.config import values
 from mjx_nero.errors import UserError
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.types import Key

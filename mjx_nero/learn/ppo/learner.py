@@ -184,7 +184,7 @@ class Learner:
         """The networks, for the policy's file."""
         return {"network": config.to_dict(self.cfg.network)}
 
-    def memory(self) -> tuple[float, float]:
+    def footprint(self) -> tuple[float, float]:
         """See ``learner.Learner.memory``. The factors were measured on compiled programs (tests/learn/test_device_memory.py).
 
         A rollout keeps every step's observations and the like; its end takes two layers of the critic for all of them; an update
@@ -199,7 +199,7 @@ class Learner:
         encoded = 2 * len(cfg.network.encoders) * sum(cfg.network.encoder_layers)
         neurons = 4 * (sum(cfg.network.actor) + sum(cfg.network.critic) + encoded)
         layers = 4 * max(a + b for a, b in itertools.pairwise((*cfg.network.critic, 1)))
-        rollout = max(env.physics.memory(self.num_devices).in_program, cfg.unroll_length * (obs + layers))
+        rollout = max(env.physics.footprint(self.num_devices).in_program, cfg.unroll_length * (obs + layers))
         update = cfg.unroll_length * (step + 1.75 * neurons) / cfg.num_minibatches
         return 2.0 * (device_memory.size(state) - own), own / cfg.num_envs + 1.1 * cfg.unroll_length * step + max(rollout, update)
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import jax
 
-from mjx_nero import bounds, config
-from mjx_nero.bounds import Bounds, Count, NonNegative, OneOf, Seed, Whole
-from mjx_nero.config import flag
+from mjx_nero import config
+from mjx_nero.config import bounds, flag
+from mjx_nero.config.bounds import Bounds, Count, NonNegative, OneOf, Seed, Whole
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner

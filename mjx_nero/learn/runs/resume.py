@@ -7,7 +7,8 @@ from typing import Any
 
 import jax
 
-from mjx_nero import config, files, values
+from mjx_nero import config, files
+from mjx_nero.config import values
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner

@@ -9,8 +9,9 @@ from typing import Any
 
 from scipy import stats
 
-from mjx_nero import files, values
-from mjx_nero.bounds import NonNegative, Seed, Share, Whole
+from mjx_nero import files
+from mjx_nero.config import values
+from mjx_nero.config.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson

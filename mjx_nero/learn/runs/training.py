@@ -9,8 +9,9 @@ from typing import Any
 
 import jax
 
-from mjx_nero import config, console, files, values
-from mjx_nero.bounds import Share
+from mjx_nero import config, console, files
+from mjx_nero.config import values
+from mjx_nero.config.bounds import Share
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, header, machines, policy

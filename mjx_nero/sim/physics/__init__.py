@@ -58,7 +58,7 @@ class Physics(Protocol):
         """
         ...
 
-    def memory(self, num_devices: int = 1) -> Footprint:
+    def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the memory that one environment needs on each of the first devices."""
         ...
 

@@ -58,7 +58,7 @@ class JaxPhysics:
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """Does nothing: the compiled program holds everything."""
 
-    def memory(self, num_devices: int = 1) -> Footprint:
+    def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the memory of a step: a few times MJX's data."""
         return Footprint(in_program=2.5 * sum(x.nbytes for x in jax.tree.leaves(self._template)))
 

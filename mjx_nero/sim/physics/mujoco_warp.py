@@ -107,7 +107,7 @@ class WarpPhysics:
         """See ``physics.fusion``."""
         return fusion()
 
-    def memory(self, num_devices: int = 1) -> Footprint:
+    def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the size of MuJoCo Warp's data, and the free memory."""
         import warp as wp
 

@@ -109,7 +109,7 @@ class NativePhysics:
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """Does nothing: the first step is as quick as any."""
 
-    def memory(self, num_devices: int = 1) -> Footprint:
+    def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns an empty footprint: the C library uses no device memory."""
         return Footprint()
 

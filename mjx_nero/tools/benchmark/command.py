@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mjx_nero import cli, config, console, files
+from mjx_nero import config, console, files
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
@@ -22,6 +22,7 @@ from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.learn.runs import compiled
 from mjx_nero.sim.physics import impls, resolve_impl
+from mjx_nero.tools import cli
 from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
 from mjx_nero.tools.benchmark.program import Row
 

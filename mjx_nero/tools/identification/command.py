@@ -3,12 +3,13 @@
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import cli, config, console, files
+from mjx_nero import config, console, files
 from mjx_nero.envs import registry
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.fit import identify
 from mjx_nero.identify.plant import Plant
 from mjx_nero.identify.simulate import RecordCfg, record
+from mjx_nero.tools import cli
 from mjx_nero.tools.identification.report import save, save_plot, table
 
 _DT = 0.005

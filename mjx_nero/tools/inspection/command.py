@@ -5,8 +5,9 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero import cli, console, files
+from mjx_nero import console, files
 from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tools import cli
 from mjx_nero.tools.inspection.motion import moves
 from mjx_nero.tools.inspection.report import environments, find, inspect, picture
 from mjx_nero.tools.inspection.tables import environment_table, move_table, tables

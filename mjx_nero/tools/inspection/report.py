@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_nero import config, docs
-from mjx_nero.bounds import Range
+from mjx_nero import config
+from mjx_nero.config import docs
+from mjx_nero.config.bounds import Range
 from mjx_nero.envs import registry, tasks
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg

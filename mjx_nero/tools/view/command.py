@@ -8,12 +8,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_nero import cli, config, files, values
+from mjx_nero import config, files
+from mjx_nero.config import values
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn import policy
 from mjx_nero.learn.runs.folder import CONFIG
+from mjx_nero.tools import cli
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
 

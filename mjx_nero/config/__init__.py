@@ -1,4 +1,5 @@
-"""Frozen configs: dotted names, overrides with clear errors, JSON.
+"""Frozen configs: dotted names, overrides with clear errors, JSON. ``bounds`` says what values are possible, ``values`` reads
+them, ``docs`` finds what is written about them.
 
 Flags are made from the configs themselves, and not by a library for command lines: which there are depends on the environment
 (its terms, by name), and one set of names, readers and messages serves ``make(**fields)`` and the files of robots too.
@@ -10,9 +11,9 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar
 
-from mjx_nero import bounds, docs
+from mjx_nero.config import bounds, docs
+from mjx_nero.config.values import UNTYPED, hint, hints, read, short
 from mjx_nero.errors import UserError
-from mjx_nero.values import UNTYPED, hint, hints, read, short
 
 Cfg = TypeVar("Cfg")
 

@@ -10,16 +10,18 @@ from typing import Annotated, Any
 
 from mjx_nero.errors import UserError
 
+Number = int | float
+
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
     """A range from ``low`` to ``high``; ``above`` excludes ``low`` itself."""
 
-    low: float = -math.inf
-    high: float = math.inf
+    low: Number = -math.inf
+    high: Number = math.inf
     above: bool = False
 
-    def fault(self, value: float) -> str:
+    def fault(self, value: Number) -> str:
         """Describes what is wrong with a value; empty if nothing is."""
         if self.low < value <= self.high or value == self.low and not self.above:
             return ""
@@ -27,7 +29,7 @@ class Bounds:
         return f"must be {low}" + (f" and at most {_text(self.high)}" if self.high < math.inf else "")
 
 
-def _text(bound: float) -> str:
+def _text(bound: Number) -> str:
     """A bound for a message: whole numbers in full."""
     return f"{bound}" if isinstance(bound, int) else f"{bound:g}"
 
@@ -36,7 +38,7 @@ def _text(bound: float) -> str:
 class Ascending:
     """Two numbers, the lower first."""
 
-    def fault(self, value: tuple[float, float]) -> str:
+    def fault(self, value: tuple[Number, Number]) -> str:
         """See ``Bounds.fault``."""
         return "" if value[0] <= value[1] else "is a range and must run from low to high"
 
