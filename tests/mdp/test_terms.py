@@ -1,5 +1,6 @@
 """Every term on hand-made views, against numbers worked out by hand, and the folds that apply them."""
 
+import dataclasses
 import math
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from mjx_nero import UserError
 from mjx_nero.mdp import actions, commands, curriculum, events, metrics, observations, rewards, success, terminations, terms
 from mjx_nero.mdp.memory import Delay, History
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.types import LEVEL, ObjectView, ObstacleView, Start, View
 
 KEY = jax.random.PRNGKey(0)
@@ -570,21 +571,28 @@ def test_rewards_fold_weighs_scales_by_time_and_follows_the_curriculum():
 
 
 EXACT = {
-    "b": {"command": ObservationTerm(observations.command), "actions": ObservationTerm(observations.last_action)},
-    "a": {"actions": ObservationTerm(observations.last_action), "command": ObservationTerm(observations.command)},
+    "b": ObservationGroup(
+        {"command": ObservationTerm(observations.command), "actions": ObservationTerm(observations.last_action)}
+    ),
+    "a": ObservationGroup(
+        {"actions": ObservationTerm(observations.last_action), "command": ObservationTerm(observations.command)}
+    ),
 }
 NOISY = {
-    "state": {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "command": ObservationTerm(observations.command),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.1),
-    },
-    "privileged_state": {"joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01)},
+    "state": ObservationGroup(
+        {
+            "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+            "command": ObservationTerm(observations.command),
+            "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.1),
+        }
+    ),
+    "privileged_state": ObservationGroup({"joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01)}),
 }
+QUIET = {name: dataclasses.replace(group, corruption=False) for name, group in NOISY.items()}
 
 
 def test_observe_concatenates_in_the_order_of_the_config():
-    out = terms.observe(EXACT, view(), KEY, True, RECALL)
+    out = terms.observe(EXACT, view(), view(), KEY, RECALL)
     assert list(out) == ["b", "a"]
     np.testing.assert_allclose(out["b"], [0, 0, 0.3, 0.5, -1, 2], atol=1e-7)
     np.testing.assert_allclose(out["a"], [0.5, -1, 2, 0, 0, 0.3], atol=1e-7)
@@ -592,11 +600,11 @@ def test_observe_concatenates_in_the_order_of_the_config():
 
 def test_noise_keeps_its_bounds_and_is_independent():
     exact = np.array([0.25, -0.5, 0, 0, 0.3, 2, -3], np.float32)
-    off = terms.observe(NOISY, view(), KEY, False, RECALL)
+    off = terms.observe(QUIET, view(), view(), KEY, RECALL)
     np.testing.assert_array_equal(off["state"], exact)
     np.testing.assert_array_equal(off["privileged_state"], exact[:2])
 
-    draws = jax.vmap(lambda k: terms.observe(NOISY, view(), k, True, RECALL))(jax.random.split(KEY, 4000))
+    draws = jax.vmap(lambda k: terms.observe(NOISY, view(), view(), k, RECALL))(jax.random.split(KEY, 4000))
     noise = np.asarray(draws["state"]) - exact
     assert (noise[:, 2:5] == 0).all()  # no noise asked for
     bounds = np.array([0.01, 0.01, 0.1, 0.1])
