@@ -1,4 +1,7 @@
-"""Riemannian motion policies: the leaves of RMPflow's tree, and the algebra that sums them at its root (see ``rmpflow``)."""
+"""Riemannian motion policies: the leaves of RMPflow's tree, and the algebra that sums them at its root (see ``rmpflow``).
+
+A leaf has the name of its group in the parameter file, whose keys it reads.
+"""
 
 from typing import NamedTuple
 
@@ -15,9 +18,6 @@ class Rmp(NamedTuple):
 
     force: Array
     metric: Array
-
-
-# Leaves, under the names of their groups in the parameter file, whose keys they read.
 
 
 def cspace_target_rmp(p: cfg.CspaceTargetCfg, q, qd, default_q) -> Rmp:
@@ -82,9 +82,6 @@ def collision_rmp(p: cfg.CollisionCfg, x, xd) -> Rmp:
     nearness = jnp.maximum(1.0 - x / p.metric_modulation_radius, 0.0) ** 2
     metric = gate * nearness * p.metric_scalar / (x / p.metric_exploder_std_dev + p.metric_exploder_eps)
     return Rmp(metric * accel, metric)
-
-
-# The tree.
 
 
 def along(direction: Float[Array, "*n 3"], curvature: Float[Array, "*n"], leaf: Rmp) -> Rmp:

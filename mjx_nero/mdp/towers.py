@@ -97,9 +97,6 @@ def _levels(view: View, place: Place) -> Iterator[_Level]:
         due &= there
 
 
-# --- success
-
-
 def distance(view: View, *, place: Place) -> Scalar:
     """Of the object that is farthest from its place [m]."""
     ways = [way(view, below=below, object=object, rise=place.rise) for below, object in place.steps]
@@ -117,9 +114,6 @@ def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
         still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
         met.append(still & (jnp.linalg.norm(view.ee_pos_w - seen.pos_w) > place.clearance))
     return jnp.all(jnp.stack(met))
-
-
-# --- rewards
 
 
 def _sum(values: Iterable[Array]) -> Scalar:

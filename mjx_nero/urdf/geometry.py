@@ -5,40 +5,21 @@ import functools
 import time
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 import trimesh
 
-from mjx_nero.sim import model_file
 from mjx_nero.types import UserError
-from mjx_nero.urdf import files, meshes, primitives
+from mjx_nero.urdf import drawing, files, meshes, primitives
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Pose, Shape, Tree, Vec
+from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Shape, Tree, Vec
 
-MAX_FACES = 100_000  # a part; MuJoCo takes 200,000 of an STL
-LEAST_FACES = 1_000  # that a part keeps
-MAX_DRAWN = 300_000  # triangles of all meshes that are drawn, shared by them alike; finer ones cost seconds and show no more
-MAX_PARTS = 8  # colours of one mesh that are kept apart
 MAX_SHAPES = 4_000  # visuals and collisions of a robot
 MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once for every scale
-MAX_FILES = model_file.MAX_MESHES  # that are drawn
 MAX_SECONDS = 60.0  # [s] of processor time
 MAX_SPAN = 10.0  # [m] of a mesh and its link's origin, and ...
 MAX_SPANS = 50.0  # ... of the longest joint offset: one beyond both is in millimetres
 MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
-GREY = (0.75, 0.76, 0.78, 1.0)
 STAND_IN = (0.9, 0.6, 0.2, 1.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Visual:
-    """A visual geom: of MuJoCo's type ``kind`` and size (a mesh: the name of its file), at ``pose`` in the link [4, 4]."""
-
-    kind: str
-    size: tuple[float, ...]
-    pose: Pose
-    rgba: tuple[float, ...]
-    mesh: str = ""
 
 
 @dataclasses.dataclass
@@ -48,7 +29,7 @@ class Look:
     ``exact`` are those collisions that are primitives already. ``guessed``: a stand-in, for want of meshes.
     """
 
-    drawn: list[Visual]
+    drawn: list[drawing.Visual]
     surfaces: list[tuple[Points, float]]
     exact: list[primitives.Primitive | None]
     guessed: bool = False
@@ -58,11 +39,36 @@ class Look:
         return np.concatenate([points for points, _ in self.surfaces]) if self.surfaces else None
 
 
-class Looks:
-    """Loads the meshes and gathers the files to write.
+class Work:
+    """Counts the triangles that were worked on, and the time since it was made.
 
     Attributes:
-        stl: name -> content of the mesh files of the model.
+        triangles: so far.
+    """
+
+    def __init__(self) -> None:
+        self.triangles, self._started = 0, time.process_time()
+
+    def spend(self, parts: list[meshes.Part]) -> None:
+        """Counts work that grows with triangles.
+
+        Raises:
+            UserError: that was too much.
+        """
+        self.triangles += sum(len(mesh.faces) for mesh, _ in parts)
+        seconds = time.process_time() - self._started
+        if self.triangles > MAX_WORK or seconds > MAX_SECONDS:
+            spent = f"{self.triangles:,} triangles in {seconds:.0f} s"
+            raise UserError(
+                f"its meshes, a time for each scale, come to {spent}: {MAX_WORK:,} in {MAX_SECONDS:g} s are the most; "
+                "use simpler ones"
+            )
+
+
+class Looks:
+    """Loads the meshes of all links: what is drawn of each, and the surfaces that collision shapes are fitted to.
+
+    Attributes:
         of: link -> its ``Look``.
 
     Raises:
@@ -71,16 +77,13 @@ class Looks:
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], loader: meshes.Meshes, notes: Notes):
-        self.stl: dict[str, bytes] = {}
-        self._meshes, self._notes = loader, notes
-        self._written: dict[tuple, list[tuple[str, tuple[float, ...]]]] = {}
+        self._meshes, self._notes, self._work = loader, notes, Work()
         self._sampled: dict[tuple, tuple[Points, float]] = {}
-        self._work, self._started = 0, time.process_time()
         shapes = sum(len(link.visuals) + len(link.collisions) for link in tree.links.values())
         if shapes > MAX_SHAPES:
             raise UserError(f"the URDF has {shapes:,} visuals and collisions: more than {MAX_SHAPES:,} are not read")
         drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
-        self._share = MAX_DRAWN // max(len(drawn), 1)
+        self._files = drawing.MeshFiles(len(drawn), self._work.spend, notes)
         self._spans: dict[tuple[str, tuple[float, ...]], float] = {}  # file and scale of a mesh -> its largest extent [m]
         self._absent: dict[str, str] = {}  # name of a mesh -> where it was looked for
         seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
@@ -93,7 +96,12 @@ class Looks:
             for name in body.links:
                 link, look = tree.links[name], self.of[name]
                 if not look.drawn and not look.surfaces and (link.visuals or link.collisions):
-                    self.of[name] = self._stand_in(name, tree)
+                    self.of[name] = stand_in(name, tree, notes)
+
+    @property
+    def stl(self) -> dict[str, bytes]:
+        """Name -> content of the mesh files of the model."""
+        return self._files.stl
 
     def _look(self, link: Link) -> Look:
         """A link's shapes. Without a visual the collision's mesh is drawn, unless the link is fixed to one with a visual; without
@@ -127,37 +135,22 @@ class Looks:
             elif not loaded[tag] and loaded[other]:
                 self._notes.add("guessed", "link", link.name, f"no {tag} in the URDF: the {other}'s is {use}")
         shown = loaded["visual"] or (loaded["collision"] if link.visuals or link.name not in self._beside else [])
-        drawn = [d for item in shown for d in self._draw(item, link.name)]
+        drawn = [visual for item in shown for visual in self._files.visuals(*item, link.name)]
         fitted = loaded["collision"] or loaded["visual"]
         count = min(primitives.SAMPLES, max(MAX_POINTS // max(len(fitted), 1), 20))
         surfaces = [self._surface(shape, parts, count) for shape, _, parts in fitted]
-        return Look(drawn, surfaces, [_exact(shape) for shape, _, _ in fitted])
+        return Look(drawn, surfaces, [primitives.exact(shape) for shape, _, _ in fitted])
 
     def _surface(self, shape: Shape, parts: list[meshes.Part], count: int) -> tuple[Points, float]:
         """Points on the shape in the link's frame [count, 3], and the volume of its convex hull [m3]."""
         key = (shape.kind, shape.file, shape.size, count)
         if key not in self._sampled:
-            self._spend(parts)
+            self._work.spend(parts)
             scale = shape.size if shape.kind == "mesh" else (1.0,) * 3
-            points = primitives.sample(_scaled(meshes.joined([m for m, _ in parts]), scale), count)
+            points = primitives.sample(drawing.scaled(meshes.joined([m for m, _ in parts]), scale), count)
             self._sampled[key] = points, _volume(shape) or primitives.hull(points)
         points, volume = self._sampled[key]
         return points @ shape.origin[:3, :3].T + shape.origin[:3, 3], volume
-
-    def _spend(self, parts: list[meshes.Part]) -> None:
-        """Counts work that grows with triangles.
-
-        Raises:
-            UserError: that was too much.
-        """
-        self._work += sum(len(mesh.faces) for mesh, _ in parts)
-        seconds = time.process_time() - self._started
-        if self._work > MAX_WORK or seconds > MAX_SECONDS:
-            spent = f"{self._work:,} triangles in {seconds:.0f} s"
-            raise UserError(
-                f"its meshes, a time for each scale, come to {spent}: {MAX_WORK:,} in {MAX_SECONDS:g} s are the most; "
-                "use simpler ones"
-            )
 
     def _load(self, shape: Shape) -> tuple[str, list[meshes.Part]]:
         if shape.kind != "mesh":
@@ -167,68 +160,30 @@ class Looks:
         self._spans[shape.file, shape.size] = float(np.ptp(corners, axis=0).max())
         return stem, parts
 
-    def _draw(self, item: tuple[Shape, str, list[meshes.Part]], link: str) -> list[Visual]:
-        shape, stem, parts = item
-        exact = _exact(shape)
-        if exact is not None:
-            return [Visual(exact.kind, exact.size, exact.pose, shape.rgba or GREY)]
-        if shape.kind == "cylinder":
-            return [Visual("cylinder", (shape.size[0], shape.size[1] / 2), shape.origin, shape.rgba or GREY)]
-        key = (shape.file, shape.size)
-        if key not in self._written:
-            self._written[key] = self._write(stem, parts, shape.size, link)
-        return [Visual("mesh", (), shape.origin, shape.rgba or rgba, name) for name, rgba in self._written[key]]
 
-    def _write(self, stem: str, parts: list[meshes.Part], scale: tuple, link: str) -> list[tuple[str, tuple[float, ...]]]:
-        self._spend(parts)
-        if len(parts) > MAX_PARTS:
-            merged = meshes.joined([mesh for mesh, _ in parts[MAX_PARTS - 1 :]])
-            parts = [*parts[: MAX_PARTS - 1], (merged, parts[MAX_PARTS - 1][1])]
-        out, share = [], self._share / max(sum(len(mesh.faces) for mesh, _ in parts), 1)
-        for mesh, rgba in parts:
-            mesh = _scaled(mesh, scale)
-            limit = min(max(int(share * len(mesh.faces)), LEAST_FACES), MAX_FACES)
-            if len(mesh.faces) > limit:
-                before, mesh = len(mesh.faces), _coarser(mesh, limit)
-                self._notes.add("note", "link", link, f"mesh of {before} triangles drawn with {len(mesh.faces)}")
-            content = trimesh.exchange.stl.export_stl(mesh)
-            if not _loads(content):
-                self._notes.add("note", "link", link, f"a part of mesh {stem!r} is too flat or small to draw: left out")
-                continue
-            name, n = stem, 1
-            while name in self.stl:
-                n += 1
-                name = f"{stem}_{n}"
-            self.stl[name] = content
-            if len(self.stl) > MAX_FILES or sum(map(len, self.stl.values())) > model_file.MAX_MESH_BYTES:
-                most = f"{MAX_FILES} files of {model_file.MAX_MESH_BYTES / 1e6:.0f} MB"
-                raise UserError(f"its meshes, one for each scale and colour, are more than {most}: use fewer or simpler ones")
-            out.append((name, rgba or GREY))
-        return out
+def stand_in(name: str, tree: Tree, notes: Notes) -> Look:
+    """A capsule from the link's origin to the next joint, or about twice as far as its centre of mass; or a ball.
 
-    def _stand_in(self, name: str, tree: Tree) -> Look:
-        """A capsule from the link's origin to the next joint, or about twice as far as its centre of mass; or a ball.
-
-        Its radius follows from the mass at 1500 kg/m3, within 15 to 60 mm.
-        """
-        ends = [j.origin[:3, 3] for j in tree.joints.values() if j.parent == name]
-        ends = [e for e in ends if np.linalg.norm(e) > 0.02] or [2 * tree.links[name].mass.com]
-        end = max(ends, key=np.linalg.norm)
-        length = float(np.linalg.norm(end))
-        if length > 2.0 or length < 0.02:
-            end, length = np.zeros(3), 0.0
-        mass = tree.links[name].mass.mass
-        radius = float(np.clip(np.sqrt(mass / 1500 / np.pi / max(length, 0.05)), 0.015, 0.06))
-        if length == 0.0:
-            shape = primitives.Primitive("sphere", (radius,), np.eye(4))
-        else:
-            radius = min(radius, length / 2)
-            place = primitives.pose(_along(end / length), end / 2)
-            shape = primitives.Primitive("capsule", (radius, max(length / 2 - radius, 5e-4)), place)
-        self._notes.add("guessed", "link", name, f"{shape.kind} of radius {radius:.3f} m in place of its meshes")
-        mesh = _mesh(shape)
-        drawn = Visual(shape.kind, shape.size, shape.pose, STAND_IN)
-        return Look([drawn], [(primitives.sample(mesh), shape.volume)], [shape], guessed=True)
+    Its radius follows from the mass at 1500 kg/m3, within 15 to 60 mm.
+    """
+    ends = [j.origin[:3, 3] for j in tree.joints.values() if j.parent == name]
+    ends = [e for e in ends if np.linalg.norm(e) > 0.02] or [2 * tree.links[name].mass.com]
+    end = max(ends, key=np.linalg.norm)
+    length = float(np.linalg.norm(end))
+    if length > 2.0 or length < 0.02:
+        end, length = np.zeros(3), 0.0
+    mass = tree.links[name].mass.mass
+    radius = float(np.clip(np.sqrt(mass / 1500 / np.pi / max(length, 0.05)), 0.015, 0.06))
+    if length == 0.0:
+        shape = primitives.Primitive("sphere", (radius,), np.eye(4))
+    else:
+        radius = min(radius, length / 2)
+        place = primitives.pose(_along(end / length), end / 2)
+        shape = primitives.Primitive("capsule", (radius, max(length / 2 - radius, 5e-4)), place)
+    notes.add("guessed", "link", name, f"{shape.kind} of radius {radius:.3f} m in place of its meshes")
+    mesh = _mesh(shape)
+    drawn = drawing.Visual(shape.kind, shape.size, shape.pose, STAND_IN)
+    return Look([drawn], [(primitives.sample(mesh), shape.volume)], [shape], guessed=True)
 
 
 @functools.lru_cache(maxsize=100)
@@ -282,51 +237,9 @@ def _along(z: Vec) -> Matrix:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def _exact(shape: Shape) -> primitives.Primitive | None:
-    if shape.kind == "box":
-        return primitives.Primitive("box", tuple(s / 2 for s in shape.size), shape.origin)
-    if shape.kind == "capsule":
-        return primitives.Primitive("capsule", (shape.size[0], shape.size[1] / 2), shape.origin)
-    return primitives.Primitive("sphere", shape.size, shape.origin) if shape.kind == "sphere" else None
-
-
-def _scaled(mesh: trimesh.Trimesh, scale: tuple[float, ...]) -> trimesh.Trimesh:
-    faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces  # a mirror turns the triangles inside out
-    return trimesh.Trimesh(mesh.vertices * np.array(scale), faces, process=False)
-
-
 def _volume(shape: Shape) -> float | None:
     """Of a primitive [m3]."""
-    exact = _exact(shape)
+    exact = primitives.exact(shape)
     if exact is not None:
         return exact.volume
     return float(np.pi * shape.size[0] ** 2 * shape.size[1]) if shape.kind == "cylinder" else None
-
-
-def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """Vertices moved together on a grid, about the finest that leaves at most so many triangles."""
-    lower, extent, cells = mesh.vertices.min(0), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0, 512
-    while True:
-        grid = np.floor((mesh.vertices - lower) / (extent / cells)).astype(np.int64)
-        _, first, group = np.unique(grid @ [1 << 20, 1 << 10, 1], return_index=True, return_inverse=True)
-        faces = group[mesh.faces]
-        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
-        if len(faces) > most:  # equal ones
-            key = (faces[:, 0] * len(first) + faces[:, 1]) * len(first) + faces[:, 2]
-            faces = faces[np.unique(key, return_index=True)[1]]
-        if len(faces) <= most:
-            return trimesh.Trimesh(mesh.vertices[first], faces, process=False)
-        cells = int(cells * min(0.8, np.sqrt(most / len(faces))))  # a surface has as many as the square of the cells
-
-
-def _loads(stl: bytes) -> bool:
-    """Whether MuJoCo takes the mesh: not, if it is flat."""
-    spec = mujoco.MjSpec()
-    spec.assets = {"m.stl": stl}
-    spec.add_mesh(name="m", file="m.stl")
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="m", contype=0, conaffinity=0, mass=0)
-    try:
-        spec.compile()
-    except ValueError:
-        return False
-    return True

@@ -17,7 +17,8 @@ from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
 from mjx_nero.urdf.cloud import Cloud
-from mjx_nero.urdf.geometry import Looks, Visual
+from mjx_nero.urdf.drawing import Visual
+from mjx_nero.urdf.geometry import Looks
 from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses

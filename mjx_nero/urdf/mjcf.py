@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree
 
 from mjx_nero.urdf import primitives
-from mjx_nero.urdf.geometry import Visual
+from mjx_nero.urdf.drawing import Visual
 from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
 
 TABLE, CUBE = 1, 2  # contact bits of the scenes

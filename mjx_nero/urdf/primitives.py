@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy import spatial
 
-from mjx_nero.urdf.tree import Matrix, Points, Pose, Values, Vec
+from mjx_nero.urdf.tree import Matrix, Points, Pose, Shape, Values, Vec
 
 SAMPLES = 3000
 OUTSIDE = 0.02  # share of the surface that may stick out: a bolt's head shall not make the whole shape thicker
@@ -143,3 +143,12 @@ def _capsule(points: Points, frame: Matrix) -> Primitive:
 def _principal(points: Points) -> Matrix:
     axes = np.linalg.eigh(np.cov(points.T))[1]
     return axes * np.sign(np.linalg.det(axes))
+
+
+def exact(shape: Shape) -> Primitive | None:
+    """A URDF's box, sphere or capsule as MuJoCo has it; None for other shapes."""
+    if shape.kind == "box":
+        return Primitive("box", tuple(s / 2 for s in shape.size), shape.origin)
+    if shape.kind == "capsule":
+        return Primitive("capsule", (shape.size[0], shape.size[1] / 2), shape.origin)
+    return Primitive("sphere", shape.size, shape.origin) if shape.kind == "sphere" else None

@@ -27,7 +27,7 @@ PER, PER_GPU = 64, 640  # env steps of a chunk: two iterations on a CPU, twenty 
 
 # Physics that compiles at once, and whose programs JAX keeps: a start takes seconds, which leaves time for many kills.
 KINEMATIC = "import mjx_nero; from kinematic import Kinematic; mjx_nero.ManipulationEnv.physics = Kinematic(); "
-MAIN = "from mjx_nero import cli; from mjx_nero.tools.train import main; cli.run(main)"
+MAIN = "from mjx_nero.tools import cli; from mjx_nero.tools.train import main; cli.run(main)"
 
 
 def flags(says: str | None) -> argparse.ArgumentParser:

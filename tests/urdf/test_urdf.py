@@ -15,10 +15,11 @@ from scipy import optimize
 from test_nero_model import EXTENTS, MASSES
 
 import mjx_nero
+from mjx_nero.envs import registry
 from mjx_nero.sim import grasp, robot_file, scene
 from mjx_nero.tools.import_urdf import main
 from mjx_nero.types import UserError
-from mjx_nero.urdf import drives, files, geometry, import_urdf, inertia, meshes, primitives, read
+from mjx_nero.urdf import drawing, drives, files, geometry, import_urdf, inertia, meshes, primitives, read
 from mjx_nero.urdf import folder as model_folder
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Mass, bodies
@@ -97,7 +98,7 @@ def test_nero_bodies_and_joints(nero):
 
 def test_nero_config(nero):
     robot = robot_file.read(nero[0] / "out")
-    assert robot == mjx_nero.envs.registry.robot(nero[0] / "out")
+    assert robot == registry.robot(nero[0] / "out")
     assert robot.arm.joints == tuple(f"joint{i}" for i in range(1, 8))
     assert robot.gripper.joints == ("gripper_joint1", "gripper_joint2")
     assert robot.gripper.open == (0.05, -0.05) and robot.gripper.close == (0.0, 0.0)
@@ -652,7 +653,7 @@ def test_limits_of_continuous_joints(tmp_path, limit, expected):
 @pytest.mark.parametrize("limits", [{"MAX_FACES": 10_000}, {"MAX_DRAWN": 10_000}], ids=lambda limits: next(iter(limits)))
 def test_large_meshes_are_made_coarser(tmp_path, monkeypatch, limits):
     for name, value in limits.items():
-        monkeypatch.setattr(geometry, name, value)
+        monkeypatch.setattr(drawing, name, value)
     ball = trimesh.creation.icosphere(subdivisions=6, radius=0.1)  # 81,920 triangles
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "m.stl").write_bytes(trimesh.exchange.stl.export_stl(ball))
@@ -665,7 +666,7 @@ def test_large_meshes_are_made_coarser(tmp_path, monkeypatch, limits):
 
 def test_meshes_share_the_triangles_that_are_drawn(tmp_path, monkeypatch):
     """Two of 20,480, which may have 10,000 together; a small one keeps its own."""
-    monkeypatch.setattr(geometry, "MAX_DRAWN", 15_000)
+    monkeypatch.setattr(drawing, "MAX_DRAWN", 15_000)
     (tmp_path / "in").mkdir()
     for name, fineness in (("a", 5), ("b", 5), ("c", 2)):
         ball = trimesh.creation.icosphere(subdivisions=fineness, radius=0.1)
