@@ -84,10 +84,10 @@ def find(
         down: orientation of the grasp point with the hand pointing down, wxyz.
         shapes: what must not get below the table.
     """
-    if not hand.joints or hand.gap <= 0 or work is None:
+    if not hand.joints or not grasp.edge(hand.gap, hand.pad, hand.closed) or work is None:
         return None, None, down, 0.0
     along = opening(down)
-    low = grasp.height(hand.gap, hand.pad) + hand.grip @ hand.approach - cloud.height
+    low = grasp.height(hand.gap, hand.pad, hand.closed) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
     w, x, y, z = down
     other = (-z + 0.0, -y + 0.0, x, w)  # half a turn on about the vertical
