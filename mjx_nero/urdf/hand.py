@@ -149,10 +149,18 @@ class _Gripper:
         at, spots = self.poses(self._around(share)), self.grip.meeting.spots
         one = at[a][:, :3, :3] @ spots[0] + at[a][:, :3, 3]
         other = at[b][:, :3, :3] @ spots[1] + at[b][:, :3, 3] if not self.grip.jaw else self._fixed_spot(spots[1])
-        opening = snapped(_unit((one - other)[1] - (one - other)[0], np.array([0.0, 1.0, 0.0])))
-        approach = self._ahead((one + other).mean(0) / 2, opening, share) if ahead is None else ahead
-        opening = _unit(opening - approach * (approach @ opening), opening)
-        return np.column_stack([approach, opening, np.cross(approach, opening)])
+        way = (one - other)[1] - (one - other)[0]
+        if self.grip.jaw and not self.swing.blind:  # from face to face: the bisector of jaws that hold something points ahead
+            way = (one - other).mean(0)
+        pivot, axis = self._hinge(share)
+        opening = snapped(_unit(way - axis * (axis @ way), np.array([0.0, 1.0, 0.0])))
+        if ahead is None:
+            tip, across = (one + other).mean(0) / 2, np.cross(axis, opening)
+            ahead = _ahead(tip, opening, self._wrist())
+            if np.linalg.norm(across) > 0.8:
+                ahead = across / np.linalg.norm(across) * (np.sign(across @ (tip - pivot)) or 1.0)
+        opening = _unit(opening - ahead * (ahead @ opening), opening)
+        return np.column_stack([ahead, opening, np.cross(ahead, opening)])
 
     def _fixed_spot(self, spot: Vec) -> np.ndarray:
         base = np.linalg.inv(self._at_link)
@@ -161,20 +169,16 @@ class _Gripper:
     def _around(self, share: float) -> Values:
         return np.clip([share - NUDGE, share + NUDGE], 0, 1)
 
-    def _ahead(self, tip: Vec, opening: Vec, share: float) -> Vec:
-        """Where the fingers point, across the opening: of those that turn across their axis, too."""
-        name, hinge = self.grip.meeting.names[0], None
+    def _hinge(self, share: float) -> tuple[Vec, Vec]:
+        """Where the joint turns that turns the first finger, and its axis; zeros if none does."""
+        name, pivot, axis = self.grip.meeting.names[0], np.zeros(3), np.zeros(3)
+        there = self.poses(np.array([share]))
         while name in self.swing.inside:
-            joint = self.parts[name].joint
+            joint, pose = self.parts[name].joint, there[name][0]
             if joint is not None and joint.type != "prismatic":
-                hinge = self.poses(np.array([share]))[name][0], joint.axis
+                pivot, axis = pose[:3, 3], pose[:3, :3] @ joint.axis
             name = self.parts[name].parent
-        if hinge is not None:
-            across = np.cross(hinge[0][:3, :3] @ hinge[1], opening)
-            if np.linalg.norm(across) > 0.8:
-                across = across / np.linalg.norm(across)
-                return across * (np.sign(across @ (tip - hinge[0][:3, 3])) or 1.0)
-        return _ahead(tip, opening, self._wrist())
+        return pivot, axis
 
     def _wrist(self) -> Vec:
         """Where the joint before the last one is."""
@@ -184,7 +188,7 @@ class _Gripper:
 
     def _fingers(self, share: float, frame: Matrix) -> tuple[list[tuple[pads.Finger, Body]], pads.Finger | None]:
         """The fingers that move, and the fixed jaw of one that is alone."""
-        there, around = self.poses(np.array([share])), self.poses(self._around(share))
+        there, around = self.poses(np.array([share, 0.0])), self.poses(self._around(share))
         moving = []
         for name in self.grip.fingers:
             points = None if self.swing.blind else surface(self.parts[name].links, self.looks)
@@ -192,11 +196,11 @@ class _Gripper:
             way = (around[name][1] - around[name][0]) @ spot
             points = None if points is None else points @ there[name][0][:3, :3].T + there[name][0][:3, 3]
             outward = float(np.sign(frame[:, 1] @ way[:3])) or 1.0
-            moving.append((pads.Finger(name, points, there[name][0], outward), self.parts[name]))
+            moving.append((pads.Finger(name, points, *there[name], outward), self.parts[name]))
         if not self.grip.jaw:
             return moving, None
         pose = there[self.grip.jaw][0]
-        return moving, pads.Finger(self.grip.jaw, surface({self.grip.jaw: pose}, self.looks), pose, -moving[0][0].outward)
+        return moving, pads.Finger(self.grip.jaw, surface({self.grip.jaw: pose}, self.looks), pose, pose, -moving[0][0].outward)
 
     def hand(self, held: _Held) -> Hand:
         """As it is, the grasp point amid its pads."""

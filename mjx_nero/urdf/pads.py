@@ -24,12 +24,14 @@ class Finger:
         name: of its body, or of the link that is the fixed jaw.
         points: of its surface [n, 3], in the link that the gripper's frame is given in; None: unknown.
         pose: of the body or link there [4, 4].
+        shut: of the body where the gripper is closed [4, 4].
         outward: to which side along the opening it moves away, 1 or -1; of a fixed jaw the side that it is on.
     """
 
     name: str
     points: Points | None
     pose: Pose
+    shut: Pose
     outward: float
 
 
@@ -56,11 +58,12 @@ def fitted(moving: list[tuple[Finger, Body]], fixed: Finger | None, frame: Matri
         else:
             end = _distal(finger.points, frame, length)
             _split(out, finger, finger.points, end, frame)
-    if fixed is not None and fixed.points is not None:
-        faces = _facing(fixed, out.held[0], frame)
-        _split(out, fixed, fixed.points, faces, frame) if faces.any() else _add(out, fixed, _like(out.held[0], fixed, frame))
-    elif fixed is not None:
-        _add(out, fixed, _like(out.held[0], fixed, frame))
+    if fixed is not None:
+        faces = None if fixed.points is None else _facing(fixed, moving[0][0], out, frame)
+        if faces is None or not faces.any():
+            _add(out, fixed, _like(out.held[0], fixed, frame))
+        else:
+            _split(out, fixed, fixed.points, faces, frame)
     return out
 
 
@@ -70,12 +73,20 @@ def _add(out: Pads, finger: Finger, pad: Primitive) -> None:
 
 
 def _split(out: Pads, finger: Finger, points: Points, end: Bool[np.ndarray, " n"], frame: Matrix) -> None:
-    """A pad for the part that grips, a shape for the rest."""
+    """A pad for the part that grips, a shape for what lies behind it."""
     box = primitives.box(points[end], frame)
     _add(out, finger, primitives.measured(box, points[end], primitives.hull(points[end])))
-    if np.count_nonzero(~end) >= FEW:
-        back = primitives.best(points[~end], primitives.hull(points[~end]), boxes=False)
+    behind = points[points @ frame[:, 0] < (points[end] @ frame[:, 0]).min()]
+    if len(behind) >= FEW:
+        back = primitives.best(behind, primitives.hull(behind), boxes=False)
+        if _reach(back, frame) > _reach(box, frame):  # a ball about a palm
+            back = primitives.measured(primitives.box(behind, frame), behind, primitives.hull(behind))
         out.backs[finger.name] = dataclasses.replace(back, pose=np.linalg.inv(finger.pose) @ back.pose)
+
+
+def _reach(shape: Primitive, frame: Matrix) -> float:
+    """How far it reaches along the approach [m]."""
+    return -float(shape.lowest(np.append(-frame[:, 0], 0.0)[None])[0])
 
 
 def _distal(points: Points, frame: Matrix, length: float) -> Bool[np.ndarray, " n"]:
@@ -85,24 +96,28 @@ def _distal(points: Points, frame: Matrix, length: float) -> Bool[np.ndarray, " 
     return chosen if FEW <= chosen.sum() <= len(points) - FEW else np.ones(len(points), bool)
 
 
-def _facing(jaw: Finger, pad: Primitive, frame: Matrix) -> Bool[np.ndarray, " n"]:
-    """Which of the fixed jaw's points [n] face the moving one's pad: no wider than that, as thick, and on the other side.
+def _facing(jaw: Finger, finger: Finger, out: Pads, frame: Matrix) -> Bool[np.ndarray, " n"]:
+    """Which of the fixed jaw's points [n] face the moving one's pad: no wider, as thick, and not before the face that it meets.
 
-    Along the approach they are the same, or, if the jaw ends before, as long a part that ends where the jaw does.
+    Along the approach they go from where that pad begins when it holds the cube to where it ends when it has closed, or, if the
+    jaw ends before, to its end.
     """
     assert jaw.points is not None
-    centre, half = pad.pose[:3, 3] @ frame, np.abs(frame.T @ pad.pose[:3, :3]) @ np.array(pad.size)
-    at = jaw.points @ frame - centre
-    beyond = at[:, 1] * jaw.outward > half[1] - MARGIN
-    beside = (np.abs(at[:, 2]) <= half[2] + MARGIN) & beyond
+    held = out.held[0]
+    half, met = np.abs(frame.T @ held.pose[:3, :3]) @ np.array(held.size), finger.shut @ np.linalg.inv(finger.pose) @ held.pose
+    start, end = held.pose[:3, 3] @ frame, met[:3, 3] @ frame
+    at = jaw.points @ frame
+    depth = at[:, 1] * jaw.outward - (start[1] * jaw.outward + half[1])
+    beside = (np.abs(at[:, 2] - end[2]) <= half[2] + MARGIN) & (depth > -MARGIN)
     if beside.sum() < FEW:
         return np.zeros(len(at), bool)
-    tip = min(float(np.quantile(at[beside, 0], 0.999)), half[0])
-    facing = beside & (at[:, 0] <= tip) & (at[:, 0] >= tip - 2 * half[0])
-    if facing.sum() < FEW:
+    tip = min(float(np.quantile(at[beside, 0], 0.999)), end[0] + half[0])
+    faces = beside & (at[:, 0] <= tip) & (at[:, 0] >= tip - 2 * half[0])
+    if faces.sum() < FEW:
         return np.zeros(len(at), bool)
-    depth = at[:, 1] * jaw.outward
-    return facing & (depth <= np.quantile(depth[facing], 0.01) + max(2 * half[1], THICK))
+    face = float(np.quantile(depth[faces], 0.01))
+    thick = (depth >= face - MARGIN / 2) & (depth <= face + max(2 * half[1], THICK))
+    return beside & thick & (at[:, 0] <= tip) & (at[:, 0] >= min(start[0] - half[0], tip - 2 * half[0]))
 
 
 def _blind(finger: Finger, body: Body, frame: Matrix) -> Primitive:
@@ -122,10 +137,14 @@ def _like(pad: Primitive, jaw: Finger, frame: Matrix) -> Primitive:
 
 
 def middle(boxes: list[Primitive], frame: Matrix) -> Vec:
-    """Amid the pads, in the axes of ``frame``; along the opening between the faces that look at each other."""
+    """Amid the pads, in the axes of ``frame``: amid what they share along the approach, along the opening between the faces that
+    look at each other."""
     centres = np.array([b.pose[:3, 3] @ frame for b in boxes])
     half = np.array([np.abs(frame[:, 1] @ b.pose[:3, :3]) @ np.array(b.size) for b in boxes])
+    reach = np.array([np.abs(frame[:, 0] @ b.pose[:3, :3]) @ np.array(b.size) for b in boxes])
+    first, last = (centres[:, 0] - reach).max(), (centres[:, 0] + reach).min()
     out = centres.mean(0)
+    out[0] = (first + last) / 2 if first < last else out[0]
     if len(boxes) > 1:
         low, high = np.argmin(centres[:, 1]), np.argmax(centres[:, 1])
         out[1] = (centres[low, 1] + half[low] + centres[high, 1] - half[high]) / 2

@@ -11,9 +11,9 @@ from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.tree import Body, Joint, Points, Poses, Values, Vec, below
 from mjx_nero.urdf.tree import poses as body_poses
 
-FOLLOWED, KEPT = 150, 3000  # points of a shape that are followed, and that others are near to
+FOLLOWED, KEPT = 300, 3000  # points of a shape that are followed, and that others are near to
 STEPS, TURN = 13, 73  # positions of a swing, and of a whole turn
-FACE = 0.2  # share of a shape's points, those that come nearest to another: the face with which it meets that
+FACE = 0.2  # of what a shape's points differ by in parting from another: the face with which it meets that differs by no more
 BESIDE = 0.7  # what a moving shape's meeting a fixed one is worth: two that move are fingers, if they meet alike
 INNER = 0.25  # of the way: shapes that are farther apart at the end than somewhere before have met there
 TOUCH = 5e-3  # [m] shapes as near as that touch: points on a surface are a few millimetres apart
@@ -99,7 +99,8 @@ class Swing:
         moved = some @ np.moveaxis(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
         away = self._trees[other].query(moved.reshape(-1, 3))[0].reshape(len(poses), -1)
         worth = np.ptp(away, axis=0) - away.min(0)
-        face = worth >= np.quantile(worth, 1 - FACE)
+        low, high = np.quantile(worth, (0.1, 0.99))
+        face = worth >= high - FACE * (high - low)
         return away[:, face].mean(1), some[face].mean(0)
 
     def ends(
