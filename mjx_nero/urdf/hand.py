@@ -14,7 +14,7 @@ from mjx_nero.urdf.fingers import Grip, Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.swing import Swing, surface
-from mjx_nero.urdf.tree import Body, Matrix, Pose, Poses, Tree, Values, Vec, body_of, depth
+from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Poses, Tree, Values, Vec, body_of, depth
 from mjx_nero.urdf.tree import poses as body_poses
 
 _TIPS = re.compile(r"tcp|(^|[_/])ee(_|$)|end_?effector|grasp|gripper_frame|hand_tip", re.IGNORECASE)
@@ -162,7 +162,7 @@ class _Gripper:
         opening = _unit(opening - ahead * (ahead @ opening), opening)
         return np.column_stack([ahead, opening, np.cross(ahead, opening)])
 
-    def _fixed_spot(self, spot: Vec) -> np.ndarray:
+    def _fixed_spot(self, spot: Vec) -> Points:
         base = np.linalg.inv(self._at_link)
         return np.tile(base[:3, :3] @ spot + base[:3, 3], (2, 1))
 

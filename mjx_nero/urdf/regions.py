@@ -74,10 +74,10 @@ def find(
     The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
     which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
     ``OVER`` it, and with nothing below the table. Where there are none either way round the hand may be turned any way about
-    the vertical, and where there are none of those either, lean by up to the last of ``LEANS``. The rectangle of such cells is taken whose
-    area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG`` times ``WIDE``; then
-    inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held may be brought as
-    far up from there as the arm gets with the hand within ``HELD`` of down.
+    the vertical, and where there are none of those either, lean: by up to the first of ``LEANS`` that will do. The rectangle of
+    such cells is taken whose area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG``
+    times ``WIDE``; then inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held
+    may be brought as far up from there as the arm gets with the hand within ``HELD`` of down.
 
     Args:
         work: the workspace; it says on which side the work is.

@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 from scipy import spatial
 
 from mjx_nero.urdf.geometry import Look
@@ -93,9 +94,9 @@ class Swing:
         two, face = self._face(self.fixed[b] if fixed else self.shapes[b], np.linalg.inv(there), a)
         return Meeting((a, b), fixed, (one + two) / 2, (spot, face))
 
-    def _face(self, points: Points, poses: Poses, other: str) -> tuple[Values, Vec]:
-        """How far the face with which it meets ``other`` is from that in each of the poses [n], and the middle of that face."""
-        some = points[:: 1 + len(points) // FOLLOWED]
+    def _face(self, points: Points, poses: Float[np.ndarray, "s 4 4"], other: str) -> tuple[Float[np.ndarray, " s"], Vec]:
+        """How far the face with which it meets ``other`` is from that in each of the poses [s], and the middle of that face."""
+        some = _some(points, FOLLOWED)
         moved = some @ np.moveaxis(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
         away = self._trees[other].query(moved.reshape(-1, 3))[0].reshape(len(poses), -1)
         worth = np.ptp(away, axis=0) - away.min(0)
@@ -194,6 +195,6 @@ def _moved(parts: dict[str, Body], joints: Sequence[str]) -> list[str]:
     return [n for n in parts if n in moved]
 
 
-def _some(points: Points) -> Points:
-    """No more of them than are needed; those of several links in turns."""
-    return points[:: 1 + len(points) // KEPT]
+def _some(points: Points, most: int = KEPT) -> Float[np.ndarray, "k 3"]:
+    """As many of them, evenly: those of several links in turns."""
+    return points[:: -(-len(points) // most)]
