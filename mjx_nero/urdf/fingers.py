@@ -116,7 +116,7 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
         open, closed: positions of some joints, in place of the guess [rad, m].
 
     Raises:
-        UserError: ``open`` or ``closed`` names another joint than the gripper's.
+        UserError: ``open`` or ``closed`` names another joint than the gripper's, or they are the same.
     """
     for flag, given in (("--open", open), ("--closed", closed)):
         for name in given:
@@ -124,9 +124,12 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
                 raise UserError(f"{flag} names joint {name!r}{config.hint(name, joints)}: the gripper has {', '.join(joints)}")
     close, wide = swing.ends(joints, open, closed)
     meetings = swing.between(close, wide)
+    if not meetings:
+        raise UserError(
+            f"open and closed are the same to {', '.join(joints)}: give --open and --closed, or --gripper with others"
+        )
     first = meetings[0]
     fingers = first.names[:1] if first.fixed else _fingers(swing, meetings)
-    parent = swing.joints[joints[0]].parent
     for finger in fingers:
         joint = swing.parts[finger].joint
         text = ", ".join(f"{n} {wide[n]:g}" for n in joints)
@@ -136,7 +139,7 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
         tuple(wide[j] for j in joints),
         tuple(close[j] for j in joints),
         swing.fork,
-        parent if parent in swing.parts[swing.fork].links else swing.fork,
+        swing.link,
         fingers,
         first.names[1] if first.fixed else "",
         first,
@@ -184,7 +187,7 @@ def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Loo
         if last.type == "prismatic" or upper - lower <= JAW:
             return (last.name,), above
         if endless(last):
-            if Swing(parts, looks, (last.name,), above).jaw(last.name, {last.name: np.zeros(1)}) is not None:
+            if Swing(tree, parts, looks, (last.name,), above).jaw(last.name, {last.name: np.zeros(1)}) is not None:
                 return (last.name,), above
             text = f"joint {last.name!r} turns without limits, and its link meets nothing: a wrist. If it is a jaw, give "
             text += f"--gripper {last.name} --open {last.name}=VALUE --closed {last.name}=VALUE"

@@ -63,7 +63,7 @@ def find(
         link, at = _placed(tree, ee) if ee is not None else (_tool(parts), np.zeros(3))
         hand = bare(parts, looks, link, at)
     else:
-        swing = Swing(parts, looks, joints, fork)
+        swing = Swing(tree, parts, looks, joints, fork)
         gripper = _Gripper(swing, looks, fingers.grip(swing, joints, open or {}, closed or {}, notes))
         held = gripper.held()
         named = _named(parts, gripper.grip.link, held.site) if ee is None else None
@@ -200,7 +200,8 @@ class _Gripper:
         if not self.grip.jaw:
             return moving, None
         pose = there[self.grip.jaw][0]
-        return moving, pads.Finger(self.grip.jaw, surface({self.grip.jaw: pose}, self.looks), pose, pose, -moving[0][0].outward)
+        points = None if self.swing.blind else surface({self.grip.jaw: pose}, self.looks)
+        return moving, pads.Finger(self.grip.jaw, points, pose, pose, -moving[0][0].outward)
 
     def hand(self, held: _Held) -> Hand:
         """As it is, the grasp point amid its pads."""
@@ -285,7 +286,8 @@ def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
         notes.add("guessed", "robot", name, f"{known} (--open and --closed change it)")
         return
     between = ", ".join((*grip.fingers, *([grip.jaw] if grip.jaw else [])))
-    why = known if hand.gap else f"the pads on {between} do not part between {shut} and {opened}"
+    meshes = "no mesh of its fingers was found, and " if blind else ""
+    why = known if hand.gap else f"{meshes}the pads on {between} do not part between {shut} and {opened}"
     flags = " ".join(f"--{flag} {','.join(f'{j}=VALUE' for j in grip.joints)}" for flag in ("open", "closed"))
     other = "; --gripper names other joints"
     lack = "no cube fits between its fingers" if hand.gap else "how far its gripper opens is unknown"

@@ -9,14 +9,15 @@ from jaxtyping import Float
 from scipy import spatial
 
 from mjx_nero.urdf.geometry import Look
-from mjx_nero.urdf.tree import Body, Joint, Points, Poses, Values, Vec, below
+from mjx_nero.urdf.tree import Body, Joint, Points, Poses, Tree, Values, Vec, below
 from mjx_nero.urdf.tree import poses as body_poses
 
-FOLLOWED, KEPT = 300, 3000  # points of a shape that are followed, and that others are near to
+FOLLOWED, KEPT = 250, 2000  # points of a shape that are followed, and that others are near to
 STEPS, TURN = 13, 73  # positions of a swing, and of a whole turn
 FACE = 0.2  # of what a shape's points differ by in parting from another: the face with which it meets that differs by no more
 BESIDE = 0.7  # what a moving shape's meeting a fixed one is worth: two that move are fingers, if they meet alike
 INNER = 0.25  # of the way: shapes that are farther apart at the end than somewhere before have met there
+STILL = 1e-6  # [m, 1] bodies whose poses differ by less do not move against one another
 TOUCH = 5e-3  # [m] shapes as near as that touch: points on a surface are a few millimetres apart
 WIDE = 0.01  # [m] and shapes that part by less never met
 AT_ZERO, NEAR_ZERO = 0.1, 1.2  # [rad] an endless jaw closes within this of its zero: what it meets farther round is the arm
@@ -50,26 +51,28 @@ class Swing:
 
     Attributes:
         inside: the bodies that move.
+        link: of the fork, on which the first joint hangs.
         shapes: of those that have any their surfaces, in their frames [n, 3]; a single point each, if none has.
         fixed: likewise of the links of the fork, in its frame.
         blind: no shape is known.
     """
 
-    def __init__(self, parts: dict[str, Body], looks: Mapping[str, Look], joints: Sequence[str], fork: str):
+    def __init__(self, tree: Tree, parts: dict[str, Body], looks: Mapping[str, Look], joints: Sequence[str], fork: str):
         self.parts, self.fork = parts, fork
         self.joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
         self.inside = _moved(parts, joints)
         found = {n: surface(parts[n].links, looks) for n in self.inside}
         self.shapes = {n: _some(points) for n, points in found.items() if points is not None}
         self.blind = not self.shapes
-        links = {n: {n: at} for n, at in parts[fork].links.items()}
-        held = {n: points for n, link in links.items() if (points := surface(link, looks)) is not None}
-        self.fixed = {n: _some(points) for n, points in held.items()}
+        held = {n: surface({n: at}, looks) for n, at in parts[fork].links.items()}
+        self.fixed = {n: _some(points) for n, points in held.items() if points is not None}
         if self.blind:
             drawn = [n for n in self.inside if any(looks[link].drawn for link in parts[n].links)]
             self.shapes = {n: parts[n].mass.com[None] for n in drawn or self.inside}
-        if not self.fixed:
-            self.fixed = {fork: parts[fork].mass.com[None]}
+        parent = self.joints[joints[0]].parent
+        self.link = parent if parent in parts[fork].links else fork
+        if self.blind or not self.fixed:
+            self.fixed = {self.link: (parts[fork].links[self.link] @ np.append(tree.links[self.link].mass.com, 1.0))[None, :3]}
         self._trees = {n: spatial.cKDTree(points) for n, points in {**self.fixed, **self.shapes}.items()}
 
     def poses(self, q: Positions) -> dict[str, Poses]:
@@ -82,17 +85,17 @@ class Swing:
     def meetings(self, q: Positions) -> list[Meeting]:
         """All pairs of shapes that move against one another, the one first that is most likely to grip."""
         poses = self.poses(q)
+        inverse = {n: np.linalg.inv(pose) for n, pose in poses.items()}
         pairs = [(a, b, False) for a, b in itertools.combinations(self.shapes, 2)]
         pairs += [(a, b, True) for a in self.shapes for b in self.fixed]
-        found = [self._meeting(a, b, fixed, poses) for a, b, fixed in pairs]
+        found = []
+        for a, b, fixed in pairs:
+            there = inverse[self.fork if fixed else b] @ poses[a]
+            if np.ptp(there, axis=0).max() > STILL:
+                one, spot = self._face(self.shapes[a], there, b)
+                two, face = self._face(self.fixed[b] if fixed else self.shapes[b], np.linalg.inv(there), a)
+                found.append(Meeting((a, b), fixed, (one + two) / 2, (spot, face)))
         return sorted(found, key=lambda m: -m.worth)
-
-    def _meeting(self, a: str, b: str, fixed: bool, poses: Mapping[str, Poses]) -> Meeting:
-        moving, other = poses[a], poses[self.fork if fixed else b]
-        there = np.linalg.inv(other) @ moving
-        one, spot = self._face(self.shapes[a], there, b)
-        two, face = self._face(self.fixed[b] if fixed else self.shapes[b], np.linalg.inv(there), a)
-        return Meeting((a, b), fixed, (one + two) / 2, (spot, face))
 
     def _face(self, points: Points, poses: Float[np.ndarray, "s 4 4"], other: str) -> tuple[Float[np.ndarray, " s"], Vec]:
         """How far the face with which it meets ``other`` is from that in each of the poses [s], and the middle of that face."""
@@ -121,7 +124,8 @@ class Swing:
         end = {j: open.get(j, ways[j][1]) for j in joints}
         if not (open or closed):
             shares = np.linspace(0, 1, STEPS)
-            first, last = _turned(self.between(start, end)[0].apart)
+            found = self.between(start, end)
+            first, last = _turned(found[0].apart) if found else (0, STEPS - 1)
             start, end = ({j: start[j] + shares[k] * (end[j] - start[j]) for j in joints} for k in (first, last))
         return {j: float(start[j]) for j in joints}, {j: float(end[j]) for j in joints}
 
@@ -137,7 +141,8 @@ class Swing:
             return self.jaw(name, rest) or (0.0, np.pi / 2)
         lower, upper = limits(joint)
         q = np.linspace(lower, upper, STEPS)
-        apart = self.meetings({**{j: np.repeat(v, STEPS) for j, v in rest.items()}, name: q})[0].apart
+        found = self.meetings({**{j: np.repeat(v, STEPS) for j, v in rest.items()}, name: q})
+        apart = found[0].apart if found else q
         return (lower, upper) if apart.argmin() <= apart.argmax() else (upper, lower)
 
     def jaw(self, name: str, rest: Positions) -> tuple[float, float] | None:
