@@ -221,7 +221,7 @@ class _Gripper:
             held.pads.pads,
             held.pads.backs,
             tuple(self.swing.inside),
-            gap if gap - closed > LEAST else 0.0,
+            gap if gap - closed > LEAST and np.isfinite(grip.meeting.worth) else 0.0,
             closed,
             extents,
         )

@@ -31,7 +31,7 @@ class Meeting:
     Attributes:
         names: a moving body, and another one or a link that the gripper hangs on.
         fixed: the second is such a link.
-        apart: how far the faces are apart with which they meet [n].
+        apart: how far the faces are apart with which they meet [n]; of points that stand for shapes, farther than when nearest.
         spots: the middles of these faces, in the frames of the two; of a fixed one in the fork's.
     """
 
@@ -42,8 +42,10 @@ class Meeting:
 
     @property
     def worth(self) -> float:
-        """How far the two part, less what is left between them when they are nearest [m]."""
-        return float(np.ptp(self.apart) - self.apart.min()) * (BESIDE if self.fixed else 1.0)
+        """How far the two part, less what is left between them when they are nearest [m]; -inf of a finger that never comes near
+        what is fixed."""
+        parted = float(np.ptp(self.apart) - self.apart.min())
+        return parted if not self.fixed else BESIDE * parted if parted > 0 else -np.inf
 
 
 class Swing:
@@ -94,7 +96,8 @@ class Swing:
             if np.ptp(there, axis=0).max() > STILL:
                 one, spot = self._face(self.shapes[a], there, b)
                 two, face = self._face(self.fixed[b] if fixed else self.shapes[b], np.linalg.inv(there), a)
-                found.append(Meeting((a, b), fixed, (one + two) / 2, (spot, face)))
+                apart = (one + two) / 2
+                found.append(Meeting((a, b), fixed, apart - apart.min() if self.blind else apart, (spot, face)))
         return sorted(found, key=lambda m: -m.worth)
 
     def _face(self, points: Points, poses: Float[np.ndarray, "s 4 4"], other: str) -> tuple[Float[np.ndarray, " s"], Vec]:
@@ -126,7 +129,7 @@ class Swing:
             shares = np.linspace(0, 1, STEPS)
             found = self.between(start, end)
             first, last = _turned(found[0].apart) if found else (0, STEPS - 1)
-            start, end = ({j: start[j] + shares[k] * (end[j] - start[j]) for j in joints} for k in (first, last))
+            start, end = ({j: (1 - shares[k]) * start[j] + shares[k] * end[j] for j in joints} for k in (first, last))
         return {j: float(start[j]) for j in joints}, {j: float(end[j]) for j in joints}
 
     def between(self, closed: Mapping[str, float], open: Mapping[str, float]) -> list[Meeting]:
