@@ -144,6 +144,8 @@ class _Hand:
         self._robot, model = robot.gripper, robot_model(robot)
         self._couplings, self.data = linkage.couplings(model), mujoco.MjData(model)
         self.model, self.pads = model, [model.geom(name).id for name in pads(model)]
+        self._site, self._down = robot.ee_site, robot.down
+        self._sides = self._side() if len(self.pads) > 2 else {i: k > 0 for k, i in enumerate(self.pads)}
 
     def positions(self, share: float) -> np.ndarray:
         """Of the gripper's joints."""
@@ -177,11 +179,24 @@ class _Hand:
         return high
 
     def apart(self, share: float) -> float:
-        """The least distance between two pads that are not of one body [m]."""
+        """The least distance between two pads that are on different sides of the opening, or on different bodies where all pads
+        are on one side [m]."""
         self.move(share)
         bodies, far, ends = self.model.geom_bodyid, 1.0, np.zeros(6)
         pairs = [(a, b) for a, b in itertools.combinations(self.pads, 2) if bodies[a] != bodies[b]]
-        return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in pairs), default=0.0)
+        opposed = [(a, b) for a, b in pairs if self._sides[a] != self._sides[b]]
+        return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in opposed or pairs), default=0.0)
+
+    def _side(self) -> dict[int, bool]:
+        """On which side of the opening each of the pads is when the hand is open."""
+        self.move(1.0)
+        sites = [self.model.site(i).name for i in range(self.model.nsite)]
+        frame = self.data.site(self._site) if self._site in sites else self.data.body(self._site)
+        local = math.rotate(math.quat_conj(jnp.array(self._down)), jnp.array([0.0, 1.0, 0.0]))
+        opening = frame.xmat.reshape(3, 3) @ np.array(local)
+        along = {i: float(self.data.geom(i).xpos @ opening) for i in self.pads}
+        middle = (min(along.values(), default=0.0) + max(along.values(), default=0.0)) / 2
+        return {i: at > middle for i, at in along.items()}
 
 
 def cube_for(robot: RobotCfg) -> ObjectCfg:

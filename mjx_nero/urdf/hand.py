@@ -196,7 +196,7 @@ class _Gripper:
             way = (around[name][1] - around[name][0]) @ spot
             points = None if points is None else points @ there[name][0][:3, :3].T + there[name][0][:3, 3]
             outward = float(np.sign(frame[:, 1] @ way[:3])) or 1.0
-            moving.append((pads.Finger(name, points, *there[name], outward), self.parts[name]))
+            moving.append((pads.Finger(name, points, there[name][0], there[name][1], outward), self.parts[name]))
         if not self.grip.jaw:
             return moving, None
         pose = there[self.grip.jaw][0]
@@ -277,8 +277,8 @@ def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
         blank = "no mesh: a box pad of 20 x 20 x 6 mm stands at its frame, or at a turning jaw's end"
         notes.add("guessed", "link", finger, blank if blind else text)
     if grip.jaw:
-        known = hand.pads[grip.jaw].fill > 0
-        text = "a box pad on what faces the moving jaw" if known else "no mesh: a box pad like the other's, where that closes"
+        seen = hand.pads[grip.jaw].fill > 0
+        text = "a box pad on what faces the moving jaw" if seen else "no mesh: a box pad like the other's, where that closes"
         notes.add("guessed", "link", grip.jaw, f"the fixed jaw, {text}")
     opened, shut = (", ".join(f"{j} {q:.4g}" for j, q in zip(grip.joints, ends, strict=True)) for ends in (grip.open, grip.close))
     known = f"its pads are {1000 * hand.gap:.0f} mm apart when open ({opened}), {1000 * hand.closed:.0f} mm when closed ({shut})"

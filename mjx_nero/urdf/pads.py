@@ -58,12 +58,10 @@ def fitted(moving: list[tuple[Finger, Body]], fixed: Finger | None, frame: Matri
         else:
             end = _distal(finger.points, frame, length)
             _split(out, finger, finger.points, end, frame)
-    if fixed is not None:
-        faces = None if fixed.points is None else _facing(fixed, moving[0][0], out, frame)
-        if faces is None or not faces.any():
-            _add(out, fixed, _like(out.held[0], fixed, frame))
-        else:
-            _split(out, fixed, fixed.points, faces, frame)
+    if fixed is not None and fixed.points is not None and (faces := _facing(fixed, moving[0][0], out, frame)).any():
+        _split(out, fixed, fixed.points, faces, frame)
+    elif fixed is not None:
+        _add(out, fixed, _like(out.held[0], fixed, frame))
     return out
 
 
