@@ -16,24 +16,31 @@ from mjx_nero.types import UserError
 
 SHARE, MOST = 0.4, 0.6  # of the opening: an edge, and the longest that leaves room to miss the middle
 LARGEST = 0.06  # [m]
+GRIPPED = 0.01  # [m] a cube is this much larger than the closed gripper's gap
 CLEAR = 0.005  # [m] the pads stay this far above the table
 DENSITY = 1000.0  # [kg/m3] 30 g at an edge of 31 mm
 Pad = tuple[float, float, float]
 
 
-def edge(opening: float, pad: Pad) -> float:
+def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
     """Of a cube that the gripper can lift [m]: ``SHARE`` of its opening, or more where long pads would touch the table before.
 
+    It is larger than the gap of the closed gripper, by ``GRIPPED`` or a quarter of the stroke; 0 where no cube fits between.
+
     Args:
-        opening: between the pads when open [m].
+        opening, closed: between the pads when open and when closed [m].
         pad: its size along the approach, across, and along the opening [m].
     """
-    return round(min(max(SHARE * opening, pad[0] + 2 * CLEAR), MOST * opening, LARGEST), 3)
+    wanted = min(max(SHARE * opening, pad[0] + 2 * CLEAR), MOST * opening, LARGEST)
+    least = closed + min(GRIPPED, (opening - closed) / 4)
+    if wanted < least > opening - 2 * CLEAR:
+        return 0.0
+    return round(max(wanted, least), 3)
 
 
-def height(opening: float, pad: Pad) -> float:
+def height(opening: float, pad: Pad, closed: float = 0.0) -> float:
     """Of the pads' middle above the table when they grasp that cube [m]: its own middle, or higher for the sake of ``CLEAR``."""
-    return max(edge(opening, pad) / 2, lowest(pad))
+    return max(edge(opening, pad, closed) / 2, lowest(pad))
 
 
 def lowest(pad: Pad) -> float:
@@ -137,6 +144,8 @@ class _Hand:
         self._robot, model = robot.gripper, robot_model(robot)
         self._couplings, self.data = linkage.couplings(model), mujoco.MjData(model)
         self.model, self.pads = model, [model.geom(name).id for name in pads(model)]
+        self._site, self._down = robot.ee_site, robot.down
+        self._sides = self._side() if len(self.pads) > 2 else {i: k > 0 for k, i in enumerate(self.pads)}
 
     def positions(self, share: float) -> np.ndarray:
         """Of the gripper's joints."""
@@ -170,23 +179,39 @@ class _Hand:
         return high
 
     def apart(self, share: float) -> float:
-        """The least distance between two pads that are not of one body [m]."""
+        """The least distance between two pads that are on different sides of the opening, or on different bodies where all pads
+        are on one side [m]."""
         self.move(share)
         bodies, far, ends = self.model.geom_bodyid, 1.0, np.zeros(6)
         pairs = [(a, b) for a, b in itertools.combinations(self.pads, 2) if bodies[a] != bodies[b]]
-        return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in pairs), default=0.0)
+        opposed = [(a, b) for a, b in pairs if self._sides[a] != self._sides[b]]
+        return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in opposed or pairs), default=0.0)
+
+    def _side(self) -> dict[int, bool]:
+        """On which side of the opening each of the pads is when the hand is open."""
+        self.move(1.0)
+        sites = [self.model.site(i).name for i in range(self.model.nsite)]
+        frame = self.data.site(self._site) if self._site in sites else self.data.body(self._site)
+        local = math.rotate(math.quat_conj(jnp.array(self._down)), jnp.array([0.0, 1.0, 0.0]))
+        opening = frame.xmat.reshape(3, 3) @ np.array(local)
+        along = {i: float(self.data.geom(i).xpos @ opening) for i in self.pads}
+        middle = (min(along.values(), default=0.0) + max(along.values(), default=0.0)) / 2
+        return {i: at > middle for i, at in along.items()}
 
 
 def cube_for(robot: RobotCfg) -> ObjectCfg:
     """The cube that a robot can lift.
 
     Raises:
-        UserError: it has no gripper, or nobody said how far that opens.
+        UserError: it has no gripper, nobody said how far that opens, or that is no more than it closes to.
     """
     where = "its robot.yaml" if robot.folder else "its config"
     if not robot.gripper.joints:
         raise UserError(f"{robot.name} has no gripper: this task needs one; reach does without")
     if robot.opening <= 0:
         raise UserError(f"how far the gripper of {robot.name} opens is unknown: give opening, between its pads [m], in {where}")
-    size = edge(robot.opening, robot.pad)
+    size = edge(robot.opening, robot.pad, robot.closed)
+    if not size:
+        gaps = f"closes to {robot.closed:g} m and opens to {robot.opening:g} m between its pads"
+        raise UserError(f"the gripper of {robot.name} {gaps}: no cube fits; correct closed and opening in {where}")
     return cube(size, mass=float(f"{DENSITY * size**3:.3g}"))

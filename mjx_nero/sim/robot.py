@@ -79,7 +79,7 @@ class RobotCfg:
         workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
             draw their commands from it by default.
         floor: height of the floor under a robot beside the table [m]; 0: the robot stands on the table.
-        opening: distance between the pads of the open gripper [m]; 0: unknown.
+        opening, closed: distance between the pads of the open and of the closed gripper [m]; an opening of 0: unknown.
         pad: size of a pad along the approach, across it, and along the opening [m]; zeros: unknown.
         grip: centre of a held cube in the frame of ``ee_site`` [m].
         pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the
@@ -104,6 +104,7 @@ class RobotCfg:
     workspace: Box | None = None
     floor: float = 0.0
     opening: float = 0.0
+    closed: NonNegative = 0.0
     pad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grip: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pick: Box | None = None

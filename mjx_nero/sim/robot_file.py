@@ -39,6 +39,7 @@ _PLAIN = (
     "workspace",
     "floor",
     "opening",
+    "closed",
     "pad",
     "grip",
     "pick",
@@ -50,8 +51,8 @@ _HEAD = """\
 # arm, gripper: one line a joint: stiffness [N m/rad or N/m] and damping of its position drive, limits of effort and speed, home.
 # workspace: box from which reach tasks draw their commands, in the base frame before base_quat rotates it.
 # down: orientation of ee_site when the gripper points straight down. floor: height of the floor under a robot beside the table.
-# opening: distance between the pads of the open gripper. pad: size of a pad along the approach, across it and along the opening.
-# A zero means unknown. grip: centre of a held object in the frame of ee_site.
+# opening, closed: distance between the pads of the open and of the closed gripper. pad: size of a pad along the approach, across
+# it and along the opening. A zero means unknown. grip: centre of a held object in the frame of ee_site.
 # pick, hold: boxes of lift tasks, in the frame of workspace. The gripper can point down everywhere in pick, which begins at the
 # height for grasping; lean is the largest angle from straight down that it needs there. hold: box of goals.
 """

@@ -51,6 +51,8 @@ def main(argv: Sequence[str]) -> None:
         "--gripper", metavar="J1,J2", help="joints that drive the gripper; none for an arm without (default: guessed)"
     )
     parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point, in metres (default: amid the fingers' ends)")
+    parser.add_argument("--open", metavar="J=VALUE,...", help="where the gripper's joints are when it is open [rad, m]")
+    parser.add_argument("--closed", metavar="J=VALUE,...", help="and when it is closed (default: where its shapes meet)")
     parser.add_argument("--home", metavar="J=VALUE,...", help="home positions of some joints [rad, m] (default: guessed)")
     parser.add_argument(
         "--degrees", action="store_true", help="the URDF gives the limits and velocities of its hinges in degrees"
@@ -71,7 +73,9 @@ def main(argv: Sequence[str]) -> None:
         fix=_fixed(args.fix),
         gripper=gripper,
         ee=args.ee,
-        home=_positions(args.home),
+        open=_positions(args.open, "--open"),
+        closed=_positions(args.closed, "--closed"),
+        home=_positions(args.home, "--home"),
         degrees=args.degrees,
         strict=args.strict,
         force=args.force,
@@ -95,9 +99,9 @@ def _pairs(items: Sequence[str], usage: str, sign: str = "=") -> dict[str, str]:
     return out
 
 
-def _positions(text: str | None) -> Mapping[str, float]:
-    pairs = _pairs(text.split(",") if text else [], "--home takes JOINT=VALUE,...")
-    return {name: values.read(float, value, f"--home {name}") for name, value in pairs.items()}
+def _positions(text: str | None, flag: str) -> Mapping[str, float]:
+    pairs = _pairs(text.split(",") if text else [], f"{flag} takes JOINT=VALUE,...")
+    return {name: values.read(float, value, f"{flag} {name}") for name, value in pairs.items()}
 
 
 def _fixed(items: Sequence[str]) -> Mapping[str, float | None]:
@@ -135,7 +139,8 @@ def _facts(report: Report) -> Table:
     bodies = len({row["body"] for row in report.links.values()})
     facts.add("links", f"{len(report.links)} in {bodies} bodies, {report.mass:.3f} kg (URDF {report.mass_read:.3f} kg)")
     facts.add("joints", f"{len(moving)} moving{f', {mimics} of them by mimic' if mimics else ''}; arm {len(robot.arm.joints)}")
-    facts.add("gripper", ", ".join(robot.gripper.joints) or "none")
+    gaps = f"; {1000 * robot.closed:.0f} mm between its pads when closed, {1000 * robot.opening:.0f} mm when open"
+    facts.add("gripper", ", ".join(robot.gripper.joints) + gaps if robot.gripper.joints else "none")
     table, cube = report.contacts["table"], report.contacts["table_and_cube"]
     facts.add("contacts", f"at most {table} with the table, {cube} with a cube on it")
     for name in ("workspace", "pick", "hold"):

@@ -103,7 +103,7 @@ def rows(
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
-    cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad) ** 3 if hand.gap > 0 else 0.0
+    cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad, hand.closed) ** 3
     force = min(FORCE, PRESS * cube) if cube else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
     followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic]

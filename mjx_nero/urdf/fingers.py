@@ -1,21 +1,26 @@
-"""How the fingers open, where they grasp, and the shapes that do: guessed from where the joints move them."""
+"""Which joints are a gripper's, which bodies it grips with, and where its joints are when it is open and when it is closed."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool
 
-from mjx_nero.sim import grasp
-from mjx_nero.urdf import primitives
+from mjx_nero import config
+from mjx_nero.types import UserError
+from mjx_nero.urdf import chain, primitives
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Body, Joint, Matrix, Points, Pose, Tree, Vec, below, body_of, depth
-from mjx_nero.urdf.tree import poses as body_poses
+from mjx_nero.urdf.swing import Meeting, Swing, endless, limits, surface
+from mjx_nero.urdf.tree import Body, Pose, Tree, Vec, below, bodies, poses
 
-DISTAL = 0.4  # share of a finger's length, from the tip, that grips
-ON_AXIS = 5e-3  # [m] a tool this near to the last joint's axis is turned by it, not carried around
-PAD = (0.02, 0.02, 0.006)  # [m] along approach, across, thickness: of fingers whose meshes are missing
+_NAMES = re.compile(r"grip|finger|jaw|hand|knuckle|claw", re.IGNORECASE)
+MOST_JOINTS = 4  # driven joints of a finger
+JAW = 2.8  # [rad] the only jaw of a gripper opens by no more: a hand that turns further is at the wrist
+STILL = 2e-3  # [m] a joint that changes no distance between fingers by more does not grip
+ALIKE = 0.8  # of what the two fingers part by that part most: a third one parts by more
+Chosen = tuple[Tree, tuple[str, ...], str]
 
 
 @dataclasses.dataclass
@@ -32,7 +37,7 @@ class Hand:
         pads: link -> collision shape in its frame; the fixed jaw of a gripper with one moving jaw is among them.
         backs: link -> shape of the rest of a finger.
         inside: bodies that only the gripper's joints move.
-        gap: between the pads when open [m].
+        gap, closed: between the pads when open and when closed [m]; a gap of 0: unknown.
         pad: size of the first along the approach, across, and along the opening [m].
         grip: where the middle of a cube is that it grips, from the grasp point, in its frame [m].
     """
@@ -49,266 +54,183 @@ class Hand:
     backs: dict[str, primitives.Primitive]
     inside: tuple[str, ...]
     gap: float = 0.0
+    closed: float = 0.0
     pad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grip: Vec = dataclasses.field(default_factory=lambda: np.zeros(3))
 
 
-# Long: its steps share what they find.
-def gripper(
-    tree: Tree,
-    parts: dict[str, Body],
-    looks: Mapping[str, Look],
-    joints: tuple[str, ...],
-    fork: str,
-    notes: Notes,
-    ahead: Vec | None = None,
-) -> Hand:
-    """The whole of a gripper: which bodies grip, how they open, and the shapes that they grip with.
+@dataclasses.dataclass(frozen=True)
+class Grip:
+    """The bodies that grip, and how a gripper's joints move them.
+
+    Attributes:
+        joints: that drive it; ``open`` and ``close`` their positions [rad, m].
+        fork: body that carries the gripper.
+        link: of the fork, on which the first joint hangs.
+        fingers: bodies that move, those first of which one meets the other most.
+        jaw: link of the fork that the only finger meets; empty if two fingers move.
+        meeting: of the first finger and its counterpart.
+    """
+
+    joints: tuple[str, ...]
+    open: tuple[float, ...]
+    close: tuple[float, ...]
+    fork: str
+    link: str
+    fingers: tuple[str, ...]
+    jaw: str
+    meeting: Meeting
+
+
+def choose(tree: Tree, looks: Mapping[str, Look], gripper: Sequence[str] | None, notes: Notes) -> Chosen:
+    """The robot with arm and gripper alone moving, the joints that drive the gripper, and the body on which it hangs.
+
+    The gripper is what hangs on the body that ends the arm: joints that change the distance between fingers, driven or by
+    ``mimic``; or the last joint, if its name or its link's speaks of a gripper. Others there, a spinning horn for show or the
+    many joints of a human hand, are held still.
 
     Args:
-        joints: that drive it.
-        fork: body that carries it.
-        ahead: where the fingers point, in the axes of ``Hand.link`` [3], in place of the guess.
+        gripper: joints that drive it, in place of the guess; empty for none.
+
+    Raises:
+        UserError: ``gripper`` names what is not there.
     """
-    moved = {b.joint.name: b.joint for b in parts.values() if b.joint}
-    inside, fingers = _moving(parts, joints)
-    link = moved[joints[0]].parent if moved[joints[0]].parent in parts[fork].links else fork
-    at_link = parts[fork].links[link]
+    parts = bodies(tree)
+    limb = chain.limb(parts)
+    if gripper is None:
+        joints, fork = _guess(tree, parts, limb.end, looks, notes)
+        text = f"gripper: {', '.join(joints)}" if joints else "no gripper found"
+        notes.add("guessed", "robot", tree.name, f"{text} (--gripper changes it)")
+    else:
+        joints, fork = _given(parts, gripper)
+    idle = [n for n in _driven(parts, list(parts)) if n not in joints and n not in limb.joints]
+    return chain.fixed(tree, {n: chain.nearest(tree.joints[n]) for n in idle}, notes), joints, fork
 
-    def seen(q: Mapping[str, float]) -> dict[str, Pose]:
-        """Poses [4, 4] of bodies in ``link``."""
-        world = body_poses(parts, {j: np.array([v]) for j, v in q.items()})
-        base = np.linalg.inv(world[fork][0] @ at_link)
-        return {n: base @ world[n][0] for n in inside}
 
-    def wrist(q: Mapping[str, float]) -> Vec:
-        """Where the joint before the last one is, in ``link``."""
-        world = body_poses(parts, {j: np.array([v]) for j, v in q.items()})
-        base, above = np.linalg.inv(world[fork][0] @ at_link), parts[fork].parent
-        return base[:3, :3] @ world[above][0][:3, 3] + base[:3, 3] if above else base[:3, 3]
+def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], closed: Mapping[str, float], notes: Notes) -> Grip:
+    """Which bodies grip: the two that part most and come nearest as the joints move, and others that do so as well as they.
 
-    spots = {f: spot(parts[f], looks) for f in fingers}
-    still = _still(tree, looks, link)
+    Bodies without shapes, as the frame of a tip, are none of them.
 
-    def spread(q: Mapping[str, float]) -> float:
-        """How far the fingers are apart."""
-        poses = seen(q)
-        ends = [poses[f][:3, :3] @ spots[f] + poses[f][:3, 3] for f in fingers]
-        centre = still if len(ends) == 1 else np.mean(ends, axis=0)
-        return float(sum(np.linalg.norm(e - centre) for e in ends))
+    Args:
+        open, closed: positions of some joints, in place of the guess [rad, m].
 
-    open, close = _ends({j: limits(moved[j]) for j in joints}, spread)
+    Raises:
+        UserError: ``open`` or ``closed`` names another joint than the gripper's, or they are the same.
+    """
+    for flag, given in (("--open", open), ("--closed", closed)):
+        for name in given:
+            if name not in joints:
+                raise UserError(f"{flag} names joint {name!r}{config.hint(name, joints)}: the gripper has {', '.join(joints)}")
+    close, wide = swing.ends(joints, open, closed)
+    meetings = swing.between(close, wide)
+    if not meetings:
+        raise UserError(
+            f"open and closed are the same to {', '.join(joints)}: give --open and --closed, or --gripper with others"
+        )
+    first = meetings[0]
+    fingers = first.names[:1] if first.fixed else _fingers(swing, meetings)
     for finger in fingers:
-        joint = parts[finger].joint
-        text = ", ".join(f"{n} {open[n]:g}" for n in joints)
+        joint = swing.parts[finger].joint
+        text = ", ".join(f"{n} {wide[n]:g}" for n in joints)
         notes.add("guessed", "joint", joint.name if joint else "", f"a finger of the gripper, open at {text}")
-
-    shut, apart = seen(close), seen(open)
-    tips = [shut[f][:3, :3] @ spots[f] + shut[f][:3, 3] for f in fingers]
-    moves = [(apart[f][:3, :3] @ spots[f] + apart[f][:3, 3]) - tip for f, tip in zip(fingers, tips, strict=True)]
-    opening = snapped(_unit(moves[0] - (moves[1] if len(moves) > 1 else 0.0), np.array([0.0, 1.0, 0.0])))
-    approach = _ahead(np.mean(tips, axis=0), opening, wrist(close)) if ahead is None else ahead
-    opening = _unit(opening - approach * (approach @ opening), opening)
-    frame = np.column_stack([approach, opening, np.cross(approach, opening)])
-
-    surfaces = {f: _surface(parts[f], looks, shut[f]) for f in fingers}
-    meshed = {f: s for f, s in surfaces.items() if s is not None}
-    length = float(np.median([np.ptp(s @ approach) for s in meshed.values()])) if meshed else 0.0
-    boxes: list[primitives.Primitive] = []
-    pads: dict[str, primitives.Primitive] = {}
-    backs: dict[str, primitives.Primitive] = {}
-
-    def split(name: str, points: Points, pose: Pose) -> None:
-        """A pad for the distal part, a shape for the rest; ``points`` in ``link``, in which the body has the ``pose``."""
-        end = _distal(points, frame, length or float(np.ptp(points @ approach)))
-        boxes.append(primitives.box(points[end], frame))
-        pad = primitives.measured(boxes[-1], points[end], primitives.hull(points[end]))
-        pads[name] = dataclasses.replace(pad, pose=np.linalg.inv(pose) @ pad.pose)
-        if not end.all():
-            back = primitives.best(points[~end], primitives.hull(points[~end]), boxes=False)
-            backs[name] = dataclasses.replace(back, pose=np.linalg.inv(pose) @ back.pose)
-
-    for f in fingers:
-        if f in meshed:
-            split(f, meshed[f], shut[f])
-            text = f"a box pad on the distal {100 * DISTAL:.0f}%, along the opening; the rest meets the table only"
-            notes.add("guessed", "link", f, text)
-        else:
-            boxes.append(_blind(parts[f], shut[f], frame, np.sign(opening @ moves[fingers.index(f)]) or 1.0))
-            pads[f] = dataclasses.replace(boxes[-1], pose=np.linalg.inv(shut[f]) @ boxes[-1].pose)
-            text = "no mesh: a box pad of 20 x 20 x 6 mm stands at its frame, or at a turning jaw's end"
-            notes.add("guessed", "link", f, text)
-    look = looks[link]
-    if len(fingers) == 1 and look.points is not None and not look.guessed:
-        split(link, look.points, np.eye(4))
-        notes.add("guessed", "link", link, "the fixed jaw: a box pad on its end")
-    elif len(fingers) == 1:
-        shut_pad = shut[fingers[0]] @ pads[fingers[0]].pose
-        across = opening * (np.sign(opening @ moves[0]) or 1.0)
-        thick = 2 * float(np.abs(opening @ shut_pad[:3, :3]) @ np.array(pads[fingers[0]].size))
-        shut_pad[:3, 3] -= across * thick
-        boxes.append(dataclasses.replace(pads[fingers[0]], pose=shut_pad))
-        pads[link] = boxes[-1]
-        notes.add("guessed", "link", link, "the fixed jaw, no mesh: a box pad like the other's, where that closes")
-    gap, pad = (
-        _gap([apart.get(n, np.eye(4)) @ p.pose for n, p in pads.items()], list(pads.values()), opening),
-        _extents(boxes[0], frame),
-    )
-    # Of a fixed jaw half a cube away: the other one comes to it.
-    aside = np.sign(opening @ moves[0]) * grasp.edge(gap, pad) / 2 if len(fingers) == 1 else 0.0
-    return Hand(
+    return Grip(
         joints,
-        tuple(open[j] for j in joints),
+        tuple(wide[j] for j in joints),
         tuple(close[j] for j in joints),
-        link,
-        tuple(fingers),
-        primitives.pose(np.eye(3), np.round(frame @ _middle(boxes, frame), 6) + 0.0),  # [m]: what is guessed has no more digits
-        approach,
-        opening,
-        pads,
-        backs,
-        tuple(inside),
-        gap,
-        pad,
-        opening * aside,
+        swing.fork,
+        swing.link,
+        fingers,
+        first.names[1] if first.fixed else "",
+        first,
     )
 
 
-def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) -> Hand:
-    """Without a gripper: a tool that points along the last joint's axis, outwards, if it lies on that axis; else away from it."""
-    body = body_of(parts, link)
-    frame = body.links[link] @ primitives.pose(np.eye(3), at)
-    direction = frame[:3, 3]
-    if body.joint is not None and body.joint.type != "prismatic":
-        axis = body.joint.axis
-        if np.linalg.norm(np.cross(frame[:3, 3], axis)) < ON_AXIS:
-            along = float((frame[:3, 3] - np.linalg.inv(body.frame)[:3, 3]) @ axis)  # from the joint before
-            if abs(along) < ON_AXIS:  # a bare wrist: to where its link lies
-                surface = _surface(body, looks, np.eye(4))
-                along = 1.0 if surface is None else float((surface.max(0) + surface.min(0)) @ axis) or 1.0
-            direction = axis * np.sign(along)
-    approach = snapped(frame[:3, :3].T @ _unit(direction, frame[:3, 2]))
-    across = np.array([0.0, 1.0, 0.0]) if abs(approach[1]) < 0.7 else np.array([1.0, 0.0, 0.0])
-    opening = _unit(across - approach * (approach @ across), across)
-    return Hand((), (), (), link, (), primitives.pose(np.eye(3), at), approach, opening, {}, {}, ())
+def _fingers(swing: Swing, meetings: Sequence[Meeting]) -> tuple[str, ...]:
+    """The two bodies that meet first, and of each other branch of the gripper the best, if that meets as well."""
+    worth: dict[str, float] = {}
+    for meeting in meetings:
+        for name in meeting.names if not meeting.fixed else ():
+            worth[name] = max(worth.get(name, -1.0), meeting.worth)
+    first = meetings[0].names
+    taken = {_branch(swing, name) for name in first}
+    others: dict[str, str] = {}
+    for name in sorted(worth, key=lambda n: -worth[n]):
+        if worth[name] > ALIKE * meetings[0].worth and _branch(swing, name) not in taken:
+            others.setdefault(_branch(swing, name), name)
+    return (*sorted(first, key=swing.inside.index), *sorted(others.values(), key=swing.inside.index))
 
 
-def _moving(parts: dict[str, Body], joints: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The bodies that the joints and their followers move, and the fingers among them: those farthest down the tree."""
-    moved = {b.joint.name: b for b in parts.values() if b.joint}
-    inside = [n for n in parts if parts[n].joint and any(n in below(parts, moved[j].name) for j in _followers(parts, joints))]
+def _branch(swing: Swing, name: str) -> str:
+    """The body next to the fork on which a finger hangs."""
+    while swing.parts[name].parent in swing.inside:
+        name = swing.parts[name].parent
+    return name
+
+
+def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Look], notes: Notes) -> tuple[tuple[str, ...], str]:
+    """Driven joints of the gripper, and the body on which it hangs."""
+    branches = [_driven(parts, below(parts, b.name)) for b in parts.values() if b.parent == end and b.joint]
+    if branches and parts[end].parent:
+        if max(map(len, branches)) > MOST_JOINTS:
+            count = sum(map(len, branches))
+            notes.add("warning", "robot", tree.name, f"its hand has {count} joints: held still (--gripper J1,J2 moves some)")
+            return (), end
+        return tuple(_gripping(parts, end, [j for branch in branches for j in branch], looks)), end
+    here, above = end, parts[end].parent
+    last = parts[here].joint
+    while last and last.mimic and above:  # what follows another joint is driven by that one
+        here, above = above, parts[above].parent
+        last = parts[here].joint
+    if above and parts[above].joint and last and (_NAMES.search(last.name) or _NAMES.search(last.child)):
+        lower, upper = limits(last)
+        if last.type == "prismatic" or upper - lower <= JAW:
+            return (last.name,), above
+        if endless(last):
+            if Swing(tree, parts, looks, (last.name,), above).jaw(last.name, {last.name: np.zeros(1)}) is not None:
+                return (last.name,), above
+            text = f"joint {last.name!r} turns without limits, and its link meets nothing: a wrist. If it is a jaw, give "
+            text += f"--gripper {last.name} --open {last.name}=VALUE --closed {last.name}=VALUE"
+            notes.add("guessed", "robot", tree.name, text)
+    return (), end
+
+
+def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mapping[str, Look]) -> list[str]:
+    """Those of the joints that change the distance between two fingers; of endless ones none, if others do."""
+    by_name = {b.joint.name: b.joint for b in parts.values() if b.joint}
+    inside = below(parts, end)[1:]
     leaves = [n for n in inside if not any(parts[m].parent == n for m in inside)]
-    deepest = max(depth(parts, n) for n in leaves)
-    return inside, [n for n in leaves if depth(parts, n) == deepest]
+    if len(leaves) < 2:
+        return joints
+    spots = {n: np.append(_spot(parts[n], looks), 1.0) for n in leaves}
+    bounds = {n: limits(by_name[n]) for n in joints}
+    middle = {n: np.full(9, sum(bounds[n]) / 2) for n in joints}
+    out = []
+    for name in joints:
+        at = poses(parts, {**middle, name: np.linspace(*bounds[name], 9)}, 9)
+        ends = {n: at[n] @ spots[n] for n in leaves}
+        apart = [np.ptp(np.linalg.norm(ends[a] - ends[b], axis=1)) for a, b in itertools.combinations(leaves, 2)]
+        if max(apart) > STILL:
+            out.append(name)
+    bounded = [n for n in out if by_name[n].type != "continuous"]
+    return bounded or out
 
 
-def _ends(
-    ranges: Mapping[str, tuple[float, float]], spread: Callable[[Mapping[str, float]], float]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Open and closed positions: the end of each joint's range at which the fingers are farther apart, and the other."""
-    middle = {j: sum(ends) / 2 for j, ends in ranges.items()}
-    open: dict[str, float] = {}
-    close: dict[str, float] = {}
-    for name, (lower, upper) in ranges.items():
-        wider = spread({**middle, name: upper}) >= spread({**middle, name: lower})
-        close[name], open[name] = (lower, upper) if wider else (upper, lower)
-    return open, close
+def _given(parts: dict[str, Body], joints: Sequence[str]) -> tuple[tuple[str, ...], str]:
+    moved = {b.joint.name: b for b in parts.values() if b.joint and not b.joint.mimic}
+    for name in joints:
+        if name not in moved:
+            raise UserError(f"--gripper names joint {name!r}{config.hint(name, moved)}: choose from {', '.join(moved)}")
+    if len(set(joints)) == len(moved):
+        raise UserError("--gripper takes all joints: leave the arm at least one")
+    return tuple(dict.fromkeys(joints)), moved[joints[0]].parent if joints else ""
 
 
-def _ahead(tip: Vec, opening: Vec, wrist: Vec) -> Vec:
-    """Where the fingers point, across the opening: from the origin to their ``tip``, but never back to the ``wrist``."""
-    fallback = np.array([0.0, 0.0, 1.0]) if abs(opening[2]) < 0.7 else np.array([1.0, 0.0, 0.0])
-    approach = snapped(_unit(tip - opening * (tip @ opening), fallback - opening * (fallback @ opening)))
-    approach = _unit(approach - opening * (approach @ opening), approach)
-    return approach if approach @ (tip - wrist) >= 0 else -approach
+def _driven(parts: dict[str, Body], names: Sequence[str]) -> list[str]:
+    return [b.joint.name for b in parts.values() if b.name in names and b.joint and not b.joint.mimic]
 
 
-def _blind(finger: Body, at: Pose, frame: Matrix, outward: float) -> primitives.Primitive:
-    """The pad of a finger without a mesh; ``outward``: to which side along the opening it moves away, 1 or -1."""
-    assert finger.joint is not None
-    turns = finger.joint.type != "prismatic"
-    origin = (at @ np.append(2 * finger.mass.com * turns, 1.0))[:3]  # of a slide its frame, of a jaw about its end
-    half = np.array([PAD[0], PAD[2], PAD[1]]) / 2
-    pose = primitives.pose(frame, origin + frame[:, 1] * outward * half[1] - frame[:, 0] * half[0])
-    return primitives.Primitive("box", tuple(half.tolist()), pose, covered=0.0, fill=0.0)
-
-
-def _followers(parts: dict[str, Body], joints: Sequence[str]) -> list[str]:
-    """The joints and those that mimic them."""
-    return [b.joint.name for b in parts.values() if b.joint and (b.joint.name in joints or (b.joint.mimic or ("",))[0] in joints)]
-
-
-def limits(joint: Joint) -> tuple[float, float]:
-    """Of a gripper's joint; a quarter turn either way of one without limits, or with room for more than a turn."""
-    endless = joint.type == "continuous" or joint.type == "revolute" and joint.upper - joint.lower > 2 * np.pi + 1e-6
-    return (-np.pi / 2, np.pi / 2) if endless else (joint.lower, joint.upper)
-
-
-def spot(body: Body, looks: Mapping[str, Look]) -> Vec:
+def _spot(body: Body, looks: Mapping[str, Look]) -> Vec:
     """A point that stands for a finger: the mean of its surface, or its centre of mass."""
-    surface = _surface(body, looks, np.eye(4))
-    return body.mass.com if surface is None else surface.mean(0)
-
-
-def _surface(body: Body, looks: Mapping[str, Look], pose: Pose) -> Points | None:
-    """Points [n, 3] of a body's links, where the body has the ``pose`` [4, 4]; stand-ins do not count."""
-    found = []
-    for name, at in body.links.items():
-        points = looks[name].points
-        if points is not None and not looks[name].guessed:
-            at = pose @ at
-            found.append(points @ at[:3, :3].T + at[:3, 3])
-    return np.concatenate(found) if found else None
-
-
-def _still(tree: Tree, looks: Mapping[str, Look], link: str) -> Vec:
-    """A point that stands for the fixed jaw."""
-    look = looks[link]
-    return tree.links[link].mass.com if look.points is None or look.guessed else look.points.mean(0)
-
-
-def _distal(points: Points, frame: Matrix, length: float) -> Bool[np.ndarray, " n"]:
-    """Which of the points [n] are in the part that grips; all, if hardly any are."""
-    along = points @ frame[:, 0]
-    chosen = along >= np.quantile(along, 0.999) - DISTAL * length
-    return chosen if 20 <= chosen.sum() <= len(points) - 20 else np.ones(len(points), bool)
-
-
-def _middle(boxes: list[primitives.Primitive], frame: Matrix) -> Vec:
-    """Amid the pads, in the axes of ``frame``; along the opening between the faces that look at each other."""
-    centres = np.array([b.pose[:3, 3] @ frame for b in boxes])
-    middle = centres.mean(0)
-    if len(boxes) > 1:
-        low, high = np.argmin(centres[:, 1]), np.argmax(centres[:, 1])
-        middle[1] = (centres[low, 1] + boxes[low].size[1] + centres[high, 1] - boxes[high].size[1]) / 2
-    return middle
-
-
-def _gap(poses: list[Pose], pads: list[primitives.Primitive], opening: Vec) -> float:
-    """How far apart the faces are that look at each other along the opening, at the pads' ``poses`` [m]."""
-    centres = np.array([pose[:3, 3] @ opening for pose in poses])
-    half = np.array([np.abs(opening @ pose[:3, :3]) @ np.array(pad.size) for pose, pad in zip(poses, pads, strict=True)])
-    middle = (centres.min() + centres.max()) / 2
-    above = centres > middle
-    if len(pads) < 2 or above.all() or not above.any():
-        return 0.0
-    return round(max(float((centres - half)[above].min() - (centres + half)[~above].max()), 0.0), 4)
-
-
-def _extents(box: primitives.Primitive, frame: Matrix) -> tuple[float, float, float]:
-    """Full size along approach, across and along the opening [m]."""
-    along, between, across = (2 * float(np.abs(frame[:, k] @ box.pose[:3, :3]) @ np.array(box.size)) for k in range(3))
-    return round(along, 4), round(across, 4), round(between, 4)
-
-
-def _unit(vector: Vec, otherwise: Vec) -> Vec:
-    length = np.linalg.norm(vector)
-    return vector / length if length > 1e-6 else otherwise / np.linalg.norm(otherwise)
-
-
-def snapped(vector: Vec, within: float = 25.0) -> Vec:
-    """The nearest axis of the frame, if that is within so many degrees."""
-    nearest = np.argmax(np.abs(vector))
-    if abs(vector[nearest]) < np.cos(np.radians(within)):
-        return vector
-    return np.eye(3)[nearest] * np.sign(vector[nearest])
+    points = surface(body.links, looks)
+    return body.mass.com if points is None else points.mean(0)

@@ -1,21 +1,22 @@
-"""Which joints are the gripper's, and where the robot grasps: guessed from the tree and from names, or as the user says."""
+"""Where the robot grasps, where its hand points, and the pads that it grips with: guessed, or as the user says."""
 
 import dataclasses
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from mjx_nero import config
+from mjx_nero.sim import grasp
 from mjx_nero.types import UserError
-from mjx_nero.urdf import chain, fingers, primitives
-from mjx_nero.urdf.fingers import Hand
+from mjx_nero.urdf import fingers, pads, primitives
+from mjx_nero.urdf.fingers import Grip, Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Body, Matrix, Pose, Tree, Vec, below, bodies, body_of, depth, poses
+from mjx_nero.urdf.swing import Swing, surface
+from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Poses, Tree, Values, Vec, body_of, depth
+from mjx_nero.urdf.tree import poses as body_poses
 
-_NAMES = re.compile(r"grip|finger|jaw|hand|knuckle|claw", re.IGNORECASE)
 _TIPS = re.compile(r"tcp|(^|[_/])ee(_|$)|end_?effector|grasp|gripper_frame|hand_tip", re.IGNORECASE)
 _TOOLS = (  # of an arm without gripper, the best name first
     re.compile(r"tcp", re.IGNORECASE),
@@ -24,71 +25,54 @@ _TOOLS = (  # of an arm without gripper, the best name first
     re.compile(r"flange", re.IGNORECASE),
 )
 _SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realsense|vision|_ft(_|$)", re.IGNORECASE)
-MOST_JOINTS = 4  # driven joints of a finger
 NEAR = 0.06  # [m] a named frame this far from where the fingers meet is their grasp point; the flange's is further away
-ASKEW = np.radians(10)  # pads that are further off where a tool's axis points are fitted anew, along it
 TOOL_AXIS = 50.0  # [degrees] a tool's frame has an axis along which it works: the one within this of where the fingers point
-JAW = 2.8  # [rad] the only jaw of a gripper opens by no more: a hand that turns further is at the wrist
-STILL = 2e-3  # [m] a joint that changes no distance between fingers by more does not grip
-Chosen = tuple[Tree, tuple[str, ...], str]
-
-
-def choose(tree: Tree, looks: Mapping[str, Look], gripper: Sequence[str] | None, notes: Notes) -> Chosen:
-    """The robot with arm and gripper alone moving, the joints that drive the gripper, and the body on which it hangs.
-
-    The gripper is what hangs on the body that ends the arm: joints that change the distance between fingers, driven or by
-    ``mimic``; or the last joint, if its name or its link's speaks of a gripper. Others there, a spinning horn for show or the
-    many joints of a human hand, are held still.
-
-    Args:
-        gripper: joints that drive it, in place of the guess; empty for none.
-
-    Raises:
-        UserError: ``gripper`` names what is not there.
-    """
-    parts = bodies(tree)
-    limb = chain.limb(parts)
-    if gripper is None:
-        joints, fork = _guess(tree, parts, limb.end, looks, notes)
-        text = f"gripper: {', '.join(joints)}" if joints else "no gripper found"
-        notes.add("guessed", "robot", tree.name, f"{text} (--gripper changes it)")
-    else:
-        joints, fork = _given(parts, gripper)
-    idle = [n for n in _driven(parts, list(parts)) if n not in joints and n not in limb.joints]
-    return chain.fixed(tree, {n: chain.nearest(tree.joints[n]) for n in idle}, notes), joints, fork
+ON_AXIS = 5e-3  # [m] a tool this near to the last joint's axis is turned by it, not carried around
+SHARES, NUDGE = 41, 0.02  # places of the way from closed to open, and how much of it tells where the fingers are going
+ROUNDS = 3  # of fitting pads where the cube is held, whose size follows from the pads
+LEAST = 5e-3  # [m] pads that part by less do not open
 
 
 def find(
-    tree: Tree, parts: dict[str, Body], looks: Mapping[str, Look], chosen: tuple[Sequence[str], str], ee: str | None, notes: Notes
+    tree: Tree,
+    parts: dict[str, Body],
+    looks: Mapping[str, Look],
+    chosen: tuple[Sequence[str], str],
+    ee: str | None,
+    notes: Notes,
+    open: Mapping[str, float] | None = None,
+    closed: Mapping[str, float] | None = None,
 ) -> Hand:
     """The hand: how the fingers open, and where they grasp.
 
-    Open is where the fingers' ends are farthest apart (of one jaw: from its counterpart). The grasp point lies amid the distal
-    40% of the fingers, or is the frame nearest to it whose name says so (``tcp``, ``ee_...``, ``grasp``, ...); without gripper it
-    is the tool's frame by name (``tcp``, ``tool0``, ``end_effector``, ``ee_...``), or the last link. It is no camera's frame.
+    Closed is where the fingers' shapes are nearest, open where they have parted. The grasp point lies amid the pads where those
+    hold the cube that the gripper is given, or is the frame nearest to that point whose name says so (``tcp``, ``ee_...``,
+    ``grasp``, ...); without gripper it is the tool's frame by name (``tcp``, ``tool0``, ``end_effector``, ``ee_...``), or the
+    last link. It is no camera's frame.
 
     Args:
-        chosen: joints and fork of ``choose``.
+        chosen: joints and fork of ``fingers.choose``.
         ee: ``LINK`` or ``LINK:x,y,z``: the grasp point, in place of the guess.
+        open, closed: positions of some of the gripper's joints [rad, m], in place of the guess.
 
     Raises:
-        UserError: ``ee`` names what is not there.
+        UserError: ``ee``, ``open`` or ``closed`` names what is not there.
     """
     joints, fork = tuple(chosen[0]), chosen[1]
     if not joints:
         link, at = _placed(tree, ee) if ee is not None else (_tool(parts), np.zeros(3))
-        hand = fingers.bare(parts, looks, link, at)
+        hand = bare(parts, looks, link, at)
     else:
-        hand = fingers.gripper(tree, parts, looks, joints, fork, notes)
-        named = _frame(parts, hand) if ee is None else None
-        if named is not None or ee is not None:
+        swing = Swing(tree, parts, looks, joints, fork)
+        gripper = _Gripper(swing, looks, fingers.grip(swing, joints, open or {}, closed or {}, notes))
+        held = gripper.held()
+        named = _named(parts, gripper.grip.link, held.site) if ee is None else None
+        if named is None and ee is None:
+            hand = gripper.hand(held)
+        else:
             link, at = _placed(tree, ee) if ee is not None else (str(named), np.zeros(3))
-            moved = _moved(parts, hand, link, at)
-            ahead = _turn(parts, hand, link) @ moved.approach
-            if ahead @ hand.approach < np.cos(ASKEW):
-                hand = fingers.gripper(tree, parts, looks, joints, fork, Notes(), ahead)
-                moved = _moved(parts, hand, link, at)
-            hand = moved
+            hand = gripper.hand_at(held, link, at)
+        _tell(gripper, hand, tree.name, notes)
     if ee is None:
         at_text = " ".join(f"{v:.4g}" for v in hand.site[:3, 3])
         why = "by its name" if any(p.search(hand.link) for p in (_TIPS, *_TOOLS)) else "the last one"
@@ -97,60 +81,236 @@ def find(
     return hand
 
 
-def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Look], notes: Notes) -> tuple[tuple[str, ...], str]:
-    """Driven joints of the gripper, and the body on which it hangs."""
-    branches = [_driven(parts, below(parts, b.name)) for b in parts.values() if b.parent == end and b.joint]
-    if branches and parts[end].parent:
-        if max(map(len, branches)) > MOST_JOINTS:
-            count = sum(map(len, branches))
-            notes.add("warning", "robot", tree.name, f"its hand has {count} joints: held still (--gripper J1,J2 moves some)")
-            return (), end
-        return tuple(_gripping(parts, end, [j for branch in branches for j in branch], looks)), end
-    here, above = end, parts[end].parent
-    last = parts[here].joint
-    while last and last.mimic and above:  # what follows another joint is driven by that one
-        here, above = above, parts[above].parent
-        last = parts[here].joint
-    if above and parts[above].joint and last and (_NAMES.search(last.name) or _NAMES.search(last.child)):
-        lower, upper = fingers.limits(last)
-        if last.type == "prismatic" or upper - lower <= JAW:
-            return (last.name,), above
-    return (), end
+@dataclasses.dataclass(frozen=True)
+class _Held:
+    """A gripper that holds its cube, in the frame of ``Grip.link``.
+
+    Attributes:
+        frame: columns approach, opening, and across both [3, 3].
+        site: the middle of the pads [3].
+        share: of the way from closed to open.
+        gaps: between the pads when closed and when open [m].
+    """
+
+    frame: Matrix
+    site: Vec
+    share: float
+    pads: pads.Pads
+    gaps: tuple[float, float]
 
 
-def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mapping[str, Look]) -> list[str]:
-    """Those of the joints that change the distance between two fingers; of endless ones none, if others do."""
-    by_name = {b.joint.name: b.joint for b in parts.values() if b.joint}
-    inside = below(parts, end)[1:]
-    leaves = [n for n in inside if not any(parts[m].parent == n for m in inside)]
-    if len(leaves) < 2:
-        return joints
-    spots = {n: np.append(fingers.spot(parts[n], looks), 1.0) for n in leaves}
-    bounds = {n: fingers.limits(by_name[n]) for n in joints}
-    middle = {n: np.full(9, sum(bounds[n]) / 2) for n in joints}
-    out = []
-    for name in joints:
-        at = poses(parts, {**middle, name: np.linspace(*bounds[name], 9)}, 9)
-        ends = {n: at[n] @ spots[n] for n in leaves}
-        apart = [np.ptp(np.linalg.norm(ends[a] - ends[b], axis=1)) for a, b in itertools.combinations(leaves, 2)]
-        if max(apart) > STILL:
-            out.append(name)
-    bounded = [n for n in out if by_name[n].type != "continuous"]
-    return bounded or out
+class _Gripper:
+    """A gripper whose joints go from closed (0) to open (1), in the frame of ``Grip.link``."""
+
+    def __init__(self, swing: Swing, looks: Mapping[str, Look], grip: Grip):
+        self.swing, self.looks, self.grip, self.parts = swing, looks, grip, swing.parts
+        self._at_link = self.parts[grip.fork].links[grip.link]
+        self._shares = np.linspace(0, 1, SHARES)
+        self._way = self.poses(self._shares)
+
+    def poses(self, shares: Values) -> dict[str, Poses]:
+        """Of the bodies that move, and of the fork's links [n, 4, 4]."""
+        ends = zip(self.grip.joints, self.grip.close, self.grip.open, strict=True)
+        found = self.swing.poses({j: close + shares * (open - close) for j, close, open in ends})
+        base = np.linalg.inv(self._at_link)
+        links = {n: np.tile(base @ at, (len(shares), 1, 1)) for n, at in self.parts[self.grip.fork].links.items()}
+        return links | {n: base @ found[n] for n in self.swing.inside}
+
+    def held(self, ahead: Vec | None = None) -> _Held:
+        """With the pads fitted where they hold the cube that fits them; closed, where no shape is known.
+
+        Args:
+            ahead: where the fingers point [3], in place of the guess.
+        """
+        share = 0.0
+        if not self.swing.blind:
+            apart = self.grip.meeting.apart
+            parted = np.maximum.accumulate(apart) - apart[0]
+            share = float(np.interp(grasp.SHARE * parted[-1], parted, np.linspace(0, 1, len(parted))))
+        for _ in range(1 if self.swing.blind else ROUNDS):
+            frame = self._frame(share, ahead)
+            moving, jaw = self._fingers(share, frame)
+            fit = pads.fitted(moving, jaw, frame)
+            sides = {finger.name: finger.outward for finger in (*(f for f, _ in moving), *([jaw] if jaw else []))}
+            gaps = np.array([self._gap(k, fit, sides) for k in range(SHARES)])
+            held = _Held(frame, frame @ pads.middle(fit.held, frame), share, fit, (float(gaps[0]), float(gaps[-1])))
+            edge = grasp.edge(held.gaps[1], pads.extents(fit.held[0], frame), held.gaps[0])
+            if not gaps[0] < edge < gaps[-1]:
+                break
+            share = float(np.interp(edge, np.maximum.accumulate(gaps) + 1e-9 * self._shares, self._shares))
+        return held
+
+    def _gap(self, k: int, fit: pads.Pads, sides: Mapping[str, float]) -> float:
+        return pads.gap(fit.pads, {n: self._way[n][k] for n in fit.pads}, sides)
+
+    def _frame(self, share: float, ahead: Vec | None) -> Matrix:
+        """Where the fingers point there, how they open, and across both."""
+        a, b = self.grip.meeting.names
+        at, spots = self.poses(self._around(share)), self.grip.meeting.spots
+        one = at[a][:, :3, :3] @ spots[0] + at[a][:, :3, 3]
+        other = at[b][:, :3, :3] @ spots[1] + at[b][:, :3, 3] if not self.grip.jaw else self._fixed_spot(spots[1])
+        way = (one - other)[1] - (one - other)[0]
+        if self.grip.jaw and not self.swing.blind:  # from face to face: the bisector of jaws that hold something points ahead
+            way = (one - other).mean(0)
+        pivot, axis = self._hinge(share)
+        opening = snapped(_unit(way - axis * (axis @ way), np.array([0.0, 1.0, 0.0])))
+        if ahead is None:
+            tip, across = (one + other).mean(0) / 2, np.cross(axis, opening)
+            ahead = _ahead(tip, opening, self._wrist())
+            if np.linalg.norm(across) > 0.8:
+                ahead = across / np.linalg.norm(across) * (np.sign(across @ (tip - pivot)) or 1.0)
+        opening = _unit(opening - ahead * (ahead @ opening), opening)
+        return np.column_stack([ahead, opening, np.cross(ahead, opening)])
+
+    def _fixed_spot(self, spot: Vec) -> Points:
+        base = np.linalg.inv(self._at_link)
+        return np.tile(base[:3, :3] @ spot + base[:3, 3], (2, 1))
+
+    def _around(self, share: float) -> Values:
+        return np.clip([share - NUDGE, share + NUDGE], 0, 1)
+
+    def _hinge(self, share: float) -> tuple[Vec, Vec]:
+        """Where the joint turns that turns the first finger, and its axis; zeros if none does."""
+        name, pivot, axis = self.grip.meeting.names[0], np.zeros(3), np.zeros(3)
+        there = self.poses(np.array([share]))
+        while name in self.swing.inside:
+            joint, pose = self.parts[name].joint, there[name][0]
+            if joint is not None and joint.type != "prismatic":
+                pivot, axis = pose[:3, 3], pose[:3, :3] @ joint.axis
+            name = self.parts[name].parent
+        return pivot, axis
+
+    def _wrist(self) -> Vec:
+        """Where the joint before the last one is."""
+        world, fork = body_poses(self.parts, {}), self.grip.fork
+        base, above = np.linalg.inv(world[fork][0] @ self._at_link), self.parts[fork].parent
+        return base[:3, :3] @ world[above][0][:3, 3] + base[:3, 3] if above else base[:3, 3]
+
+    def _fingers(self, share: float, frame: Matrix) -> tuple[list[tuple[pads.Finger, Body]], pads.Finger | None]:
+        """The fingers that move, and the fixed jaw of one that is alone."""
+        there, around = self.poses(np.array([share, 0.0])), self.poses(self._around(share))
+        moving = []
+        for name in self.grip.fingers:
+            points = None if self.swing.blind else surface(self.parts[name].links, self.looks)
+            spot = np.append(self.swing.shapes[name].mean(0), 1.0)
+            way = (around[name][1] - around[name][0]) @ spot
+            points = None if points is None else points @ there[name][0][:3, :3].T + there[name][0][:3, 3]
+            outward = float(np.sign(frame[:, 1] @ way[:3])) or 1.0
+            moving.append((pads.Finger(name, points, there[name][0], there[name][1], outward), self.parts[name]))
+        if not self.grip.jaw:
+            return moving, None
+        pose = there[self.grip.jaw][0]
+        points = None if self.swing.blind else surface({self.grip.jaw: pose}, self.looks)
+        return moving, pads.Finger(self.grip.jaw, points, pose, pose, -moving[0][0].outward)
+
+    def hand(self, held: _Held) -> Hand:
+        """As it is, the grasp point amid its pads."""
+        grip, frame = self.grip, held.frame
+        site = primitives.pose(np.eye(3), np.round(held.site, 6) + 0.0)  # [m]: what is guessed has no more digits
+        extents = pads.extents(held.pads.held[0], frame)
+        closed, gap = (round(float(v), 4) for v in held.gaps)
+        hand = Hand(
+            grip.joints,
+            grip.open,
+            grip.close,
+            grip.link,
+            grip.fingers,
+            site,
+            frame[:, 0],
+            frame[:, 1],
+            held.pads.pads,
+            held.pads.backs,
+            tuple(self.swing.inside),
+            gap if gap - closed > LEAST and np.isfinite(grip.meeting.worth) else 0.0,
+            closed,
+            extents,
+        )
+        if self.swing.blind and grip.jaw:  # the fixed jaw is half a cube away from its middle: the other one comes to it
+            moved = self._fingers(held.share, frame)[0][0][0].outward
+            hand.grip = frame[:, 1] * moved * grasp.edge(hand.gap, extents, closed) / 2
+        return hand
+
+    def hand_at(self, held: _Held, link: str, at: Vec) -> Hand:
+        """With the grasp point in the frame of a named link, which has an axis that tells where the fingers point.
+
+        Pads that stand in for missing meshes are moved there: the frame knows more than they.
+        """
+        there = self._in_link(link, held.share)
+        held = self.held(there[:3, :3] @ snapped(there[:3, :3].T @ held.frame[:, 0], TOOL_AXIS))
+        there = self._in_link(link, held.share)
+        hand, turn = self.hand(held), there[:3, :3].T
+        away = turn @ (held.site - there[:3, 3]) - at
+        if self.swing.blind:
+            by = there[:3, :3] @ -away
+            poses = {n: p[0] for n, p in self.poses(np.array([held.share])).items()}
+            hand.pads = {n: _shifted(pad, poses[n], by) for n, pad in hand.pads.items()}
+            away = np.zeros(3)
+        return dataclasses.replace(
+            hand,
+            link=link,
+            site=primitives.pose(np.eye(3), at),
+            approach=turn @ hand.approach,
+            opening=turn @ hand.opening,
+            grip=np.round(away + turn @ hand.grip, 4) + 0.0,
+        )
+
+    def _in_link(self, link: str, share: float) -> Pose:
+        """Pose of any link of the robot in ``Grip.link`` [4, 4]."""
+        ends = zip(self.grip.joints, self.grip.close, self.grip.open, strict=True)
+        world = body_poses(self.parts, {j: np.array([close + share * (open - close)]) for j, close, open in ends})
+        fork, body = self.grip.fork, body_of(self.parts, link)
+        return np.linalg.inv(world[fork][0] @ self._at_link) @ world[body.name][0] @ body.links[link]
 
 
-def _given(parts: dict[str, Body], joints: Sequence[str]) -> tuple[tuple[str, ...], str]:
-    moved = {b.joint.name: b for b in parts.values() if b.joint and not b.joint.mimic}
-    for name in joints:
-        if name not in moved:
-            raise UserError(f"--gripper names joint {name!r}{config.hint(name, moved)}: choose from {', '.join(moved)}")
-    if len(set(joints)) == len(moved):
-        raise UserError("--gripper takes all joints: leave the arm at least one")
-    return tuple(dict.fromkeys(joints)), moved[joints[0]].parent if joints else ""
+def _shifted(pad: primitives.Primitive, pose: Pose, by: Vec) -> primitives.Primitive:
+    """A pad of a body that has the ``pose``, moved."""
+    there = pose @ pad.pose
+    there[:3, 3] += by
+    return dataclasses.replace(pad, pose=np.linalg.inv(pose) @ there)
 
 
-def _driven(parts: dict[str, Body], names: Sequence[str]) -> list[str]:
-    return [b.joint.name for b in parts.values() if b.name in names and b.joint and not b.joint.mimic]
+def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
+    """What was guessed of the gripper, and what is lacking."""
+    grip, blind = gripper.grip, gripper.swing.blind
+    for finger in grip.fingers:
+        text = f"a box pad on the distal {100 * pads.DISTAL:.0f}%, along the opening; the rest meets the table only"
+        blank = "no mesh: a box pad of 20 x 20 x 6 mm stands at its frame, or at a turning jaw's end"
+        notes.add("guessed", "link", finger, blank if blind else text)
+    if grip.jaw:
+        seen = hand.pads[grip.jaw].fill > 0
+        text = "a box pad on what faces the moving jaw" if seen else "no mesh: a box pad like the other's, where that closes"
+        notes.add("guessed", "link", grip.jaw, f"the fixed jaw, {text}")
+    opened, shut = (", ".join(f"{j} {q:.4g}" for j, q in zip(grip.joints, ends, strict=True)) for ends in (grip.open, grip.close))
+    known = f"its pads are {1000 * hand.gap:.0f} mm apart when open ({opened}), {1000 * hand.closed:.0f} mm when closed ({shut})"
+    if hand.gap and grasp.edge(hand.gap, hand.pad, hand.closed):
+        notes.add("guessed", "robot", name, f"{known} (--open and --closed change it)")
+        return
+    between = ", ".join((*grip.fingers, *([grip.jaw] if grip.jaw else [])))
+    meshes = "no mesh of its fingers was found, and " if blind else ""
+    why = known if hand.gap else f"{meshes}the pads on {between} do not part between {shut} and {opened}"
+    flags = " ".join(f"--{flag} {','.join(f'{j}=VALUE' for j in grip.joints)}" for flag in ("open", "closed"))
+    other = "; --gripper names other joints"
+    lack = "no cube fits between its fingers" if hand.gap else "how far its gripper opens is unknown"
+    notes.add("warning", "robot", name, f"{lack}, and tasks that grasp need it: {why}. Give {flags}{other}")
+
+
+def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) -> Hand:
+    """Without a gripper: a tool that points along the last joint's axis, outwards, if it lies on that axis; else away from it."""
+    body = body_of(parts, link)
+    frame = body.links[link] @ primitives.pose(np.eye(3), at)
+    direction = frame[:3, 3]
+    if body.joint is not None and body.joint.type != "prismatic":
+        axis = body.joint.axis
+        if np.linalg.norm(np.cross(frame[:3, 3], axis)) < ON_AXIS:
+            along = float((frame[:3, 3] - np.linalg.inv(body.frame)[:3, 3]) @ axis)  # from the joint before
+            if abs(along) < ON_AXIS:  # a bare wrist: to where its link lies
+                points = surface(body.links, looks)
+                along = 1.0 if points is None else float((points.max(0) + points.min(0)) @ axis) or 1.0
+            direction = axis * np.sign(along)
+    approach = snapped(frame[:3, :3].T @ _unit(direction, frame[:3, 2]))
+    across = np.array([0.0, 1.0, 0.0]) if abs(approach[1]) < 0.7 else np.array([1.0, 0.0, 0.0])
+    opening = _unit(across - approach * (approach @ across), across)
+    return Hand((), (), (), link, (), primitives.pose(np.eye(3), at), approach, opening, {}, {}, ())
 
 
 def _tool(parts: dict[str, Body]) -> str:
@@ -165,16 +325,18 @@ def _tool(parts: dict[str, Body]) -> str:
         if found:
             return found[-1]
     if last.joint is not None and last.joint.type != "prismatic":
-        links = [n for n in links if np.linalg.norm(np.cross(last.links[n][:3, 3], last.joint.axis)) < fingers.ON_AXIS] or links
+        links = [n for n in links if np.linalg.norm(np.cross(last.links[n][:3, 3], last.joint.axis)) < ON_AXIS] or links
     return links[-1]
 
 
-def _frame(parts: dict[str, Body], hand: Hand) -> str | None:
-    """The named frame nearest to where the fingers meet, if it is not far from there."""
-    body = body_of(parts, hand.link)
-    centre = (body.links[hand.link] @ hand.site)[:3, 3]
+def _named(parts: dict[str, Body], link: str, at: Vec) -> str | None:
+    """The named frame nearest to where the fingers meet, ``at`` in ``link``, if it is not far from there."""
+    body = body_of(parts, link)
+    centre = (body.links[link] @ np.append(at, 1.0))[:3]
     away = {
-        n: float(np.linalg.norm(at[:3, 3] - centre)) for n, at in body.links.items() if _TIPS.search(n) and not _SENSORS.search(n)
+        n: float(np.linalg.norm(frame[:3, 3] - centre))
+        for n, frame in body.links.items()
+        if _TIPS.search(n) and not _SENSORS.search(n)
     }
     nearest = min(away, key=away.__getitem__, default=None)
     return nearest if nearest is not None and away[nearest] < NEAR else None
@@ -193,42 +355,22 @@ def _placed(tree: Tree, ee: str) -> tuple[str, Vec]:
     return link, at
 
 
-def _moved(parts: dict[str, Body], hand: Hand, link: str, at: Vec) -> Hand:
-    """The hand with its grasp point in the frame of a named link; directions stay where the fingers point.
-
-    Pads that stand in for missing meshes are moved there: the frame knows more than they.
-    """
-    world = _shut(parts, hand)
-    old, new = (world[b.name] @ b.links[n] for n, b in ((n, body_of(parts, n)) for n in (hand.link, link)))
-    turn = new[:3, :3].T @ old[:3, :3] @ hand.site[:3, :3]
-    site = new @ primitives.pose(np.eye(3), at)
-    away = new[:3, :3].T @ (old @ hand.site - site)[:3, 3]  # from the new grasp point to the old one
-    approach, opening = fingers.snapped(turn @ hand.approach, TOOL_AXIS), turn @ hand.opening
-    side = opening - approach * (approach @ opening)
-    side = side / max(float(np.linalg.norm(side)), 1e-9)
-    moved = dataclasses.replace(hand, link=link, site=primitives.pose(np.eye(3), at), approach=approach, opening=opening)
-    aside = side * (hand.grip @ hand.opening)
-    if any(pad.fill > 0 for pad in hand.pads.values()):
-        return dataclasses.replace(moved, grip=np.round(away + aside, 4) + 0.0)
-    frame = new[:3, :3] @ np.column_stack([approach, side, np.cross(approach, side)])
-    pads = {}
-    for name, pad in hand.pads.items():
-        body = body_of(parts, name)
-        pose = world[body.name] @ body.links[name]
-        off = ((pose @ pad.pose)[:3, 3] - (old @ hand.site)[:3, 3]) @ (old[:3, :3] @ hand.opening)
-        there = primitives.pose(frame, site[:3, 3] + off * frame[:, 1])
-        pads[name] = dataclasses.replace(pad, pose=np.linalg.inv(pose) @ there)
-    return dataclasses.replace(moved, opening=side, pads=pads, grip=np.round(aside, 4) + 0.0)
+def _ahead(tip: Vec, opening: Vec, wrist: Vec) -> Vec:
+    """Where the fingers point, across the opening: from the origin to their ``tip``, but never back to the ``wrist``."""
+    fallback = np.array([0.0, 0.0, 1.0]) if abs(opening[2]) < 0.7 else np.array([1.0, 0.0, 0.0])
+    approach = snapped(_unit(tip - opening * (tip @ opening), fallback - opening * (fallback @ opening)))
+    approach = _unit(approach - opening * (approach @ opening), approach)
+    return approach if approach @ (tip - wrist) >= 0 else -approach
 
 
-def _turn(parts: dict[str, Body], hand: Hand, link: str) -> Matrix:
-    """The axes of another link of the same hand in those of the grasp point [3, 3]."""
-    world = _shut(parts, hand)
-    old, new = (world[b.name] @ b.links[n] for n, b in ((n, body_of(parts, n)) for n in (hand.link, link)))
-    return (old @ hand.site)[:3, :3].T @ new[:3, :3]
+def _unit(vector: Vec, otherwise: Vec) -> Vec:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-6 else otherwise / np.linalg.norm(otherwise)
 
 
-def _shut(parts: dict[str, Body], hand: Hand) -> dict[str, Pose]:
-    """Poses [4, 4] of the bodies with the gripper closed."""
-    q = {j: np.array([v]) for j, v in zip(hand.joints, hand.close, strict=True)}
-    return {n: p[0] for n, p in poses(parts, q).items()}
+def snapped(vector: Vec, within: float = 25.0) -> Vec:
+    """The nearest axis of the frame, if that is within so many degrees."""
+    nearest = np.argmax(np.abs(vector))
+    if abs(vector[nearest]) < np.cos(np.radians(within)):
+        return vector
+    return np.eye(3)[nearest] * np.sign(vector[nearest])

@@ -12,12 +12,13 @@ from jaxtyping import Float
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
 from mjx_nero.urdf import chain as chain_of
-from mjx_nero.urdf import collide, drives, files, folder, inertia, meshes, mjcf, regions, rest, workspace
+from mjx_nero.urdf import collide, drives, files, fingers, folder, inertia, meshes, mjcf, regions, rest, workspace
 from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
 from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.drawing import Visual
+from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.geometry import Looks
 from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
@@ -36,6 +37,8 @@ def import_urdf(
     fix: Mapping[str, float | None] | None = None,
     gripper: Sequence[str] | None = None,
     ee: str | None = None,
+    open: Mapping[str, float] | None = None,
+    closed: Mapping[str, float] | None = None,
     home: Mapping[str, float] | None = None,
     degrees: bool = False,
     strict: bool = False,
@@ -57,8 +60,9 @@ def import_urdf(
         args: values of a xacro file's arguments, in place of their defaults.
         chain: ``BASE:TIP``, links, of a robot that is more than an arm; what is not between them is held still.
         fix: joint -> position to hold it at [rad, m]; None: the one nearest to 0.
-        gripper: joints that drive the gripper, in place of the guess (``hand.choose``); empty for none.
+        gripper: joints that drive the gripper, in place of the guess (``fingers.choose``); empty for none.
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
+        open, closed: positions of the gripper's joints [rad, m], in place of the guess (``swing.Swing.ends``).
         home: positions of some joints [rad, m], in place of the guess (``home.home``).
         degrees: limits and velocities of hinges are in degrees; slides, mimics and what is given here stay in metres and radians.
         strict: warnings become an error.
@@ -74,9 +78,9 @@ def import_urdf(
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
-    tree, grips, fork = hands.choose(_filled(tree, looks, notes), looks.of, gripper, notes)
+    tree, grips, fork = fingers.choose(_filled(tree, looks, notes), looks.of, gripper, notes)
     parts = bodies(tree)
-    hand = hands.find(tree, parts, looks.of, (grips, fork), ee, notes)
+    hand = hands.find(tree, parts, looks.of, (grips, fork), ee, notes, open, closed)
     stand = rest.stand(parts, looks.of, hand, mount, tree.name, notes)
     start = workspace.first_home(parts, hand, home or {})
     cloud = Cloud(parts, hand, stand.mount, start)
@@ -134,7 +138,7 @@ class _Model:
         self,
         tree: Tree,
         parts: dict[str, Body],
-        hand: hands.Hand,
+        hand: Hand,
         collisions: collide.Collisions,
         at_home: Mapping[str, float],
         notes: Notes,
@@ -195,6 +199,7 @@ def _robot(
         hold=boxes[2],
         floor=stand.floor,
         opening=made.hand.gap,
+        closed=made.hand.closed,
         pad=made.hand.pad,
         grip=_floats(made.hand.grip),
         folder=str(out),
@@ -208,7 +213,7 @@ def _compiled(text: str) -> mujoco.MjModel:
         raise UserError(f"MuJoCo refuses the model: {' '.join(str(error).split())}") from None
 
 
-def _levers(parts: dict[str, Body], hand: hands.Hand) -> dict[str, float]:
+def _levers(parts: dict[str, Body], hand: Hand) -> dict[str, float]:
     """Of the gripper's joints: how far from its axis a joint moves the fingers' pads [m]; of slides 1."""
     inside = [parts[n] for n in hand.inside]
     at = {n: p[0] for n, p in body_poses(parts, {j: np.array([v]) for j, v in zip(hand.joints, hand.close, strict=True)}).items()}

@@ -1,6 +1,8 @@
 """Primitive shapes around meshes. Collisions of meshes are slow in MJX, and a capsule costs two contacts with the table."""
 
 import dataclasses
+import functools
+import itertools
 import math
 
 import numpy as np
@@ -11,6 +13,7 @@ from scipy import spatial
 from mjx_nero.urdf.tree import Matrix, Points, Pose, Shape, Values, Vec
 
 SAMPLES = 3000
+GRID = 9  # points along an edge of a box, that its distance from another is measured at
 OUTSIDE = 0.02  # share of the surface that may stick out: a bolt's head shall not make the whole shape thicker
 CONTACTS = {"sphere": 1, "capsule": 2, "box": 4}  # with a plane
 _PENALTY = {"sphere": 1.0, "capsule": 1.0, "box": 1.3}  # at about equal volume the one with fewer contacts
@@ -112,6 +115,24 @@ def pose(turn: Matrix, at: Vec) -> Pose:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn, at
     return out
+
+
+def distance(a: Primitive, b: Primitive) -> float:
+    """How far two boxes are apart [m], 0 if they overlap: of points on a grid over either's faces from the other."""
+    away = []
+    for one, other in ((a, b), (b, a)):
+        points = _grid() * np.array(one.size) @ one.pose[:3, :3].T + one.pose[:3, 3]
+        local = (points - other.pose[:3, 3]) @ other.pose[:3, :3]
+        away.append(np.linalg.norm(np.maximum(np.abs(local) - np.array(other.size), 0.0), axis=1).min())
+    return float(min(away))
+
+
+@functools.lru_cache(maxsize=1)
+def _grid() -> Points:
+    """Points on the faces of the box from -1 to 1 [n, 3]."""
+    line = np.linspace(-1, 1, GRID)
+    points = np.array(list(itertools.product(line, line, line)))
+    return points[(np.abs(points) == 1).any(1)]
 
 
 def hull(points: Points) -> float:

@@ -21,7 +21,7 @@ NEAR, ASIDE = 0.25, 0.3125  # of the reach: the nearest before the shoulder, the
 LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
 OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
 TALL = 0.4  # of the reach: the highest above the table that anything is held
-LEAN = np.radians(45)  # of a hand that cannot point down
+LEANS = tuple(np.radians((15, 30, 45)))  # of a hand that cannot point down: as little as will do
 HELD = np.radians(60)  # of one that holds something
 DESCENTS, STARTS = 8, 12  # of the inverse kinematics, for a cell and for a point of a region
 TURNS = 5  # joints of an arm that can turn its hand at will while that points down
@@ -74,20 +74,20 @@ def find(
     The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
     which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
     ``OVER`` it, and with nothing below the table. Where there are none either way round the hand may be turned any way about
-    the vertical, and where there are none of those either, lean by up to ``LEAN``. The rectangle of such cells is taken whose
-    area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG`` times ``WIDE``; then
-    inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held may be brought as
-    far up from there as the arm gets with the hand within ``HELD`` of down.
+    the vertical, and where there are none of those either, lean: by up to the first of ``LEANS`` that will do. The rectangle of
+    such cells is taken whose area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG``
+    times ``WIDE``; then inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held
+    may be brought as far up from there as the arm gets with the hand within ``HELD`` of down.
 
     Args:
         work: the workspace; it says on which side the work is.
         down: orientation of the grasp point with the hand pointing down, wxyz.
         shapes: what must not get below the table.
     """
-    if not hand.joints or hand.gap <= 0 or work is None:
+    if not hand.joints or not grasp.edge(hand.gap, hand.pad, hand.closed) or work is None:
         return None, None, down, 0.0
     along = opening(down)
-    low = grasp.height(hand.gap, hand.pad) + hand.grip @ hand.approach - cloud.height
+    low = grasp.height(hand.gap, hand.pad, hand.closed) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
     w, x, y, z = down
     other = (-z + 0.0, -y + 0.0, x, w)  # half a turn on about the vertical
@@ -96,7 +96,7 @@ def find(
         (exact, 0.0, along, down),
         (exact, 0.0, -along, other),
         ("pointing down", 0.0, None, down),
-        ("leaning", LEAN, None, down),
+        *(("leaning", tilt, None, down) for tilt in LEANS),
     ]
     for how, tilt, opened, turned in ways if len(cloud.arm) >= TURNS else ways[2:]:
         pick = _pick(Reaching(cloud, shapes, shun, tilt, opened), work, low)

@@ -79,6 +79,7 @@ class Report:
             "mass": self.mass,
             "mass_read": self.mass_read,
             "contacts": self.contacts,
+            "gap": {"open": self.robot.opening, "closed": self.robot.closed},
             "warnings": self.warnings,
             "notes": self.notes.of("robot", self.robot.name),
             "links": {name: {**row, "notes": self.notes.of("link", name)} for name, row in self.links.items()},
