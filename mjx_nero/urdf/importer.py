@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
 from mjx_nero.urdf import chain as chain_of
-from mjx_nero.urdf import collide, drives, files, folder, inertia, meshes, mjcf, regions, rest, workspace
+from mjx_nero.urdf import collide, couplings, drives, files, folder, inertia, meshes, mjcf, regions, rest, workspace
 from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
@@ -22,6 +22,7 @@ from mjx_nero.urdf.geometry import Looks
 from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
+from mjx_nero.urdf.units import METRES, Units, check_lengths
 
 
 # Long: the stages of an import, one after another.
@@ -37,7 +38,7 @@ def import_urdf(
     gripper: Sequence[str] | None = None,
     ee: str | None = None,
     home: Mapping[str, float] | None = None,
-    degrees: bool = False,
+    units: Units = METRES,
     strict: bool = False,
     force: bool = False,
 ) -> Report:
@@ -60,7 +61,7 @@ def import_urdf(
         gripper: joints that drive the gripper, in place of the guess (``hand.choose``); empty for none.
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
         home: positions of some joints [rad, m], in place of the guess (``home.home``).
-        degrees: limits and velocities of hinges are in degrees; slides, mimics and what is given here stay in metres and radians.
+        units: of the URDF, if they are not metres and radians; what is given here is in these.
         strict: warnings become an error.
 
     Raises:
@@ -70,11 +71,14 @@ def import_urdf(
     folder.check(out, force)
     notes = Notes()
     roots = files.Roots(path, packages or {})
-    tree, mount = reader.read(path, roots, notes, args or {}, degrees=degrees)
+    tree, mount = reader.read(path, roots, notes, args or {}, units=units)
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
-    tree, grips, fork = hands.choose(_filled(tree, looks, notes), looks.of, gripper, notes)
+    check_lengths(tree, looks.spans, units)
+    whole = _filled(tree, looks, notes)
+    tree, grips, fork = hands.choose(whole, looks.of, gripper, notes)
+    couplings.warn_of_frozen(whole, tree, grips, notes)
     parts = bodies(tree)
     hand = hands.find(tree, parts, looks.of, (grips, fork), ee, notes)
     stand = rest.stand(parts, looks.of, hand, mount, tree.name, notes)
