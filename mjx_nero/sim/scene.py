@@ -24,6 +24,7 @@ _SHAPES = {
 }
 # Contact bits: the table meets bit 1, objects bit 2; robot geoms have no type, so never meet one another. Objects meet by bit 4.
 _TABLE, _OBJECT, _OBJECTS = 1, 2, 4
+_HANGS = 0.5  # cosine of a base's tilt: one that is tilted further hangs from a plate
 COMMANDED = (0.2, 0.8, 0.3, 1.0)  # colour of the goal, and of the object that belongs there where there are several
 
 
@@ -181,7 +182,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         pairs = touch.self_pairs(robot) if scene.self_collision else ()
         touch.add(spec, robot.base_link, scene.obstacles, tuple(scene.objects), pairs)
     if visuals:
-        _add_visuals(spec, scene, goal, robot.floor)
+        _add_visuals(spec, scene, goal, robot)
     else:
         spec.discard_visual()
     spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
@@ -293,7 +294,7 @@ def _add_drives(spec: mujoco.MjSpec, drive) -> None:
         actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
 
 
-def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, floor: float) -> None:
+def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) -> None:
     hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
     box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.goal_edge / 2
     shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
@@ -309,8 +310,15 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, floor: float) -> No
     x, y = scene.table_center
     size = [scene.table_size[0] / 2, scene.table_size[1] / 2, 0.02]
     world.add_geom(name="table_top", type=box, size=size, pos=[x, y, -0.0205], rgba=[0.72, 0.6, 0.47, 1], **hidden)
-    if floor < 0:
-        world.add_geom(name="floor", type=box, size=[3, 3, 0.02], pos=[x, y, floor - 0.0205], rgba=[0.6, 0.62, 0.64, 1], **hidden)
+    grey = [0.6, 0.62, 0.64, 1]
+    if robot.floor < 0:
+        world.add_geom(name="floor", type=box, size=[3, 3, 0.02], pos=[x, y, robot.floor - 0.0205], rgba=grey, **hidden)
+    up = np.zeros(9)
+    mujoco.mju_quat2Mat(up, np.array(robot.base_quat) / np.linalg.norm(robot.base_quat))
+    if up[8] < _HANGS:  # what it hangs from, behind its base
+        behind = np.array(robot.base_pos) - 0.0105 * up.reshape(3, 3)[:, 2]
+        where = {"size": [0.15, 0.15, 0.01], "pos": behind, "quat": robot.base_quat}
+        world.add_geom(name="plate", type=box, **where, rgba=grey, **hidden)
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

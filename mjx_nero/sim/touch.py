@@ -5,8 +5,11 @@ them with the same meaning. A net force on a link would hide a link that is sque
 in every step and miss what happens between two control steps.
 """
 
+import collections
+import copy
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -26,6 +29,9 @@ _MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoc
 _SAMPLES = 1000  # postures in which links are tested
 _ALWAYS = 0.9  # links that touch in this share of the postures are built that way
 _ANYWHERE = 10.0  # [m] half the edge of the bounding box of an obstacle, which may stand anywhere
+
+Pair = tuple[int, int]  # geoms
+Depths = dict[Pair, float]
 
 
 def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, Any], objects: tuple[str, ...], pairs) -> None:
@@ -139,6 +145,48 @@ def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
     Raises:
         UserError: not every backend can collide two of the shapes.
     """
+    model, (home, *others) = _depths(robot)
+    found = [pair for pair in _now_and_then(home, others) if pair not in home]
+    for a, b in found:
+        kinds = {mujoco.mjtGeom(model.geom_type[g]) for g in (a, b)}
+        if not kinds <= _MEETS_BOX:
+            names = " and ".join(repr(model.geom(g).name) for g in (a, b))
+            raise UserError(f"scene.self_collision: {names} of {robot.name} are shapes that not every backend brings together")
+    return tuple((model.geom(a).name, model.geom(b).name) for a, b in found)
+
+
+def at_home(robot: RobotCfg) -> dict[tuple[str, str], float]:
+    """Names of the robot's links that lie within one another at home, and how deep [m].
+
+    Left out are links that follow one another, the gripper's own parts, and what touches in nearly all postures. The shapes that
+    collide are wider than the links: how deep is said of the hulls of what is drawn, where both links have looks.
+    """
+    model, (home, *others) = _depths(robot)
+    bodies = {tuple(sorted(model.geom_bodyid[list(pair)])): home[pair] for pair in _now_and_then(home, others) if pair in home}
+    model, found = copy.copy(model), {}
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    data = mujoco.MjData(model)
+    data.qpos[:] = next(_postures(model, robot))
+    mujoco.mj_kinematics(model, data)
+    for (first, second), depth in bodies.items():
+        drawn = [np.flatnonzero((model.geom_bodyid == body) & (model.geom_group != COLLISION)) for body in (first, second)]
+        gaps = [mujoco.mj_geomDistance(model, data, a, b, 0.0, None) for a, b in itertools.product(*drawn)]
+        deep = -min(gaps) if gaps else depth
+        if deep > 0:
+            found[model.body(first).name, model.body(second).name] = float(deep)
+    return found
+
+
+def _now_and_then(home: Depths, others: list[Depths]) -> list[Pair]:
+    """The pairs that touch in some postures, and not in nearly all."""
+    count = collections.Counter(pair for depths in (home, *others) for pair in depths)
+    return sorted(pair for pair, times in count.items() if times < _ALWAYS * (len(others) + 1))
+
+
+@functools.lru_cache(maxsize=8)
+def _depths(robot: RobotCfg) -> tuple[mujoco.MjModel, list[Depths]]:
+    """The robot with shapes that all meet, and how deep those of links that do not follow one another lie within one another
+    [m], in each of ``_postures``."""
     spec = robot_file.model(robot)
     shapes = _collision_shapes(spec, robot.base_link)
     for geom in spec.geoms:
@@ -149,25 +197,19 @@ def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
     model = spec.compile()
     arm = [model.joint(name).id for name in robot.arm.joints]
     link = [_link(model, body, arm) for body in model.geom_bodyid]
-    count: dict[tuple[int, int], int] = {}
-    postures = list(_postures(model, robot))
-    data = mujoco.MjData(model)
-    for k, qpos in enumerate(postures):
+    data, out = mujoco.MjData(model), []
+    for qpos in _postures(model, robot):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        touching = {(int(min(contact.geom)), int(max(contact.geom))) for contact in data.contact if contact.dist < 0}
-        for pair in touching:
-            if abs(link[pair[0]] - link[pair[1]]) > 1:
-                count[pair] = count.get(pair, 0) + (len(postures) if k == 0 else 1)  # the first is home
-    found = sorted(pair for pair, times in count.items() if times < _ALWAYS * len(postures))
-    for a, b in found:
-        kinds = {mujoco.mjtGeom(model.geom_type[g]) for g in (a, b)}
-        if not kinds <= _MEETS_BOX:
-            names = " and ".join(repr(model.geom(g).name) for g in (a, b))
-            raise UserError(f"scene.self_collision: {names} of {robot.name} are shapes that not every backend brings together")
-    return tuple((model.geom(a).name, model.geom(b).name) for a, b in found)
+        depths: Depths = {}
+        for contact in data.contact:
+            pair = int(min(contact.geom)), int(max(contact.geom))
+            if contact.dist < 0 and abs(link[pair[0]] - link[pair[1]]) > 1:
+                depths[pair] = max(-float(contact.dist), depths.get(pair, 0.0))
+        out.append(depths)
+    return model, out
 
 
 def _link(model: mujoco.MjModel, body: int, arm: list[int]) -> int:

@@ -8,10 +8,12 @@ from mjx_nero import console
 from mjx_nero.config import values
 from mjx_nero.console import Table
 from mjx_nero.errors import UserError
+from mjx_nero.sim import robot_file
 from mjx_nero.tools import cli
-from mjx_nero.urdf import files
+from mjx_nero.urdf import files, folder
 from mjx_nero.urdf.importer import import_urdf
 from mjx_nero.urdf.report import Report
+from mjx_nero.urdf.units import Units
 
 MOST_LINES = 12  # of warnings shown; report.json has all
 
@@ -31,6 +33,37 @@ def main(argv: Sequence[str]) -> None:
     Raises:
         UserError: as ``import_urdf``, or the arguments are wrong.
     """
+    parser = _parser()
+    args, rest = parser.parse_known_args(argv)
+    if rest:
+        parser.error(f"unknown argument {rest[0]!r}")
+    gripper = None if args.gripper is None else [] if args.gripper == "none" else args.gripper.split(",")
+    report = import_urdf(
+        args.file,
+        args.out,
+        _packages(args.package),
+        args.gains,
+        args=_pairs(args.arg, "--arg takes NAME:=VALUE", ":="),
+        chain=args.chain,
+        fix=_fixed(args.fix),
+        gripper=gripper,
+        ee=args.ee,
+        open=_positions(args.open, "--open"),
+        closed=_positions(args.closed, "--closed"),
+        home=_positions(args.home, "--home"),
+        units=Units(args.degrees, args.scale, args.mesh_scale),
+        strict=args.strict,
+        force=args.force,
+    )
+    _print(report)
+    if args.self_test:
+        _test(report)
+    # A bare name might be one of the package's robots.
+    out = shlex.quote(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
+    console.line(console.screen(), f"next: {cli.called_as('inspect')} {out}; {cli.called_as('train')} --env reach --robot {out}")
+
+
+def _parser() -> cli.Parser:
     parser = cli.Parser(
         prog=cli.called_as("import-urdf"),
         description="Makes a model folder of a URDF: model.xml, meshes/, robot.yaml (edit it) and report.json.",
@@ -57,30 +90,24 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--degrees", action="store_true", help="the URDF gives the limits and velocities of its hinges in degrees"
     )
+    parser.add_argument(
+        "--scale", type=cli.positive_float, metavar="FACTOR", help="of all lengths but the meshes': 0.001 for millimetres"
+    )
+    parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="of the meshes, besides their own")
+    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="do not try the robot in simulation")
     parser.add_argument("--strict", action="store_true", help="a warning is an error")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
-    args, rest = parser.parse_known_args(argv)
-    if rest:
-        parser.error(f"unknown argument {rest[0]!r}")
-    gripper = None if args.gripper is None else [] if args.gripper == "none" else args.gripper.split(",")
-    report = import_urdf(
-        args.file,
-        args.out,
-        _packages(args.package),
-        args.gains,
-        args=_pairs(args.arg, "--arg takes NAME:=VALUE", ":="),
-        chain=args.chain,
-        fix=_fixed(args.fix),
-        gripper=gripper,
-        ee=args.ee,
-        open=_positions(args.open, "--open"),
-        closed=_positions(args.closed, "--closed"),
-        home=_positions(args.home, "--home"),
-        degrees=args.degrees,
-        strict=args.strict,
-        force=args.force,
-    )
-    _print(report)
+    return parser
+
+
+def _test(report: Report) -> None:
+    """Tries the robot in simulation. What comes of it stands in its report; a failure undoes nothing."""
+    from mjx_nero.tools import self_test  # with JAX, which reading a URDF does without
+
+    cli.setup_jax()
+    found = self_test.run(robot_file.read(report.folder))
+    folder.record(report.folder, "self_test", found.json())
+    console.line(console.screen(), found.line, "green" if found.passed else "yellow")
 
 
 def _packages(items: Sequence[str]) -> Mapping[str, pathlib.Path]:
@@ -127,9 +154,6 @@ def _print(report: Report) -> None:
             console.line(screen, f"{kind} {note.where} {note.name}: {note.text}", style)
         if len(found) > len(shown):
             console.line(screen, f"{kind} and {len(found) - len(shown)} more in report.json", style)
-    # A bare name might be one of the package's robots.
-    folder = shlex.quote(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
-    console.line(screen, f"next: {cli.called_as('inspect')} {folder}; {cli.called_as('train')} --env reach --robot {folder}")
 
 
 def _facts(report: Report) -> Table:

@@ -10,6 +10,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from mjx_nero import files
 from mjx_nero.sim import robot_file
@@ -103,6 +104,16 @@ def write(out: pathlib.Path, text: str, stl: Mapping[str, bytes], robot: RobotCf
                 shutil.rmtree(made, ignore_errors=True)
             for folder in absent:  # those that it made, innermost first, if they are still empty
                 folder.rmdir()
+
+
+def record(out: pathlib.Path, name: str, content: Any) -> None:
+    """Adds an entry to the report of an import, or replaces it; the rest stays.
+
+    Raises:
+        UserError: there is no report, or it cannot be written.
+    """
+    held = files.read_json(out / _REPORT, _MAX_REPORT)
+    files.write_json(out / _REPORT, {**held, name: content})
 
 
 def _move(made: pathlib.Path, out: pathlib.Path, force: bool) -> None:

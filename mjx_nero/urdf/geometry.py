@@ -16,8 +16,6 @@ from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Shape, Tree, Vec
 MAX_SHAPES = 4_000  # visuals and collisions of a robot
 MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once for every scale
 MAX_SECONDS = 60.0  # [s] of processor time
-MAX_SPAN = 10.0  # [m] of a mesh and its link's origin, and ...
-MAX_SPANS = 50.0  # ... of the longest joint offset: one beyond both is in millimetres
 MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
 STAND_IN = (0.9, 0.6, 0.2, 1.0)
 
@@ -70,10 +68,10 @@ class Looks:
 
     Attributes:
         of: link -> its ``Look``.
+        spans: file and scale of each mesh -> its largest extent [m].
 
     Raises:
-        UserError: a mesh lies outside the folders, is too large or looks to be in millimetres, or the robot has more shapes than
-            the limits above allow.
+        UserError: a mesh lies outside the folders or is too large, or the robot has more shapes than the limits above allow.
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], loader: meshes.Meshes, notes: Notes):
@@ -84,12 +82,11 @@ class Looks:
             raise UserError(f"the URDF has {shapes:,} visuals and collisions: more than {MAX_SHAPES:,} are not read")
         drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
         self._files = drawing.MeshFiles(len(drawn), self._work.spend, notes)
-        self._spans: dict[tuple[str, tuple[float, ...]], float] = {}  # file and scale of a mesh -> its largest extent [m]
+        self.spans: dict[tuple[str, tuple[float, ...]], float] = {}
         self._absent: dict[str, str] = {}  # name of a mesh -> where it was looked for
         seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
         self._beside = {n for links in seen for n in links}  # links whose body has looks: what has none of its own is hidden
         self.of = {name: self._look(link) for name, link in tree.links.items()}
-        _check_units(self._spans, max(float(np.linalg.norm(j.origin[:3, 3])) for j in tree.joints.values()))
         if self._absent:
             notes.add("warning", "robot", tree.name, _told(self._absent))
         for body in parts.values():
@@ -157,7 +154,7 @@ class Looks:
             return "", [(_solid(shape.kind, shape.size), None)]
         stem, parts = self._meshes.load(shape.file)
         corners = np.concatenate([np.zeros((1, 3)), *(mesh.bounds for mesh, _ in parts)]) * shape.size
-        self._spans[shape.file, shape.size] = float(np.ptp(corners, axis=0).max())
+        self.spans[shape.file, shape.size] = float(np.ptp(corners, axis=0).max())
         return stem, parts
 
 
@@ -197,21 +194,6 @@ def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
         return trimesh.creation.cylinder(size[0], size[1])
     capsule = trimesh.creation.capsule(height=size[1], radius=size[0])
     return capsule.apply_translation(-capsule.bounds.mean(0))
-
-
-def _check_units(spans: Mapping[tuple[str, tuple[float, ...]], float], offset: float) -> None:
-    """Compares the meshes' extents with the longest joint offset [m].
-
-    Raises:
-        UserError: the largest mesh looks to be in millimetres.
-    """
-    (file, scale), span = max(spans.items(), key=lambda item: item[1], default=(("", ()), 0.0))
-    if span > max(MAX_SPAN, MAX_SPANS * offset):
-        wanted = " ".join(f"{s / 1000:g}" for s in scale)
-        raise UserError(
-            f"mesh {file!r} is {span:.3g} m large, but no joint is offset by more than {offset:.3g} m: the mesh looks to be in "
-            f'millimetres; give it scale="{wanted}" in the URDF'
-        )
 
 
 def _told(absent: Mapping[str, str]) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
 from mjx_nero.urdf import chain as chain_of
-from mjx_nero.urdf import collide, drives, files, fingers, folder, inertia, meshes, mjcf, regions, rest, workspace
+from mjx_nero.urdf import collide, couplings, drives, files, fingers, folder, inertia, meshes, mjcf, regions, rest, workspace
 from mjx_nero.urdf import hand as hands
 from mjx_nero.urdf import home as homing
 from mjx_nero.urdf import read as reader
@@ -23,6 +23,7 @@ from mjx_nero.urdf.geometry import Looks
 from mjx_nero.urdf.report import Notes, Report
 from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
+from mjx_nero.urdf.units import METRES, Units, check_lengths
 
 
 # Long: the stages of an import, one after another.
@@ -40,7 +41,7 @@ def import_urdf(
     open: Mapping[str, float] | None = None,
     closed: Mapping[str, float] | None = None,
     home: Mapping[str, float] | None = None,
-    degrees: bool = False,
+    units: Units = METRES,
     strict: bool = False,
     force: bool = False,
 ) -> Report:
@@ -64,7 +65,7 @@ def import_urdf(
         ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
         open, closed: positions of the gripper's joints [rad, m], in place of the guess (``swing.Swing.ends``).
         home: positions of some joints [rad, m], in place of the guess (``home.home``).
-        degrees: limits and velocities of hinges are in degrees; slides, mimics and what is given here stay in metres and radians.
+        units: of the URDF, if they are not metres and radians; what is given here is in these.
         strict: warnings become an error.
 
     Raises:
@@ -74,11 +75,14 @@ def import_urdf(
     folder.check(out, force)
     notes = Notes()
     roots = files.Roots(path, packages or {})
-    tree, mount = reader.read(path, roots, notes, args or {}, degrees=degrees)
+    tree, mount = reader.read(path, roots, notes, args or {}, units=units)
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
-    tree, grips, fork = fingers.choose(_filled(tree, looks, notes), looks.of, gripper, notes)
+    check_lengths(tree, looks.spans, units)
+    whole = _filled(tree, looks, notes)
+    tree, grips, fork = fingers.choose(whole, looks.of, gripper, notes)
+    couplings.warn_of_frozen(whole, tree, grips, notes)
     parts = bodies(tree)
     hand = hands.find(tree, parts, looks.of, (grips, fork), ee, notes, open, closed)
     stand = rest.stand(parts, looks.of, hand, mount, tree.name, notes)

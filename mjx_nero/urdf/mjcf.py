@@ -51,7 +51,6 @@ def document(
     for mesh in dict.fromkeys(d.mesh for items in drawn.values() for d in items if d.mesh):
         etree.SubElement(asset, "mesh", name=mesh, file=f"{mesh}.stl")
     elements = {"": etree.SubElement(root, "worldbody")}
-    joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
     for body in parts.values():
         # MuJoCo displaces a joint from its reference: the body's frame is given there, and poses stay the URDF's.
         frame = body.frame
@@ -61,7 +60,7 @@ def document(
         elements[body.name] = element
         _inertial(element, masses[body.name])
         if body.joint:
-            _joint(element, body.joint, _range(body.joint, joints), armature[body.joint.name], rest)
+            _joint(element, body.joint, armature[body.joint.name], rest)
         for link, at in body.links.items():
             for item in drawn[link]:
                 _drawn(element, item, at)
@@ -106,18 +105,9 @@ def _mimic(element: etree._Element, joint: Joint, rest: Mapping[str, float]) -> 
     etree.SubElement(element, "joint", **both, polycoef=_text(terms), solref="0.02 1", solimp="0.95 0.99 0.001")
 
 
-def _range(joint: Joint, joints: Mapping[str, Joint]) -> tuple[float, float]:
-    """A joint's range; of a follower where its driver takes it, as its own limits would stop the driver half way."""
-    if joint.mimic is None or joint.mimic[0] not in joints:
-        return joint.lower, joint.upper
-    source, multiplier, offset = joint.mimic
-    low, high = sorted(multiplier * end + offset for end in (joints[source].lower, joints[source].upper))
-    return low, high
-
-
-def _joint(element: etree._Element, joint: Joint, span: tuple[float, float], armature: float, rest: Mapping[str, float]) -> None:
+def _joint(element: etree._Element, joint: Joint, armature: float, rest: Mapping[str, float]) -> None:
     row = {"name": joint.name, "type": "slide" if joint.type == "prismatic" else "hinge", "axis": _text(joint.axis)}
-    row |= {"range": _text(span), "armature": repr(float(armature))}
+    row |= {"range": _text((joint.lower, joint.upper)), "armature": repr(float(armature))}
     if joint.mimic:
         row["ref"] = repr(float(rest[joint.name]))
     if joint.type == "continuous" or joint.mimic:

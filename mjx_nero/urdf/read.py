@@ -1,5 +1,6 @@
 """URDF text to a checked ``Tree``: what is wrong is repaired with a note, or is an error that says what to do."""
 
+import dataclasses
 import io
 import logging
 import math
@@ -13,13 +14,12 @@ from lxml import etree
 
 from mjx_nero import config
 from mjx_nero.types import UserError
-from mjx_nero.urdf import files, inertia, validate, xacro
+from mjx_nero.urdf import couplings, files, inertia, validate, xacro
+from mjx_nero.urdf import units as units_of
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import MOVING, Joint, Link, Mass, Pose, Shape, Tree
 
 MAX_MOVING = 100  # MuJoCo's XML reader nests no deeper than a few hundred bodies
-MAX_TURNS = 4  # limits of a hinge beyond that look like degrees
-HINGES = ("revolute", "continuous")
 RESERVED = {"link": ("world", "cube", "goal"), "joint": ("cube",)}  # names that scenes use
 logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
 
@@ -30,12 +30,12 @@ def read(
     notes: Notes,
     args: Mapping[str, str] = MappingProxyType({}),
     *,
-    degrees: bool = False,
+    units: units_of.Units = units_of.METRES,
 ) -> tuple[Tree, Pose]:
     """The robot that the file describes, and where its root stands in the world [4, 4].
 
     An empty root link ``world`` with one fixed joint is that joint's pose; it is left out of the tree.
-    With ``degrees`` the limits and velocities of hinges are read in degrees, not radians.
+    ``units`` says what its numbers are in, if not in metres and radians.
 
     Raises:
         UserError: the file is missing, too large, malformed, or describes no tree of links with fixed, revolute, continuous and
@@ -51,6 +51,7 @@ def read(
     if not (root.get("name") or "").strip():
         root.set("name", path.stem)
     root.set("name", "".join(c for c in root.get("name") if c.isprintable())[: validate.MAX_NAME].strip() or "robot")
+    couplings.adopt(root, notes)
     validate.check(root, notes)
     try:
         urdf = yourdfpy.URDF.load(
@@ -61,27 +62,11 @@ def read(
         )
     except Exception as error:  # what the checks above let through fails in yourdfpy in ways of its own
         raise UserError(f"{path} cannot be read as a URDF: {type(error).__name__}: {' '.join(str(error).split())}") from None
-    if degrees:
-        _to_radians(urdf.robot)
+    units_of.applied(urdf.robot, units)
     tree, mount = _tree(urdf.robot, notes)
-    if not degrees:
-        _suspect_degrees(tree, notes)
+    if not units.degrees:
+        units_of.suspect_degrees(tree, notes)
     return tree, mount
-
-
-def _to_radians(robot: yourdfpy.Robot) -> None:
-    """Takes the limits and velocities of hinges for degrees."""
-    for limit in (j.limit for j in robot.joints if j.type in HINGES and j.limit is not None):
-        for field in ("lower", "upper", "velocity"):
-            value = getattr(limit, field)
-            setattr(limit, field, None if value is None else math.radians(value))
-
-
-def _suspect_degrees(tree: Tree, notes: Notes) -> None:
-    for joint in tree.joints.values():
-        if joint.type == "revolute" and max(abs(joint.lower), abs(joint.upper)) > MAX_TURNS * math.tau:
-            text = f"limits {joint.lower:g} .. {joint.upper:g} rad lie beyond {MAX_TURNS} turns, which looks like degrees"
-            notes.add("warning", "joint", joint.name, f"{text}: if they are, import with --degrees")
 
 
 def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
@@ -178,7 +163,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
     if abs(length - 1) > 1e-6:
         notes.add("repaired", "joint", name, f"the axis had length {length:g}, now 1")
     kind = "revolute" if _bounded(joint) else joint.type
-    lower, upper = _limits(joint, name, notes)
+    lower, upper = (0.0, 0.0) if joint.mimic else _limits(joint, name, notes)  # a follower's are its driver's
     effort, velocity = (_positive(joint.limit, field, name, notes) for field in ("effort", "velocity"))
     losses = {}
     for field in ("damping", "friction"):
@@ -259,13 +244,22 @@ def _with_mimics(joints: list[Joint], robot: yourdfpy.Robot, rename: dict[str, s
                 notes.add("warning", "joint", joint.name, f"mimics the fixed joint {source!r}: held at {offset:g}")
                 source = ""
             mimic = source, multiplier, offset
-        out.append(Joint(**{**joint.__dict__, "mimic": mimic}))
+            joint = _following(joint, by_name[source] if source else None, (multiplier, offset))
+        out.append(dataclasses.replace(joint, mimic=mimic))
     moving = sum(j.moves for j in out)
     if not any(j.moves and j.mimic is None for j in out):
         raise UserError("the URDF has no joint that moves: nothing to control")
     if moving > MAX_MOVING:
         raise UserError(f"the URDF has {moving} moving joints: more than {MAX_MOVING} are not supported")
     return out
+
+
+def _following(joint: Joint, source: Joint | None, by: tuple[float, float]) -> Joint:
+    """A follower between the limits that its driver's put to it: its own would stop the driver half way."""
+    multiplier, offset = by
+    ends = (multiplier * end + offset for end in ((source.lower, source.upper) if source else (0.0, 0.0)))
+    lower, upper = sorted(ends)
+    return dataclasses.replace(joint, lower=lower, upper=upper)
 
 
 def _link(name: str, link: yourdfpy.Link, colours: dict[str, tuple[float, ...] | None], notes: Notes) -> Link:

@@ -40,7 +40,7 @@ class Notes(list[Note]):
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What an import did; ``report.json`` holds the same.
+    """What an import did; ``report.json`` holds the same, and later what the self-test found (``folder.record``).
 
     Attributes:
         folder: the model folder.

@@ -1,4 +1,4 @@
-"""How the robot stands: on the table, or on the floor beside it."""
+"""How the robot stands: on the table, or on the floor beside it; or how it hangs."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,9 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Pose, body_of
 
 SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal, which stands on the floor beside the table
-UPRIGHT = 0.99  # least cosine of a base's tilt that stands and does not hang
+UPRIGHT = 0.99  # least cosine of a base's tilt that may stand on the table as well
+TILTED = 0.5  # ... and of one that stands at all
+HANGS = (0.3, 0.9)  # of the arm's length: so high is the shoulder of one that hangs above the table
 TALL = 0.6  # [m] a shoulder higher than this above the floor, and than ...
 SHARE = 0.4  # ... this share of the arm's length, is a robot's that stands on the floor
 BELOW = 0.3  # of the arm's length: the table then lies so far below the shoulder
@@ -26,10 +28,53 @@ class Stand:
 
 
 def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: Pose, name: str, notes: Notes) -> Stand:
-    """On the table; a pedestal beside it on the floor, its frame at the table's height; and so what is as tall as a person."""
+    """On the table; a pedestal, or what is as tall as a person, on the floor beside it; or hung, as the URDF mounts it.
+
+    A pedestal's top, where the arm begins, is at the table's height. What hangs does so where the table is in its reach.
+    """
     base = next(iter(parts.values()))
     points = [(look.points @ at[:3, :3].T + at[:3, 3]) for link, at in base.links.items() if (look := _seen(looks[link]))]
     low = min(float((p @ mount[2, :3]).min()) for p in points) if points else 0.0
+    chain = _chain(parts, hand)
+    shoulder = float((mount[:3, :3] @ _pose(parts, chain[0].name)[:3, 3])[2]) if chain else 0.0
+    length = sum(float(np.linalg.norm(b.frame[:3, 3])) for b in chain[1:])
+    if mount[2, 2] < TILTED:
+        return _hung(mount, shoulder, length, name, notes)
+    if low < -SINKS:
+        top = float((mount[:3, :3] @ _foot(base, chain)[:3, 3])[2])
+        mount = _at(mount, -round(top, 3))
+        text = f"its base goes {top - low:.2f} m below where the arm begins: a pedestal, on the floor beside the table"
+        notes.add("guessed", "robot", name, f"{text}, its top at the table's height (base_pos, floor)")
+        return Stand(mount, round(float(mount[2, 3]) + low, 3))
+    if shoulder - low > TALL and shoulder - low > SHARE * length:
+        mount = _at(mount, -round(shoulder - BELOW * length, 2))
+        notes.add("guessed", "robot", name, f"it stands on the floor: the table is {-mount[2, 3]:g} m higher (base_pos)")
+        return Stand(mount, round(float(mount[2, 3]) + low, 3))
+    if points and mount[2, 2] > UPRIGHT and mount[2, 3] + low > SINKS:
+        notes.add("guessed", "robot", name, f"mounted {mount[2, 3]:.2f} m up on nothing: put on the table (base_pos)")
+        mount = _at(mount, -low)
+    return Stand(mount, 0.0)
+
+
+def _hung(mount: Pose, shoulder: float, length: float, name: str, notes: Notes) -> Stand:
+    """A base that is tilted so far that it can only hang; lower or higher, if the arm would not work over the table.
+
+    Args:
+        shoulder: how much higher than the mount the first joint is [m].
+        length: of the arm [m].
+    """
+    height = float(mount[2, 3]) + shoulder
+    fits = HANGS[0] * length <= height <= HANGS[1] * length
+    if not fits:
+        mount = _at(mount, round(sum(HANGS) / 2 * length - shoulder, 2))
+    angle = np.degrees(np.arccos(np.clip(mount[2, 2], -1, 1)))
+    where = f"its mount is {mount[2, 3]:.2f} m above the table{'' if fits else ', where that is in reach'} (base_pos)"
+    notes.add("guessed", "robot", name, f"its base is tilted by {angle:.0f} degrees: it hangs from a plate, and {where}")
+    return Stand(mount, 0.0)
+
+
+def _chain(parts: dict[str, Body], hand: Hand) -> list[Body]:
+    """The bodies from the base to the hand, without the slides that a lift begins with."""
     chain: list[Body] = []
     at = body_of(parts, hand.link)
     while at.joint is not None:
@@ -37,23 +82,20 @@ def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: 
         at = parts[at.parent]
     while len(chain) > 1 and chain[0].joint and chain[0].joint.type == "prismatic":
         chain = chain[1:]
-    shoulder = float((mount[:3, :3] @ _pose(parts, chain[0].name)[:3, 3])[2]) if chain else 0.0
-    length = sum(float(np.linalg.norm(b.frame[:3, 3])) for b in chain[1:])
-    if low < -SINKS:
-        notes.add(
-            "guessed", "robot", name, f"its base goes {-low:.2f} m below its frame: a pedestal, on the floor beside the table"
-        )
-        return Stand(mount, round(float(mount[2, 3]) + low, 3))
-    if shoulder - low > TALL and shoulder - low > SHARE * length:
-        mount = mount.copy()
-        mount[2, 3] = -round(shoulder - BELOW * length, 2)
-        notes.add("guessed", "robot", name, f"it stands on the floor: the table is {-mount[2, 3]:g} m higher (base_pos)")
-        return Stand(mount, round(float(mount[2, 3]) + low, 3))
-    if points and mount[2, 2] > UPRIGHT and mount[2, 3] + low > SINKS:
-        notes.add("guessed", "robot", name, f"mounted {mount[2, 3]:.2f} m up on nothing: put on the table (base_pos)")
-        mount = mount.copy()
-        mount[2, 3] = -low
-    return Stand(mount, 0.0)
+    return chain
+
+
+def _foot(base: Body, chain: list[Body]) -> Pose:
+    """The frame of the base's link that carries the arm [4, 4]."""
+    joint = chain[0].joint if chain else None
+    return base.links.get(joint.parent if joint else base.name, np.eye(4))
+
+
+def _at(mount: Pose, height: float) -> Pose:
+    """The mount at another height [m]."""
+    out = mount.copy()
+    out[2, 3] = height
+    return out
 
 
 def _pose(parts: dict[str, Body], name: str) -> Pose:

@@ -233,7 +233,7 @@ def test_program_takes_the_folder_of_an_imported_robot(call, tmp_path):
     folder.mkdir()
     shutil.copy(NERO.xml, folder / "model.xml")
     robot_file.write(folder, dataclasses.replace(NERO, name="my_arm", gripper=GripperCfg()))
-    code, out, err = call(str(folder))
+    code, out, err = call(str(folder), "--no-self-test")
     assert (code, err) == (0, "") and "joints of my_arm" in out and "gap" not in out
     code, out, _ = call("nero_lift", "--robot", "cobotta_pro_900")
     assert code == 0 and "joints of cobotta_pro_900" in out
@@ -250,7 +250,7 @@ def test_list_envs(call, monkeypatch):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "the following arguments are required: name"),
+        ([], "name a robot, an environment or the folder of an imported robot"),
         (["nerro"], "no robot or environment 'nerro' (did you mean 'nero'?)"),
         (["nero", "--preset", "isaac"], "nero is a robot: --preset and --robot go with an environment"),
         (["nero_lift", "--preset", "x"], "unknown preset of nero_lift 'x'"),

@@ -23,6 +23,7 @@ from mjx_nero.urdf import drawing, drives, files, geometry, import_urdf, inertia
 from mjx_nero.urdf import folder as model_folder
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Mass, bodies
+from mjx_nero.urdf.units import METRES, Units, check_lengths
 
 KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in ("plane", "sphere", "capsule", "box")}
 EXACT = {"rtol": 0, "atol": 1e-12}
@@ -542,7 +543,7 @@ def test_limits_in_degrees(tmp_path, limit, degrees, expected, speed):
     slide = make.joint("s", "l1", "tip", **{**make.SLIDE, "limit": 'lower="0" upper="30" velocity="60"'})
     text = make.arm(1, make.link("tip"), slide).replace('lower="-1" upper="1" effort="10" velocity="2"', limit)
     path, notes = make.write(tmp_path, text), Notes()
-    tree, _ = read.read(path, files.Roots(path, {}), notes, degrees=degrees)
+    tree, _ = read.read(path, files.Roots(path, {}), notes, units=Units(degrees))
     hinge, slider = tree.joints["j1"], tree.joints["s"]
     np.testing.assert_allclose([hinge.lower, hinge.upper], expected)
     assert hinge.velocity == (None if speed is None else pytest.approx(speed))
@@ -557,7 +558,7 @@ def test_degrees_of_the_command(tmp_path):
     with pytest.raises(UserError, match="--strict: joint j1: .*looks like degrees.*--degrees"):
         main([str(path), "--out", str(tmp_path / "out"), "--strict"])
     assert not (tmp_path / "out").exists()
-    main([str(path), "--out", str(tmp_path / "out"), "--degrees"])
+    main([str(path), "--out", str(tmp_path / "out"), "--degrees", "--no-self-test"])
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
     np.testing.assert_allclose(model.jnt_range, [[-np.pi / 2, np.pi / 2]] * 2, rtol=1e-6)
 
@@ -579,7 +580,7 @@ def test_meshes_in_millimetres(tmp_path, corner, scale, offset, wanted):
     roots, notes = files.Roots(path, {}), Notes()
     tree, _ = read.read(path, roots, notes)
     if wanted is None:
-        geometry.Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
+        check_lengths(tree, geometry.Looks(tree, bodies(tree), meshes.Meshes(roots), notes).spans, METRES)
         return
     with pytest.raises(UserError, match=f"'m.stl' .* millimetres; give it scale=\"{wanted}\"") as error:
         import_urdf(path, tmp_path / "out")
@@ -874,7 +875,20 @@ def test_out_of_others_is_left_alone(tmp_path):
 def test_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     path = make.write(tmp_path / "in", make.arm(3, make.link("e", make.mesh("no.stl")), make.joint("w", "l3", "e", "fixed")))
-    main([str(path), "--out", str(tmp_path / "out"), "--home", "j1=0.5,j2=-0.25", "--gripper", "none", "--ee", "l3:0,0,0.2"])
+    main(
+        [
+            str(path),
+            "--out",
+            str(tmp_path / "out"),
+            "--home",
+            "j1=0.5,j2=-0.25",
+            "--gripper",
+            "none",
+            "--ee",
+            "l3:0,0,0.2",
+            "--no-self-test",
+        ]
+    )
     text = capsys.readouterr().out
     for part in (
         "5 in 4 bodies",

@@ -254,6 +254,37 @@ def test_pedestal_stands_on_the_floor_beside_the_table(tmp_path):
     assert model.geom("floor").pos[2] + model.geom("floor").size[2] == pytest.approx(-0.8, abs=2e-3)
 
 
+def test_arm_on_a_stand_has_the_table_at_its_foot(tmp_path):
+    """A stand of 0.5 m with its frame amid it, mounted so that it stands on the ground: not on the table, but beside it."""
+    stand = make.link("stand", make.inertial(50), make.shape('<box size="0.2 0.2 0.5"/>'))
+    world = make.link("world"), make.joint("fix", "world", "stand", "fixed", xyz="0 0 0.25")
+    foot = make.joint("on", "stand", "base", "fixed", xyz="0 0 0.255")
+    _, report = imported(tmp_path, *world, stand, foot, base(), *six())
+    robot, note = report.robot, "\n".join(report.notes.of("robot", "arm"))
+    assert robot.base_pos == pytest.approx((0, 0, -0.255)) and robot.floor == pytest.approx(-0.505, abs=1e-3)
+    assert "a pedestal, on the floor beside the table, its top at the table's height" in note
+    objects = scene.around(robot, scene.SceneCfg())
+    model = scene.build(robot, objects, scene.SimCfg())
+    assert objects.table_center[0] - objects.table_size[0] / 2 > 0.1  # not in the stand
+    assert model.geom("floor").pos[2] + model.geom("floor").size[2] == pytest.approx(robot.floor, abs=2e-3)
+    assert robot.workspace[2][0] + robot.base_pos[2] > 0.05
+
+
+@pytest.mark.parametrize(("height", "kept"), [(0.5, True), (0.0, False), (3.0, False)])
+def test_arm_that_hangs_does_so_in_reach_of_the_table(tmp_path, height, kept):
+    """Upside down: its stand, which is then above it, is no pedestal; where it would hang too low or high it is moved."""
+    column = make.shape('<box size="0.2 0.2 0.5"/>', xyz="0 0 -0.25")
+    world = make.link("world"), make.joint("fix", "world", "base", "fixed", xyz=f"0 0 {height}", rpy="3.14159265 0 0")
+    _, report = imported(tmp_path, *world, base(column), *six())
+    robot, note = report.robot, "\n".join(report.notes.of("robot", "arm"))
+    assert robot.floor == 0 and robot.base_pos[2] == (pytest.approx(height) if kept else pytest.approx(0.58, abs=0.1))
+    assert "pedestal" not in note and "tilted by 180 degrees: it hangs from a plate" in note
+    assert f"{robot.base_pos[2]:.2f} m above the table" in note and ("where that is in reach" in note) != kept
+    model = scene.build(robot, scene.around(robot, scene.SceneCfg()), scene.SimCfg())
+    assert model.geom("plate").pos[2] - model.geom("plate").size[2] == pytest.approx(robot.base_pos[2], abs=2e-3)
+    assert robot.workspace and robot.workspace[2][0] + robot.base_pos[2] > 0.04
+
+
 def test_tall_robot_has_the_table_below_its_shoulder(tmp_path):
     """A shoulder 1 m above the floor, an arm of about 0.8 m: the table is 0.3 arms lower, and the workspace above it."""
     _, report = imported(tmp_path, base(make.shape('<box size="0.3 0.3 0.9"/>', xyz="0 0 0.45")), *six(foot="0 0 1.0"))

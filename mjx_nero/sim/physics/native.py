@@ -65,7 +65,7 @@ class NativePhysics:
         n, (nq, nqv, nqvv, end) = math.prod(packed.shape[:-1]), self._sizes
         given, fields = np.split(np.asarray(packed).reshape(n, -1), [end], axis=1)
         after = np.empty((n, nqvv + len(self._readers)), np.float32)
-        with _lock, _quiet():
+        with _lock, quiet():
             if n not in self._made:
                 self._made[n] = self._make(n)
             models, present, start, warmstart, ctrl, states, sensors = self._made[n]
@@ -125,7 +125,7 @@ class NativePhysics:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Silences MuJoCo's warnings, which it prints and writes to a file. The environments count the states that they concern."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero import console, files
+from mjx_nero.sim.motion import moves
 from mjx_nero.sim.scene import SimCfg
-from mjx_nero.tools import cli
-from mjx_nero.tools.inspection.motion import moves
+from mjx_nero.tools import cli, self_test
 from mjx_nero.tools.inspection.report import environments, find, inspect, picture
 from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
 
@@ -17,22 +17,33 @@ def main(argv: Sequence[str]) -> None:
     """The command line of ``inspect``."""
     parser = cli.Parser(prog=cli.called_as("inspect"), description="Shows what a robot or an environment is made of.")
     parser.add_load()
-    parser.add_argument("name", help="robot, environment, or folder of an imported robot")
+    parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
     parser.add_argument("--preset", help="of the environment (default: its first)")
-    parser.add_argument("--robot", help="for the environment: name, or folder of an imported robot")
+    parser.add_argument("--robot", help="for the environment, or by itself: name, or folder of an imported robot")
+    parser.add_argument(
+        "--no-self-test", dest="self_test", action="store_false", help="do not try an imported robot in simulation again"
+    )
     parser.add_argument("--move", action="store_true", help="move every joint to its limits and the gripper open and closed")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="everything, for programs")
     args, _ = parser.parse(argv)
     for path in filter(None, (args.render, args.json)):
         files.check_writable(path)
-    robot, cfg = find(args.name, args.preset, args.robot)
-    report, screen = inspect(args.name, args.preset, args.robot), console.screen()
+    if args.name is None and args.robot is None:
+        parser.error("name a robot, an environment or the folder of an imported robot")
+    what = (args.name, args.preset, args.robot) if args.name else (args.robot, args.preset, None)
+    robot, cfg = find(*what)
+    report, screen = inspect(*what), console.screen()
     for view in tables(report):
         screen.print(view)
     moved = moves(robot, cfg.sim if cfg else SimCfg()) if args.move else ()
     if moved:
         screen.print(move_table(moved))
+    tested = None
+    if args.self_test and robot.folder and not cfg:
+        cli.setup_jax()
+        tested = self_test.run(robot)
+        console.line(screen, tested.line, "green" if tested.passed else "yellow")
     if args.render:
         import imageio.v3 as imageio
 
@@ -42,6 +53,7 @@ def main(argv: Sequence[str]) -> None:
         console.wrote(screen, "picture", args.render)
     if args.json:
         content: dict[str, Any] = {**dataclasses.asdict(report), "moves": [dataclasses.asdict(m) for m in moved]}
+        content |= {"self_test": tested.json()} if tested else {}
         with files.whole(args.json) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
         console.wrote(screen, "json", args.json)

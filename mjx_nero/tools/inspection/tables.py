@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.console import Table
-from mjx_nero.tools.inspection.motion import Move
+from mjx_nero.sim.motion import Move
 from mjx_nero.tools.inspection.report import Environment, Report, Task
 
 

@@ -11,6 +11,7 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 _NEAR = 0.01  # of a joint's range: there, for ``moves``
 _REST, _AFTER = 3.0, 4.0  # [s] before a movement, and after its target has arrived
+_LONGEST = 60.0  # [s] of a movement: a drive may be as slow as its file says
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,20 +40,31 @@ def moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
     Position targets change once a control step, at the drives' speed limits, as in an environment; contacts are off. One joint of
     the arm at a time, from home; the gripper's together, from the other end. A joint without limits is left out.
     """
-    model = scene.build(robot, SceneCfg(objects={}, table=False), sim, visuals=False)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    home, n = np.array(robot.home), len(robot.arm.joints)
-    out = []
+    model, home, out = _alone(robot, sim), np.array(robot.home), []
     for i, name in enumerate(robot.arm.joints):
         for end in model.joint(name).range if model.jnt_limited[model.joint(name).id] else ():
             target = home.copy()
             target[i] = end
             out += _move(model, robot, sim, home, target, [i])
-    if robot.gripper.joints:
-        opened, closed = (np.concatenate([home[:n], ends]) for ends in (robot.gripper.open, robot.gripper.close))
-        fingers = list(range(n, len(home)))
-        out += _move(model, robot, sim, opened, closed, fingers) + _move(model, robot, sim, closed, opened, fingers)
-    return tuple(out)
+    return (*out, *gripper_moves(robot, sim))
+
+
+def gripper_moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
+    """The gripper closed, then opened, as in ``moves``; a line a joint. Empty without a gripper."""
+    if not robot.gripper.joints:
+        return ()
+    model, home, n = _alone(robot, sim), np.array(robot.home), len(robot.arm.joints)
+    opened, closed = (np.concatenate([home[:n], ends]) for ends in (robot.gripper.open, robot.gripper.close))
+    fingers = list(range(n, len(home)))
+    ways = (opened, closed), (closed, opened)
+    return tuple(move for start, end in ways for move in _move(model, robot, sim, start, end, fingers))
+
+
+def _alone(robot: RobotCfg, sim: SimCfg) -> mujoco.MjModel:
+    """The robot with its drives, without contacts."""
+    model = scene.build(robot, SceneCfg(objects={}, table=False), sim, visuals=False)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return model
 
 
 def _move(
@@ -63,7 +75,7 @@ def _move(
     data.qpos[at], data.ctrl[:] = robot.home, start
     mujoco.mj_step(model, data, round(_REST / sim.dt))
     speed = np.array(robot.arm.speed + robot.gripper.speed)
-    seconds = float(np.max(np.abs(target - start)[moving] / speed[moving])) + _AFTER
+    seconds = min(float(np.max(np.abs(target - start)[moving] / speed[moving])) + _AFTER, _LONGEST)
     begin, path, speeds, full = data.qpos[at].copy(), [], [], []
     limit = np.array(robot.arm.effort + robot.gripper.effort) * (1 - 1e-6)
     for _ in range(round(seconds / dt)):

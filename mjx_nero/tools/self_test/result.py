@@ -1,0 +1,53 @@
+"""What a self-test found, as values and as one line."""
+
+import dataclasses
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What the robot does, in physics.
+
+    Attributes:
+        gripper: whether it opens and closes to the ends that it claims: empty, or where it stops and why.
+        home: what touches there: empty, or the pairs.
+        script: what the tries are of: ``pick_place``, ``reach`` (without a gripper that can grasp), or empty.
+        tries: how many; of these ``good`` grasped the cube, or got there, and ``placed`` put it where it belongs.
+        failures: phase of the script -> tries that failed there.
+        reason: why there were no tries, or what was seen where most of them failed and what to look at.
+        has_gripper: whether there is one to test.
+        seconds: that the test took.
+    """
+
+    gripper: str
+    home: str
+    script: str
+    tries: int
+    good: int
+    placed: int
+    failures: dict[str, int]
+    reason: str
+    has_gripper: bool
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is left to look at."""
+        return not (self.gripper or self.home or self.reason)
+
+    @property
+    def line(self) -> str:
+        """All of it, for people."""
+        parts = [self.gripper or "the gripper opens and closes"] if self.has_gripper else []
+        parts.append(self.home or "home touches nothing")
+        if self.script == "pick_place":
+            parts.append(f"the script grasps the cube in {self.good} of {self.tries} tries and places it in {self.placed}")
+        elif self.script:
+            parts.append(f"the arm reaches {self.good} of {self.tries} points of its workspace")
+        where = ", ".join(f"{count} fail{'s' * (count == 1)} at {phase!r}" for phase, count in self.failures.items())
+        parts += [part for part in (where, self.reason) if part]
+        return f"self-test: {'; '.join(parts)}"
+
+    def json(self) -> dict[str, Any]:
+        """For ``report.json``."""
+        return {**dataclasses.asdict(self), "passed": self.passed, "line": self.line}
