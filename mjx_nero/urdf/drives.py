@@ -1,5 +1,6 @@
 """Drives of an imported robot: gains from a file, or worked out from the inertia that each joint moves."""
 
+import dataclasses
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -21,6 +22,7 @@ FREQUENCY = 20.0  # [rad/s] natural frequency of the arm's drives: a tenth of wh
 STRETCH = 0.05  # [rad, m] position error at which a drive gives its full effort, at the least
 STUCK = 0.01  # [rad, m] most that dry friction keeps a joint from where it should be
 DT = 1 / 60  # [s] longest physics step of the tasks
+USUAL = 1.5  # [rad/s, m/s] of a joint whose velocity the file leaves open
 SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
 FORCE = 60.0  # [N] most that a finger gives
@@ -97,55 +99,83 @@ def rows(
     Effort and speed are the URDF's limits, the latter at most ``SPEED``; an effort of 1 that all joints have, or that hardly
     moves its joint, is none. An arm's drive has the natural frequency ``FREQUENCY`` with the most inertia that the joint moves,
     more if the joint's own damping would make it creep or its friction stop it more than ``STUCK`` away, less if it would reach
-    its full effort within ``STRETCH``; a finger's gives its full effort (at most ``FORCE`` at its end, and ``PRESS`` for each
-    kilogram of the cube that it can lift) at ``SQUEEZE``, with a warning if it is less than ``HOLD`` for each. Damping is what
-    the joint lacks to critical, at the package's longest physics step too.
+    its full effort within ``STRETCH``; a finger's gives its full effort at ``SQUEEZE``: beside what the joints' own friction
+    takes at most ``FORCE`` at its end, and ``PRESS`` for each kilogram of the cube that it can lift, with a warning if that is
+    less than ``HOLD`` for each. Damping is what the joints lack to critical, at the package's longest physics step too.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
     cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad, hand.closed) ** 3
     force = min(FORCE, PRESS * cube) if cube else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
-    followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic]
     for joint in driven:
-        moved = [(joint.name, 1.0), *((j.name, j.mimic[1]) for j in followers if j.mimic and j.mimic[0] == joint.name)]
-        total = float(sum(ratio**2 * (inertia[name] + rotors[name]) for name, ratio in moved))
+        load = _load(joint, parts, inertia, rotors)
         finger = joint.name in hand.joints
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
-        effort, speed = joint.effort and min(joint.effort, MAX_NUMBER), min(joint.velocity or 1.5, SPEED)
-        if finger:
-            effort = min(FORCE / 3 * lever if unsaid or not effort else effort, force * lever)
-            stiffness = effort * lever / SQUEEZE if joint.type != "prismatic" else effort / SQUEEZE
-            if joint.effort and joint.effort > effort:
-                notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
-        else:
-            stiffness = max(FREQUENCY**2 * total, FREQUENCY / 2 * joint.damping, joint.friction / STUCK)
-            stiffness = min(stiffness, MAX_NUMBER)  # what robot.yaml may hold
-            if effort is None or (effort == PLACEHOLDER and (unsaid or effort / total < 2.0)):
-                kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} is a placeholder: now ")
-                effort = stiffness * 0.5
-                notes.add(kind, "joint", joint.name, f"{why}effort {effort:.3g}, the drive's at half a radian or metre")
-            elif effort / total < 2.0:
-                text = f"effort {effort:g} moves its load at no more than {effort / total:.2g} rad/s2 or m/s2: check it"
-                notes.add("warning", "joint", joint.name, text)
-            stiffness = min(stiffness, effort / STRETCH)
-        damping = max(critical_damping(stiffness, total, DT) - joint.damping, 0.0)
-        row = {"stiffness": stiffness, "damping": damping, "effort": effort, "speed": speed}
+        row = _finger(joint, load, lever, force, unsaid, notes) if finger else _arm(joint, load, unsaid, notes)
+        row["damping"] = max(critical_damping(row["stiffness"], load.inertia, DT) - load.damping, 0.0)
         if joint.name in given:
             row |= given[joint.name]
         else:
-            notes.add(
-                "guessed", "joint", joint.name, f"stiffness {stiffness:.4g} and damping {row['damping']:.4g}, by its inertia"
-            )
-        if finger and row["effort"] < HOLD * cube * lever:
-            notes.add("warning", "joint", joint.name, _weak(row["effort"], lever, cube))
-        out[joint.name] = {column: float(f"{value:.6g}") for column, value in row.items()}
+            text = f"stiffness {row['stiffness']:.4g} and damping {row['damping']:.4g}, by its inertia"
+            notes.add("guessed", "joint", joint.name, text)
+        if finger and row["effort"] - load.friction < HOLD * cube * lever:
+            notes.add("warning", "joint", joint.name, _weak(row["effort"], load.friction, lever, cube))
+        out[joint.name] = {column: float(f"{row[column]:.6g}") for column in COLUMNS}
     return out
 
 
-def _weak(effort: float, lever: float, cube: float) -> str:
+@dataclasses.dataclass(frozen=True)
+class _Load:
+    """What a drive moves, with all that follow its joint: inertia [kg m2, kg], damping [N m s/rad, N s/m], dry friction [N m, N]."""
+
+    inertia: float
+    damping: float
+    friction: float
+
+
+def _load(joint: Joint, parts: Mapping[str, Body], inertia: Mapping[str, float], rotors: Mapping[str, float]) -> _Load:
+    followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic and b.joint.mimic[0] == joint.name]
+    moved = [(joint, 1.0), *((j, j.mimic[1]) for j in followers if j.mimic)]
+    return _Load(
+        inertia=float(sum(ratio**2 * (inertia[j.name] + rotors[j.name]) for j, ratio in moved)),
+        damping=float(sum(ratio**2 * j.damping for j, ratio in moved)),
+        friction=float(sum(abs(ratio) * j.friction for j, ratio in moved)),
+    )
+
+
+def _finger(joint: Joint, load: _Load, lever: float, force: float, unsaid: bool, notes: Notes) -> dict[str, float]:
+    """Stiffness, effort and speed of a finger's drive that grips with ``force`` [N] at most at its ``lever`` [m]."""
+    wanted = FORCE / 3 * lever + load.friction if unsaid or not joint.effort else joint.effort
+    effort = min(wanted, force * lever + load.friction)
+    if joint.effort and joint.effort > effort:
+        notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
+    speed = min(joint.velocity or USUAL, SPEED)
+    if (spare := effort - load.friction) > 0 and load.damping * speed > spare:
+        speed = spare / load.damping
+        notes.add("repaired", "joint", joint.name, f"its own damping lets it move at {speed:.3g} rad/s or m/s and no faster")
+    return {"stiffness": effort * (1.0 if joint.type == "prismatic" else lever) / SQUEEZE, "effort": effort, "speed": speed}
+
+
+def _arm(joint: Joint, load: _Load, unsaid: bool, notes: Notes) -> dict[str, float]:
+    """Stiffness, effort and speed of an arm's drive."""
+    stiffness = max(FREQUENCY**2 * load.inertia, FREQUENCY / 2 * load.damping, load.friction / STUCK)
+    stiffness = min(stiffness, MAX_NUMBER)  # what robot.yaml may hold
+    effort = joint.effort and min(joint.effort, MAX_NUMBER)
+    if effort is None or (effort == PLACEHOLDER and (unsaid or effort / load.inertia < 2.0)):
+        kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} is a placeholder: now ")
+        effort = stiffness * 0.5
+        notes.add(kind, "joint", joint.name, f"{why}effort {effort:.3g}, the drive's at half a radian or metre")
+    elif effort / load.inertia < 2.0:
+        text = f"effort {effort:g} moves its load at no more than {effort / load.inertia:.2g} rad/s2 or m/s2: check it"
+        notes.add("warning", "joint", joint.name, text)
+    return {"stiffness": min(stiffness, effort / STRETCH), "effort": effort, "speed": min(joint.velocity or USUAL, SPEED)}
+
+
+def _weak(effort: float, friction: float, lever: float, cube: float) -> str:
     """What to say of a finger's effort that does not hold ``cube`` [kg] at ``lever`` [m], 1 of a slide."""
+    grip = max(effort - friction, 0.0) / lever
     return (
-        f"effort {effort:.3g} grips with {effort / lever:.2g} N, too little for a cube of {1000 * cube:.3g} g: "
-        f"give its motor's, at least {1.01 * HOLD * cube * lever:.3g}, with --gains"
+        f"effort {effort:.3g} grips with {grip:.2g} N, too little for a cube of {1000 * cube:.3g} g: "
+        f"give its motor's, at least {1.01 * HOLD * cube * lever + friction:.3g}, with --gains"
     )
