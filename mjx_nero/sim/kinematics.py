@@ -6,6 +6,7 @@ after a reset, and controllers need neither a simulator nor its data.
 """
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,17 +15,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero import math
+from mjx_nero.sim import linkage
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _STILL = np.array([1.0, 0.0, 0.0, 0.0])
+_ITSELF = (0.0, 1.0)
+
+
+class _Node(NamedTuple):
+    """A joint that moves, its frame at the anchor."""
+
+    index: int  # of the joint in q that moves it: itself, or the one that it follows
+    parent: int  # node that carries it; -1: the world
+    fixed: tuple[np.ndarray, np.ndarray]  # transform from there
+    axis: np.ndarray
+    slide: bool
+    powers: tuple[float, ...]  # how far it is from its qpos0: a polynomial in how far that joint is from its own
 
 
 class Chain:
     """Poses and Jacobians of frames as functions of some hinges and slides. Its methods are pure and take one configuration.
 
-    Joints that are not listed stay at the model's ``qpos0``. The constructor merges everything fixed between two joints into one
-    transform.
+    A joint that an equality of the model couples to a listed one follows it, as in a palletising arm's linkage. All others stay
+    at the model's ``qpos0``. The constructor merges everything fixed between two joints into one transform.
 
     Args:
         model: compiled model.
@@ -49,20 +63,19 @@ class Chain:
         limited = model.jnt_limited[ids].astype(bool)
         self.lower = np.where(limited, model.jnt_range[ids, 0], -np.inf).astype(np.float32)
         self.upper = np.where(limited, model.jnt_range[ids, 1], np.inf).astype(np.float32)
-        # A node is a listed joint, its frame at the anchor: (index in q, parent node, fixed transform from it, axis, slide?)
-        self._nodes: list[tuple[int, int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]] = []
+        self._nodes: list[_Node] = []
         self._qpos0 = np.array(model.qpos0[model.jnt_qposadr[ids]], np.float32)  # where a joint displaces nothing
-        self._index = {j: i for i, j in enumerate(ids)}
+        self._moved = _moved(model, ids)
         self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), _STILL))}
         self._model = model
         self._ends = [self._end(name) for name in frames]
-        # path[f, i]: joint i (in the order of q) moves frame f
-        self._path = np.zeros((len(self.frames), len(ids)), bool)
+        # path[f, n]: node n moves frame f
+        self._path = np.zeros((len(self.frames), len(self._nodes)), np.float32)
         for f, (node, _) in enumerate(self._ends):
             while node >= 0:
-                self._path[f, self._nodes[node][0]] = True
-                node = self._nodes[node][1]
-        del self._model, self._last
+                self._path[f, node] = 1.0
+                node = self._nodes[node].parent
+        del self._model, self._last, self._moved
 
     def _body(self, body: int, frame: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
         """Returns the node that carries a body and the fixed transform from there. Adds nodes on the way."""
@@ -75,8 +88,9 @@ class Chain:
             if m.jnt_type[j] not in (_HINGE, _SLIDE):
                 raise ValueError(f"frame {frame!r} hangs on a ball or free joint: only hinges and slides are supported")
             anchor, slide = m.jnt_pos[j], bool(m.jnt_type[j] == _SLIDE)
-            if j in self._index:
-                self._nodes.append((self._index[j], node, _compose(fixed, (anchor, _STILL)), m.jnt_axis[j].copy(), slide))
+            if j in self._moved:
+                index, powers = self._moved[j]
+                self._nodes.append(_Node(index, node, _compose(fixed, (anchor, _STILL)), m.jnt_axis[j].copy(), slide, powers))
                 node, fixed = len(self._nodes) - 1, (-anchor, _STILL)
         self._last[body] = node, fixed
         return node, fixed
@@ -94,7 +108,7 @@ class Chain:
         node, end = self._ends[frame]
         links = []
         while node >= 0:
-            i, node, fixed, axis, slides = self._nodes[node]
+            i, node, fixed, axis, slides, _ = self._nodes[node]
             links.append((i, fixed, axis, slides))
         return links[::-1], end
 
@@ -107,22 +121,25 @@ class Chain:
         nodes = self._forward(q)
         pos, quat = self._frames(nodes)
         columns: list[Array] = [jnp.zeros((len(self.frames), 6))] * len(self.joints)
-        for (i, _, _, axis, slide), (anchor, turn) in zip(self._nodes, nodes, strict=True):
-            axis_w = jnp.broadcast_to(math.rotate(turn, jnp.asarray(axis, jnp.float32)), pos.shape)
-            linear = axis_w if slide else jnp.cross(axis_w, pos - anchor)
-            columns[i] = jnp.concatenate([linear, jnp.zeros_like(linear) if slide else axis_w], axis=1)
-        return pos, quat, jnp.stack(columns, axis=-1) * jnp.asarray(self._path[:, None], jnp.float32)
+        off = q - self._qpos0
+        for n, (node, (anchor, turn)) in enumerate(zip(self._nodes, nodes, strict=True)):
+            axis_w = jnp.broadcast_to(math.rotate(turn, jnp.asarray(node.axis, jnp.float32)), pos.shape)
+            linear = axis_w if node.slide else jnp.cross(axis_w, pos - anchor)
+            column = jnp.concatenate([linear, jnp.zeros_like(linear) if node.slide else axis_w], axis=1)
+            ratio = _polynomial(tuple(np.polynomial.polynomial.polyder(node.powers)), off[node.index])
+            columns[node.index] += self._path[:, n, None] * ratio * column
+        return pos, quat, jnp.stack(columns, axis=-1)
 
     def _forward(self, q: Float[Array, " nj"]) -> list[Pose]:
         nodes: list[Pose] = []
         q = q - self._qpos0
-        for i, parent, fixed, axis, slide in self._nodes:
+        for i, parent, fixed, axis, slide, powers in self._nodes:
             pos, quat = _attach(nodes, parent, fixed)
-            along = jnp.asarray(axis, jnp.float32)
+            along, off = jnp.asarray(axis, jnp.float32), _polynomial(powers, q[i])
             if slide:
-                pos = pos + math.rotate(quat, along * q[i])
+                pos = pos + math.rotate(quat, along * off)
             else:
-                quat = math.quat_mul(quat, math.axis_angle(along, q[i]))
+                quat = math.quat_mul(quat, math.axis_angle(along, off))
             nodes.append((pos, quat))
         return nodes
 
@@ -174,6 +191,30 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
         return pos[:, 0], quat[:, 0]
 
     return pose
+
+
+def _moved(model: mujoco.MjModel, ids: Sequence[int]) -> dict[int, tuple[int, tuple[float, ...]]]:
+    """``_Node.index`` and ``powers`` of each joint that moves: the listed ones, and those that follow them."""
+    moved = {j: (i, _ITSELF) for i, j in enumerate(ids)}
+    joint = {int(address): j for j, address in enumerate(model.jnt_qposadr)}
+    for coupling in linkage.couplings(model):  # leaders come before their followers
+        follower, leader = joint[coupling.follower], joint[coupling.leader]
+        if follower not in moved and leader in moved:
+            index, powers = moved[leader]
+            constant, *ratios = coupling.coefficients
+            own = np.polynomial.Polynomial([constant - model.qpos0[coupling.follower], *ratios])
+            moved[follower] = index, tuple(float(c) for c in own(np.polynomial.Polynomial(powers)).coef)
+    return moved
+
+
+def _polynomial(powers: tuple[float, ...], x: Float[Array, ""]) -> Float[Array, ""] | float:
+    """Coefficients from the constant one on, at ``x``."""
+    if powers == _ITSELF:
+        return x
+    out: Float[Array, ""] | float = 0.0
+    for power in powers[::-1]:
+        out = out * x + power
+    return out
 
 
 def _attach(nodes: list[Pose], parent: int, fixed: tuple[np.ndarray, np.ndarray]) -> Pose:

@@ -12,6 +12,7 @@ LIGHTEST = 1e-3  # [kg] what a moving body is given at least: little enough to l
 LIGHTEST_RADIUS = 0.01  # [m] ... spread like a ball of this size at least
 DENSITY = 1000.0  # [kg/m3]
 MAX_MASS = 1e6  # [kg]
+ABSURD = 100.0  # times the most inertia that a link of its shape and mass can have: exporters write 1 where nobody gave it
 EXACT, ROUNDED = 1e-6, 0.02  # of the largest second moment: what floats lose, and what figures rounded to two digits can
 
 
@@ -44,7 +45,7 @@ def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
 
 def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero or such
-    as no body has (without a shape, the nearest that one can have).
+    as no body has (without a shape, the nearest that one can have), or ``ABSURD`` for that shape.
 
     Also notes what is suspicious and leaves it alone: a placeholder's mass, mass that would have to lie outside the shape.
     """
@@ -53,9 +54,8 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     if mass.mass < PLACEHOLDER:
         notes.add("note", "link", name, f"{mass.mass:g} kg looks like a placeholder")
     lack = _lack(mass.inertia)
-    if mass.inertia.any() and lack <= ROUNDED:
-        if points is not None and mass.mass >= PLACEHOLDER:
-            _compare(mass, points, name, notes)
+    over = _over(mass, points, name, notes) if lack <= ROUNDED and points is not None and mass.mass >= PLACEHOLDER else 0.0
+    if mass.inertia.any() and lack <= ROUNDED and over <= ABSURD:
         return mass
     if points is not None:
         moments = np.maximum(np.ptp(points, axis=0), 1e-3) ** 2 * mass.mass / 12
@@ -65,7 +65,10 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     else:
         tensor = _ball(mass.mass, max(LIGHTEST_RADIUS, (mass.mass / DENSITY / 4.19) ** (1 / 3)))
         what = f"that of a ball of {DENSITY:g} kg/m3"
-    if lack > ROUNDED:
+    if over > ABSURD:
+        text = f"{_principal(mass.inertia)} are {over:.3g} times what {mass.mass:g} kg within its shape can have: "
+        notes.add("warning", "link", name, f"{text}now {_principal(tensor)}, {what}; correct its <inertia>")
+    elif lack > ROUNDED:
         text = f"{_impossible(mass.inertia)}: now {_principal(tensor)}, {what}; correct its <inertia>"
         notes.add("warning", "link", name, text)
     elif mass.mass >= PLACEHOLDER:
@@ -109,19 +112,24 @@ def _ball(mass: float, radius: float) -> Matrix:
     return 0.4 * mass * radius**2 * np.eye(3)
 
 
-def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
-    """Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis."""
+def _over(mass: Mass, points: Points, name: str, notes: Notes) -> float:
+    """How many times the most that fits the shape's ``points`` the inertia is, at most 1 where it does; notes what is odd.
+
+    Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis; one of which
+    nothing is known lies amid the shape.
+    """
     lower, upper = points.min(0), points.max(0)
     slack = 0.02 * np.ptp(points, axis=0).max()
-    if ((mass.com < lower - slack) | (mass.com > upper + slack)).any():
-        notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
-        return
     moments = np.trace(mass.inertia) / 2 - np.diag(mass.inertia)
-    bound = mass.mass * (upper + slack - mass.com) * (mass.com - lower + slack)
-    ratio = float((moments / bound).max())
-    if ratio > 1:
+    outside = bool(((mass.com < lower - slack) | (mass.com > upper + slack)).any())
+    if outside:
+        notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
+    above, under = upper - mass.com + slack, mass.com - lower + slack
+    ratio = float((moments / mass.mass / (np.maximum(above, under) ** 2 if outside else above * under)).max())
+    if 1 < ratio <= ABSURD and not outside:
         text = f"the inertia needs mass outside the link: {ratio:.1f} times the most that fits its shape (kept)"
         notes.add("note", "link", name, text)
+    return ratio
 
 
 def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
