@@ -127,7 +127,7 @@ def rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Load:
-    """What a drive moves, with all that follow its joint: inertia [kg m2, kg], damping [N m s/rad, N s/m], dry friction [N m, N]."""
+    """Of a joint and its followers: inertia [kg m2, kg], damping [N m s/rad, N s/m] and dry friction [N m, N]."""
 
     inertia: float
     damping: float

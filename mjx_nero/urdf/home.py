@@ -11,6 +11,7 @@ from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.primitives import Primitive
+from mjx_nero.urdf.regions import Place, Quat
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
 from mjx_nero.urdf.workspace import Box
@@ -26,6 +27,7 @@ RANDOM = 200  # poses: links that touch in all of them are shaped so
 TRAVEL = 0.1  # [m] above its lowest height the hand comes to a place of ``pick``
 ACROSS, DOWNWARD, STEPS = 12, 5, 4  # points of the way there, and steps of inverse kinematics for each
 NEAR = 0.005  # [m] from its end it has got there
+NEARER = 0.1  # of ``pick``: a home that spares half a turn of the hand may reach so much less
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,24 +83,31 @@ def home(
     start: dict[str, float],
     given: Mapping[str, float],
     shapes: list[tuple[str, Primitive, bool]],
-    pick: tuple[Box | None, Vec | None, float],
+    place: Place,
     name: str,
     notes: Notes,
-) -> dict[str, float]:
-    """Joint -> home position [rad, m]: of the candidates one from which the hand gets to the most of ``pick``.
+) -> tuple[dict[str, float], Quat]:
+    """Joint -> home position [rad, m], of the candidates one from which the hand gets to the most of ``place.pick``; and how the
+    hand is turned there, wxyz: of two ways that do equally well the one that is nearer at home, as a hand has better to do than
+    to turn by half a turn first.
 
     Without a candidate it is ``start``; if a shape is below the table there, the nearest of the random poses in which none is.
-
-    Args:
-        pick: where to grasp, the direction of the grasp point's frame that then lies along y, and how far the hand may lean.
     """
     low = [(link, shape) for link, shape, meets in shapes if meets]
+    down = place.ways[0][1]
     if not len(homes.q):
-        return _clear(hand, cloud, start, given, low, name, notes)
-    box, along, lean = pick
-    best = int(np.argmax(_reached(homes.q, cloud, low, box, along, lean))) if box else 0
+        return _clear(hand, cloud, start, given, low, name, notes), down
+    best = 0
+    if place.pick is not None:
+        turns = cloud.sites(cloud.at(homes.q))[:, 1, :3]
+        values = np.zeros((len(homes.q), len(place.ways)))
+        for way, (along, _) in enumerate(place.ways):
+            near = 0.0 if along is None else turns @ along > 0
+            values[:, way] = _reached(homes.q, cloud, low, place.pick, along, place.lean) + NEARER * near
+        best, way = np.unravel_index(np.argmax(values), values.shape)
+        down = place.ways[way][1]
     notes.add("guessed", "robot", name, "home: amid the workspace (--home changes it)")
-    return homes.pose(best, start, cloud)
+    return homes.pose(int(best), start, cloud), down
 
 
 def _reached(

@@ -94,12 +94,11 @@ def import_urdf(
     homes = homing.candidates(parts, looks.of, hand, cloud, start, home or {}, shapes, work)
     down = workspace.down(cloud, hand, work[0], homes.pose(0, start, cloud) if len(homes.q) else start)
     low = [(link, shape) for link, shape, meets in shapes if meets]
-    pick, hold, down, lean = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
-    way = pick, None if lean or len(cloud.arm) < regions.TURNS else regions.opening(down), lean
-    at_home = homing.home(homes, hand, cloud, start, home or {}, shapes, way, tree.name, notes)
+    place = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
+    at_home, down = homing.home(homes, hand, cloud, start, home or {}, shapes, place, tree.name, notes)
     made = _Model(tree, parts, hand, collisions, at_home, notes)
     rotors, rows = _drives(made, gains, notes)
-    robot = dataclasses.replace(_robot(made, stand, rows, down, (work[0], pick, hold), out), lean=lean)
+    robot = dataclasses.replace(_robot(made, stand, rows, down, (work[0], place.pick, place.hold), out), lean=place.lean)
     text = made.xml({name: look.drawn for name, look in looks.of.items()}, rotors)
     report = Report(
         source=path.name,

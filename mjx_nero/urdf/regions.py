@@ -31,6 +31,23 @@ Shapes = list[tuple[str, Primitive]]  # that meet the table, with their links
 
 
 @dataclasses.dataclass(frozen=True)
+class Place:
+    """Where the gripper can grasp and hold, and how its hand is turned there.
+
+    Attributes:
+        pick, hold: boxes as in ``RobotCfg``; None where there are none.
+        lean: how far the hand leans [rad], 0 where it points down.
+        ways: how the hand may be turned about the vertical, the usual way first: the direction of the grasp point's frame [3]
+            that then lies along y, None where the turn does not count, and the orientation ``RobotCfg.down``.
+    """
+
+    pick: Box | None
+    hold: Box | None
+    lean: float
+    ways: tuple[tuple[Vec | None, Quat], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Reaching:
     """Inverse kinematics that keeps above the table.
 
@@ -65,48 +82,53 @@ def _above(cloud: Cloud, shapes: Shapes, poses: Mapping[str, Poses]) -> Bool[np.
     return np.min(heights, axis=0) > 0 if heights else np.ones(len(next(iter(poses.values()))), bool)
 
 
-def find(
-    cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes, name: str, notes: Notes
-) -> tuple[Box | None, Box | None, Quat, float]:
-    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, None where there are none; ``down``, or half a turn from it; and how far
-    the hand leans [rad], 0 where it points down.
+def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes, name: str, notes: Notes) -> Place:
+    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, and how the hand is turned there.
 
     The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
     which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
     ``OVER`` it, and with nothing below the table. Where there are none either way round the hand may be turned any way about
-    the vertical, and where there are none of those either, lean: by up to the first of ``LEANS`` that will do. The rectangle of
-    such cells is taken whose area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG``
-    times ``WIDE``; then inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held
-    may be brought as far up from there as the arm gets with the hand within ``HELD`` of down.
+    the vertical, and where there are none of those either, lean by up to one of ``LEANS``. The rectangle of such cells is taken
+    whose area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG`` times ``WIDE``; then
+    inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held may be brought as
+    far up from there as the arm gets with the hand within ``HELD`` of down.
 
     Args:
         work: the workspace; it says on which side the work is.
         down: orientation of the grasp point with the hand pointing down, wxyz.
         shapes: what must not get below the table.
     """
+    along, turned = opening(down), _half_turn(down)
+    either = (along, down), (-along, turned)
     if not hand.joints or not grasp.edge(hand.gap, hand.pad, hand.closed) or work is None:
-        return None, None, down, 0.0
-    along = opening(down)
+        return Place(None, None, 0.0, either[:1])
     low = grasp.height(hand.gap, hand.pad, hand.closed) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
-    w, x, y, z = down
-    other = (-z + 0.0, -y + 0.0, x, w)  # half a turn on about the vertical
-    exact = "pointing down, fingers along y"
-    ways = [
-        (exact, 0.0, along, down),
-        (exact, 0.0, -along, other),
-        ("pointing down", 0.0, None, down),
-        *(("leaning", tilt, None, down) for tilt in LEANS),
+    exact, few = "pointing down, fingers along y", len(cloud.arm) < TURNS
+    tries = [
+        *((exact, 0.0, (way,)) for way in either if not few),
+        ("pointing down", 0.0, ((None, down),) if few else either),
+        *(("leaning", tilt, ((None, down),)) for tilt in LEANS),
     ]
-    for how, tilt, opened, turned in ways if len(cloud.arm) >= TURNS else ways[2:]:
+    for how, tilt, ways in tries:
+        opened = ways[0][0] if how == exact else None
         pick = _pick(Reaching(cloud, shapes, shun, tilt, opened), work, low)
-        if pick is not None:
-            hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
-            notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
-            notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
-            return pick, hold, turned, round(float(tilt), 4)
+        if pick is None:
+            continue
+        hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
+        notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
+        notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
+        if how == exact and ways[0] is either[0] and Reaching(cloud, shapes, shun, tilt, -along).everywhere(pick):
+            ways = either
+        return Place(pick, hold, round(float(tilt), 4), ways)
     notes.add("warning", "robot", name, "no place found to grasp at on the table: lift needs pick and hold in robot.yaml")
-    return None, None, down, 0.0
+    return Place(None, None, 0.0, either[:1])
+
+
+def _half_turn(down: Quat) -> Quat:
+    """Half a turn on about the vertical."""
+    w, x, y, z = down
+    return -z + 0.0, -y + 0.0, x, w
 
 
 def opening(down: Quat) -> Vec:
