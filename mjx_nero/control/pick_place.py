@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
+from mjx_nero.bounds import NonNegative
 from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg
@@ -19,6 +20,7 @@ from mjx_nero.types import UserError, View
 _FASTEST = 1.0  # [m/s]: a target that moves on faster has jumped
 # Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
 PHASES = ("above pick", "down", "settle", "close", "up", "across", "down", "open", "up", "away")
+_CLOSE, _OPEN = PHASES.index("close"), PHASES.index("open")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +29,7 @@ class PickPlaceCfg:
 
     Attributes:
         events_dt: the share of each phase that one control step takes; a phase has ceil(1 / share) steps.
+        wait: how much longer the fingers take than the phases in which they close and open [s].
         end_effector_initial_height: of the grasp point above the cube's table, while it travels.
         end_effector_offset: of the grasp point from the cube's centre. The tutorial's 0.25 m counts from the flange and would
             press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
@@ -42,6 +45,7 @@ class PickPlaceCfg:
     # The tutorial's shares work, too, but take 96 s at 50 Hz. These take 17 s: the arc to the tutorial's goal turns the base by
     # up to 2.6 rad, which RMPflow's cap of 1 rad/s allows in the 5 s of phase 5.
     events_dt: tuple[float, ...] = (0.01, 0.0125, 0.05, 0.02, 0.0125, 0.004, 0.01, 0.025, 0.0125, 0.02)
+    wait: NonNegative = 0.0
     end_effector_initial_height: float = 0.2
     end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # A straight line from the front to the tutorial's goal runs through the robot's base.
@@ -105,6 +109,7 @@ class PickPlace:
         self.dt, self.cfg = dt, cfg
         # Integers: adding up shares in float32 gives other counts. The small part forgives 1 / 0.05 = 20.000000000000004.
         self.steps = np.array([int(np.ceil(1 / share - 1e-6)) for share in cfg.events_dt], np.int32)
+        self.steps[[_CLOSE, _OPEN]] += round(cfg.wait / dt)
         self.gripper = ParallelGripper(robot)
         self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
         self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None

@@ -28,6 +28,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 OPEN = 2.0  # times a cube's edge
 SLOW = 0.3  # [s] to close on it
+PRESSED = 0.7  # of their effort, with which fingers hold it
 
 
 def lift_setup(robot: RobotCfg) -> lift.LiftSetup:
@@ -88,10 +89,27 @@ def _ready(robot: RobotCfg) -> RobotCfg:
 
 
 def _pick_place(robot: RobotCfg) -> EnvCfg:
-    """By inverse kinematics: RMPflow needs files a robot."""
-    cfg, offset = pick_place.default(robot, pick_place_setup(robot)), regions.of(robot).offset
-    fields = {**cfg.controllers["pick_place"], "end_effector_offset": offset, "motion": "ik", **regions.ik(robot, "ik.")}
-    return dataclasses.replace(cfg, controllers={"pick_place": fields})
+    """By inverse kinematics: RMPflow needs files a robot. Fingers that close slowly get the time that they need."""
+    robot = _even(_ready(robot))
+    setup = pick_place_setup(robot)
+    late = max(0.0, round(grasp.closing_time(robot, grasp.cube_for(robot).size[0]) - SLOW, 2))
+    cfg = pick_place.default(robot, dataclasses.replace(setup, episode_length_s=round(setup.episode_length_s + 2 * late, 2)))
+    fields = {**cfg.controllers["pick_place"], "end_effector_offset": regions.of(robot).offset, "motion": "ik", "wait": late}
+    return dataclasses.replace(cfg, controllers={"pick_place": {**fields, **regions.ik(robot, "ik.")}})
+
+
+def _even(robot: RobotCfg) -> RobotCfg:
+    """Fingers with drives of their own close a little less than on nothing: drives that press against one another at their limits
+    let what they hold drift to either side, and springs keep it in the middle."""
+    fingers, held = robot.gripper, grasp.opened(robot, grasp.cube_for(robot).size[0]).gripper.open
+    if len(fingers.joints) < 2:
+        return robot
+    pressed = [PRESSED * effort / stiffness for effort, stiffness in zip(fingers.effort, fingers.stiffness, strict=True)]
+    close = (
+        float(np.clip(at + np.sign(shut - at) * by, min(at, shut), max(at, shut)))
+        for at, by, shut in zip(held, pressed, fingers.close, strict=True)
+    )
+    return dataclasses.replace(robot, gripper=dataclasses.replace(fingers, close=tuple(round(q, 5) for q in close)))
 
 
 def _follow_target(robot: RobotCfg, factory: Callable[[RobotCfg, follow_target.FollowTargetSetup], EnvCfg]) -> EnvCfg:

@@ -27,87 +27,96 @@ RANDOM = 200  # poses: links that touch in all of them are shaped so
 TRAVEL = 0.1  # [m] above its lowest height the hand comes to a place of ``pick``
 ACROSS, DOWNWARD, STEPS = 12, 5, 4  # points of the way there, and steps of inverse kinematics for each
 NEAR = 0.005  # [m] from its end it has got there
+OVER = 0.2  # [m] above its lowest height the hand is at most over the middle of ``pick``
 NEARER = 0.1  # of ``pick``: a home that spares half a turn of the hand may reach so much less
 
 
 @dataclasses.dataclass(frozen=True)
-class Homes:
-    """The poses that would do for a home, best first [n, k], and the joints that are free to take them."""
+class Search:
+    """A robot whose home is looked for.
 
-    q: Float[np.ndarray, "n k"]
-    free: tuple[str, ...]
-
-    def pose(self, index: int, start: Mapping[str, float], cloud: Cloud) -> dict[str, float]:
-        """Joint -> home position [rad, m]; the joints that are not free stay at ``start``."""
-        return {**start, **{j: float(v) + 0.0 for j, v in zip(cloud.arm, self.q[index], strict=True) if j in self.free}}
-
-
-def candidates(
-    parts: dict[str, Body],
-    looks: Mapping[str, Look],
-    hand: Hand,
-    cloud: Cloud,
-    start: Mapping[str, float],
-    given: Mapping[str, float],
-    shapes: list[tuple[str, Primitive, bool]],
-    work: tuple[Box | None, bool],
-) -> Homes:
-    """The poses that inverse kinematics finds with the grasp point amid the workspace, hand down if it can, its links clear of
-    the table and of one another; those that are farthest from joint limits and singularities first.
-
-    Args:
+    Attributes:
+        start: joint -> position where no better is found [rad, m].
         given: joints whose position is the user's.
         shapes: link, shape in its frame, whether it meets the table.
     """
-    free = tuple(j for j in start if j not in given and j not in hand.joints)
-    box, down = work
-    if box is None or not free:
-        return Homes(np.zeros((0, len(cloud.arm))), free)
-    found = cloud.solve(np.mean(box, axis=1)[None], down, STARTS, given, CALM)[0]
-    found = np.round(_unwound(found[~np.isnan(found[:, 0])], cloud), 3)
-    if not len(found):
-        return Homes(found, free)
-    poses = cloud.at(found)
-    above = np.min([cloud.lowest(link, s, poses) for link, s, meets in shapes if meets] or [np.ones(len(found))], axis=0)
-    clear = above > CLEAR
-    apart = clear & ~_touching(parts, looks, cloud, poses, shapes)
-    fits = apart if apart.any() else clear
-    order = np.argsort(-_comfort(cloud, found, poses, above), kind="stable")
-    return Homes(found[order[fits[order]]], free)
+
+    parts: dict[str, Body]
+    looks: Mapping[str, Look]
+    hand: Hand
+    cloud: Cloud
+    start: dict[str, float]
+    given: Mapping[str, float]
+    shapes: list[tuple[str, Primitive, bool]]
+
+    @property
+    def low(self) -> list[tuple[str, Primitive]]:
+        """The shapes that meet the table."""
+        return [(link, shape) for link, shape, meets in self.shapes if meets]
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """The joints that may be anywhere."""
+        return tuple(j for j in self.start if j not in self.given and j not in self.hand.joints)
+
+    def pose(self, q: Float[np.ndarray, " k"]) -> dict[str, float]:
+        """Joint -> position [rad, m] of a candidate; the joints that are not free stay at ``start``."""
+        arm = zip(self.cloud.arm, q, strict=True)
+        return {**self.start, **{j: float(v) + 0.0 for j, v in arm if j in self.free}}
+
+    def amid(self, box: Box | None, down: bool, tilt: float = 0.0) -> Float[np.ndarray, "n k"]:
+        """The poses that inverse kinematics finds with the grasp point amid a box, hand down or leaning by up to ``tilt``, its
+        links clear of the table and of one another; those that are farthest from joint limits and singularities first."""
+        cloud = self.cloud
+        if box is None or not self.free:
+            return np.zeros((0, len(cloud.arm)))
+        found = cloud.solve(np.mean(box, axis=1)[None], down, STARTS, self.given, CALM, tilt=tilt)[0]
+        found = np.round(_unwound(found[~np.isnan(found[:, 0])], cloud), 3)
+        if not len(found):
+            return found
+        poses = cloud.at(found)
+        above = np.min([cloud.lowest(link, s, poses) for link, s in self.low] or [np.ones(len(found))], axis=0)
+        clear = above > CLEAR
+        apart = clear & ~_touching(self.parts, self.looks, cloud, poses, self.shapes)
+        fits = apart if apart.any() else clear
+        order = np.argsort(-_comfort(cloud, found, poses, above), kind="stable")
+        return found[order[fits[order]]]
 
 
-def home(
-    homes: Homes,
-    hand: Hand,
-    cloud: Cloud,
-    start: dict[str, float],
-    given: Mapping[str, float],
-    shapes: list[tuple[str, Primitive, bool]],
-    place: Place,
-    name: str,
-    notes: Notes,
-) -> tuple[dict[str, float], Quat]:
+def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str, notes: Notes) -> tuple[dict[str, float], Quat]:
     """Joint -> home position [rad, m], of the candidates one from which the hand gets to the most of ``place.pick``; and how the
     hand is turned there, wxyz: of two ways that do equally well the one that is nearer at home, as a hand has better to do than
     to turn by half a turn first.
 
-    Without a candidate it is ``start``; if a shape is below the table there, the nearest of the random poses in which none is.
+    Where none of those amid the workspace leads to all of ``pick`` there are others over its middle. Without a candidate it is
+    ``start``; if a shape is below the table there, the nearest of the random poses in which none is.
     """
-    low = [(link, shape) for link, shape, meets in shapes if meets]
-    down = place.ways[0][1]
-    if not len(homes.q):
-        return _clear(hand, cloud, start, given, low, name, notes), down
-    best = 0
+    poses, best, way = amid, 0, 0
     if place.pick is not None:
-        turns = cloud.sites(cloud.at(homes.q))[:, 1, :3]
-        values = np.zeros((len(homes.q), len(place.ways)))
+        values = _values(search, poses, place)
+        if values.max(initial=0.0) < 1:
+            x, y, (bottom, top) = place.pick
+            over = min(top, bottom + OVER)
+            poses = np.concatenate([poses, search.amid((x, y, (over, over)), True, place.lean)])
+            values = _values(search, poses, place)
+        if len(poses):
+            best, way = np.unravel_index(np.argmax(values), values.shape)
+    if not len(poses):
+        return _clear(search, name, notes), place.ways[0][1]
+    where = "amid the workspace" if best < len(amid) else "over the place to grasp at"
+    notes.add("guessed", "robot", name, f"home: {where} (--home changes it)")
+    return search.pose(poses[best]), place.ways[way][1]
+
+
+def _values(search: Search, q: Float[np.ndarray, "n k"], place: Place) -> Float[np.ndarray, "n w"]:
+    """How good each of the poses is to start from, for each way to turn the hand: 1 and more leads to all of ``pick``."""
+    out = np.zeros((len(q), len(place.ways)))
+    if len(q) and place.pick is not None:
+        across = search.cloud.sites(search.cloud.at(q))[:, 1, :3]
         for way, (along, _) in enumerate(place.ways):
-            near = 0.0 if along is None else turns @ along > 0
-            values[:, way] = _reached(homes.q, cloud, low, place.pick, along, place.lean) + NEARER * near
-        best, way = np.unravel_index(np.argmax(values), values.shape)
-        down = place.ways[way][1]
-    notes.add("guessed", "robot", name, "home: amid the workspace (--home changes it)")
-    return homes.pose(int(best), start, cloud), down
+            near = 0.0 if along is None else across @ along > 0
+            out[:, way] = _reached(q, search.cloud, search.low, place.pick, along, place.lean) + NEARER * near
+    return out
 
 
 def _reached(
@@ -136,15 +145,8 @@ def _reached(
     return fine.reshape(len(q), -1).mean(1)
 
 
-def _clear(
-    hand: Hand,
-    cloud: Cloud,
-    start: dict[str, float],
-    given: Mapping[str, float],
-    shapes: list[tuple[str, Primitive]],
-    name: str,
-    notes: Notes,
-) -> dict[str, float]:
+def _clear(search: Search, name: str, notes: Notes) -> dict[str, float]:
+    hand, cloud, start, given, shapes = search.hand, search.cloud, search.start, search.given, search.low
     guessed = [j for j in start if j not in given and j not in hand.joints]
     clear = np.min([cloud.lowest(link, s) for link, s in shapes], axis=0) > CLEAR if shapes else np.ones(len(cloud.site), bool)
     if clear[0] or not guessed:

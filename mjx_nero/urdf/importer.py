@@ -91,11 +91,11 @@ def import_urdf(
     collisions = collide.collisions(tree, parts, looks, hand, cloud, notes)
     work = workspace.workspace(cloud, tree.name, notes)
     shapes = [(link, shape, bits > 0) for link, items in collisions.items() for _, shape, bits in items]
-    homes = homing.candidates(parts, looks.of, hand, cloud, start, home or {}, shapes, work)
-    down = workspace.down(cloud, hand, work[0], homes.pose(0, start, cloud) if len(homes.q) else start)
-    low = [(link, shape) for link, shape, meets in shapes if meets]
-    place = regions.find(cloud, hand, work[0], down, low, tree.name, notes)
-    at_home, down = homing.home(homes, hand, cloud, start, home or {}, shapes, place, tree.name, notes)
+    search = homing.Search(parts, looks.of, hand, cloud, start, home or {}, shapes)
+    homes = search.amid(*work)
+    down = workspace.down(cloud, hand, work[0], search.pose(homes[0]) if len(homes) else start)
+    place = regions.find(cloud, hand, work[0], down, search.low, tree.name, notes)
+    at_home, down = homing.home(search, homes, place, tree.name, notes)
     made = _Model(tree, parts, hand, collisions, at_home, notes)
     rotors, rows = _drives(made, gains, notes)
     robot = dataclasses.replace(_robot(made, stand, rows, down, (work[0], place.pick, place.hold), out), lean=place.lean)

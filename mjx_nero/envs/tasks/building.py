@@ -23,7 +23,6 @@ CLOSING = 0.5  # [s] the fingers take to close, at least: at a metre a second th
 PRESS = 0.075  # [s] they press before an object is lifted, at least
 # Shares of the ten phases that a control step takes: 305 steps in all, 25 of them to close and 20 to open.
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
-CLOSES, OPENS = 3, 7
 
 
 def lets_go(acts: dict[str, Term]) -> dict[str, Term]:
@@ -155,13 +154,11 @@ class Tower:
         # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
         below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
         leave = max(there.travel, top + max(self.edge, below + self.place["place"].clearance + LIFTED))
-        quick, late = list(QUICK), round(self.slow / (SimCfg().dt * SimCfg().decimation))  # control steps
-        for phase in (CLOSES, OPENS):
-            quick[phase] = 1 / (round(1 / quick[phase]) + late)
         fields = {
             "tower": self.objects,
             "rise": self.edge,
-            "events_dt": tuple(quick),
+            "events_dt": QUICK,
+            "wait": self.slow,
             "end_effector_initial_height": round(leave, 4),
             "end_effector_offset": there.offset,
             "motion": "ik",
