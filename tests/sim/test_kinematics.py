@@ -155,6 +155,27 @@ def test_joints_that_are_not_listed_stay_at_qpos0():
     chain_agrees(model, (A, B), ("tip",), np.random.default_rng(4).uniform(-3, 3, (5, 2)))
 
 
+def test_joints_that_follow_a_listed_one_move_with_it():
+    """As in the parallelograms of palletising arms: a joint follows one with a ratio, another follows that."""
+    equality = """<equality>
+      <joint joint1="offset" joint2="slide" polycoef="0.2 -1.5 0.3 0 0"/>
+      <joint joint1="b" joint2="offset" polycoef="0.1 2 0 0 0"/>
+    </equality></mujoco>"""
+    xml = CHAIN.replace('name="offset"', 'ref="40" name="offset"').replace('name="slide"', 'ref="-0.2" name="slide"')
+    model = mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", equality))
+    start = model.joint(OFFSET).qpos0[0]
+    chain = Chain(model, (A, SLIDE), ("tip", "hand"))
+    for q in np.random.default_rng(5).uniform(-0.5, 0.5, (5, 2)):
+        moved = 0.2 - 1.5 * (q[1] + 0.2) + 0.3 * (q[1] + 0.2) ** 2
+        pos, quat, jac = mujocos(model, ORDER, ("tip", "hand"), [q[1], start + moved, q[0], 0.1 + 2 * moved])
+        slope = -1.5 + 0.6 * (q[1] + 0.2)
+        wanted = np.stack([jac[:, :, 2], jac[:, :, 0] + slope * jac[:, :, 1] + 2 * slope * jac[:, :, 3]], axis=2)
+        at, turn, got = chain.jacobians(jnp.asarray(q, jnp.float32))
+        np.testing.assert_allclose(at, pos, atol=1e-5)
+        np.testing.assert_allclose(np.abs(np.sum(np.asarray(turn) * quat, axis=1)), 1, atol=1e-5)
+        np.testing.assert_allclose(got, wanted, atol=2e-5)
+
+
 @pytest.mark.parametrize("robot", [NERO, COBOTTA_PRO_900], ids=lambda robot: robot.name)
 def test_chain_of_the_robots(robot):
     model = robot_model(robot)

@@ -53,6 +53,24 @@ def test_the_elbow_of_a_ur_is_up(tmp_path):
     assert elbow > 0.3 and elbow > hand
 
 
+@pytest.mark.parametrize("offset", ["0", "3.14159265", "1.5708"])
+def test_a_home_spares_half_a_turn_of_the_hand(tmp_path, offset):
+    """However the hand is mounted, at home its fingers open along y within a quarter of a turn of what ``down`` asks for."""
+    hand = files.fingers(tmp_path, "palm", at="0 0 0.02")
+    palm = files.link("palm", files.inertial(0.1)), files.joint("tool", "link6", "palm", "fixed", "0 0 0.05", f"0 0 {offset}")
+    import_urdf(files.write(tmp_path / "in", files.robot(files.base(), *files.six(), *palm, *hand)), tmp_path / "out")
+    robot = robot_file.read(tmp_path / "out")
+    model = robot_model(robot)
+    data, down, between = mujoco.MjData(model), np.zeros(9), np.zeros(4)
+    for name, at in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos = at
+    mujoco.mj_kinematics(model, data)
+    mujoco.mju_quat2Mat(down, np.array(robot.down))
+    off = data.site(robot.ee_site).xmat.reshape(3, 3) @ down.reshape(3, 3).T
+    mujoco.mju_mat2Quat(between, off.ravel())
+    assert off[2, 2] > 0.99 and off[1, 1] > -0.01 and robot.pick is not None
+
+
 def test_links_that_always_touch_do_not_end_the_test_of_the_others(tmp_path):
     """Two links of a linkage lie within one another at every pose: that says nothing of a pose."""
     fist = [

@@ -428,6 +428,21 @@ def test_an_effort_of_one_is_a_placeholder(tmp_path):
     assert light.robot.arm.effort == (1.0,)
 
 
+def test_an_inertia_of_one_is_a_placeholder(tmp_path):
+    """1 kg m2 for a kilogram within a few centimetres, as exporters write it; what a motor's rotor adds to a link stays."""
+
+    def link(name, moments):
+        return make.link(name, make.inertial(1.0, moments=moments), make.shape('<box size="0.05 0.05 0.1"/>'))
+
+    limit = 'lower="-1" upper="1" effort="10" velocity="1"'
+    joints = [make.joint(f"j{i}", a, b, xyz="0 0 0.1", axis="0 1 0", limit=limit) for i, (a, b) in enumerate(("ba", "ac"))]
+    text = make.robot(make.link("b"), link("a", "1 0 0 1 0 1"), link("c", "0.01 0 0 0.01 0 0.01"), *joints)
+    model, report = imported(tmp_path, text)
+    np.testing.assert_allclose(np.sort(model.body("a").inertia), np.array([0.005, 0.0125, 0.0125]) / 12, rtol=1e-6)
+    np.testing.assert_allclose(model.body("c").inertia, 0.01, rtol=1e-6)
+    assert [w for w in report.warnings if "within its shape" in w and "link a" in w] == report.warnings
+
+
 def test_arm_without_gripper(tmp_path):
     model, report = imported(tmp_path, make.arm(4))
     assert report.robot.gripper.joints == () and len(report.robot.arm.joints) == 4
@@ -802,6 +817,29 @@ def test_fingers_too_weak_to_hold_are_a_warning(tmp_path, type, axis, effort, gr
     rows = "".join(f"f{i}: {{stiffness: 100, damping: 1, effort: {least}}}\n" for i in (1, 2))
     (tmp_path / "gains.yaml").write_text(rows)
     assert not weak("given", effort, gains=tmp_path / "gains.yaml")[1]
+
+
+def test_fingers_overcome_their_joints_own_friction(tmp_path):
+    """Dry friction of both fingers comes on top of what they grip with; damping says how fast they can be."""
+
+    def grips(name, losses, effort=20.0):
+        row = {"type": "prismatic", "xyz": "0 0 0.2", "limit": f'lower="0" upper="0.04" effort="{effort}" velocity="1"'}
+        inner = f"<dynamics {losses}/>"
+        joints = (
+            make.joint("f1", "l3", "left", axis="0 1 0", inner=inner, **row),
+            make.joint("f2", "l3", "right", axis="0 -1 0", inner=inner + '<mimic joint="f1"/>', **row),
+        )
+        report = imported(tmp_path / name, hand(tmp_path / name, *joints))[1]
+        return report, report.robot.gripper
+
+    _, free = grips("free", 'friction="0" damping="0"')
+    report, rough = grips("rough", 'friction="4" damping="0"')
+    assert rough.effort[0] == pytest.approx(free.effort[0] + 8, rel=1e-4) and not report.warnings
+    report, _ = grips("stuck", 'friction="12" damping="0"')
+    assert any("effort 20 grips with 0 N" in text for text in report.warnings)
+    report, slow = grips("slow", 'friction="0" damping="100"')
+    assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) < free.speed[0]
+    assert any("its own damping" in note for note in report.notes.of("joint", "f1"))
 
 
 def test_default_gains(tmp_path):
