@@ -32,7 +32,7 @@ class Public:
     flags: str = ""
     """What import-urdf takes besides."""
     packages: tuple[str, ...] = ()
-    """Folders OWNER+NAME/... of packages that it mentions."""
+    """Folders OWNER+NAME/... of packages that it mentions; NAME=OWNER+NAME/... of one that it calls by another name."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -79,6 +79,8 @@ def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
     commits = {name: values.read(str, commit, name) for name, commit in held["repositories"].items()}
     robots = {name: values.read(Public, robot, f"robots.{name}") for name, robot in held["robots"].items()}
     for name, robot in robots.items():
+        if "," in name:
+            raise UserError(f"{path}: {name!r} has a comma, which separates names in --robots: rename it")
         if robot.repository not in commits:
             raise UserError(f"{path}: {name}: {values.unknown('repository', robot.repository, commits)}")
     return commits, robots
@@ -99,7 +101,7 @@ def figures(path: pathlib.Path) -> dict[str, Any]:
 def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
     """A robot imported and tried, or the line that says why not."""
     source = folder / robot.repository.replace("/", "+") / robot.file
-    packages = [word for name in robot.packages for word in ("--package", str(folder / name))]
+    packages = [word for package in robot.packages for word in ("--package", _below(folder, package))]
     with tempfile.TemporaryDirectory() as scratch:
         out, result = pathlib.Path(scratch, "robot"), pathlib.Path(scratch, "result.json")
         begun = time.monotonic()
@@ -113,6 +115,12 @@ def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
             return row | {"failed": "episodes", "reason": failed}
         played = figures(result)
         return row | {name: played[name] for name in ("success_rate", "grasp_rate", "dropped_rate", "episodes")}
+
+
+def _below(folder: pathlib.Path, package: str) -> str:
+    """A package of the list as import-urdf takes it."""
+    name, sign, path = package.rpartition("=")
+    return f"{name}{sign}{folder / path}"
 
 
 def _failure(command: str, *words: object) -> str:
@@ -132,8 +140,14 @@ def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
     return {
         "gripper": list(robot["gripper"] or ()),
         "opening": robot["opening"],
-        "warnings": [text.replace(f"{folder}/", "") for text in report["warnings"]],
+        "warnings": [text.replace(f"{folder}/", "") for text in (*report["warnings"], *_self_test(report))],
     }
+
+
+def _self_test(report: Mapping[str, Any]) -> list[str]:
+    """The line of an import's self-test that did not pass."""
+    found = report.get("self_test") or {"passed": True}
+    return [] if found["passed"] else [found["line"]]
 
 
 def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Mapping[str, dict[str, Any]]) -> str:

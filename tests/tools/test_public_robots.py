@@ -30,6 +30,7 @@ def test_the_projects_own_list_names_arms_enough():
         ("repositories: {}", "is no list of robots"),
         ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/c, file: r.urdf}}", "no repository 'a/c'"),
         ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/b}}", "file"),
+        ("repositories: {a/b: '1'}\nrobots: {'r, left': {repository: a/b, file: r.urdf}}", "comma"),
         ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/b, file: r.urdf, flag: x}}", "'flag'"),
     ],
 )
