@@ -12,9 +12,9 @@ import urdf_files as files
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from mjx_nero import UserError, env_cfg, make
+from mjx_nero import UserError, control, env_cfg, make
 from mjx_nero.control.gripper import ParallelGripper
-from mjx_nero.envs import regions, registry
+from mjx_nero.envs import fitted, regions, registry
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.arms.so_arm100 import SO_ARM100
@@ -188,11 +188,25 @@ def test_experts_wait_for_slow_fingers(hand):
         assert usual.controllers["pick_place"]["events_dt"] == building.QUICK and usual.episode_length_s == 7.0
         late = 1.0 + building.PRESS - building.CLOSING
         assert patient.episode_length_s == pytest.approx(7.0 + 2 * late, abs=0.05)
-        steps = [1 / share for share in patient.controllers["pick_place"]["events_dt"]]
+        fields = patient.controllers["pick_place"]
+        steps = control.make("pick_place", slow, 0.02, fields).steps
         assert steps[3] == pytest.approx(25 + late / 0.02, abs=1.1) and steps[7] == pytest.approx(20 + late / 0.02, abs=1.1)
+    usual, patient = (env_cfg("pick_place", robot=each) for each in (robot, slow))
+    late = patient.controllers["pick_place"]["wait"]
+    assert usual.controllers["pick_place"]["wait"] == 0.0 and late == pytest.approx(1.0 - fitted.SLOW, abs=0.1)
+    assert patient.episode_length_s == pytest.approx(usual.episode_length_s + 2 * late)
     nero = dataclasses.replace(NERO, gripper=dataclasses.replace(NERO.gripper, speed=(0.02, 0.02)))
     closing = [env_cfg("clutter", robot=each).controllers["pick_up"]["closing"] for each in (NERO, nero)]
     assert closing == [0.3, pytest.approx((0.06 - 0.0143) / 2 / 0.02, abs=0.06)]  # from 6 cm to the thinnest there is
+
+
+def test_fingers_with_drives_of_their_own_hold_by_their_springs():
+    """Two drives that push at their limits would let the cube drift to either side: they are to stop within their springs."""
+    cfg = env_cfg("pick_place", robot=NERO)
+    edge, fingers = cfg.scene.objects["cube"].size[0], cfg.robot.gripper
+    for at, shut, effort, stiffness in zip(fingers.close, (0.5, -0.5), fingers.effort, fingers.stiffness, strict=True):
+        force = stiffness * abs(edge * shut - at)
+        assert np.sign(at) in (0, np.sign(shut)) and 0.4 * effort < force < 0.9 * effort
 
 
 def test_a_hand_leaves_what_is_held_above_its_grasp_point(hand):
