@@ -28,7 +28,6 @@ from mjx_nero.sim.scene import SceneCfg
 
 OPEN = 2.0  # times a cube's edge
 SLOW = 0.3  # [s] to close on it
-PRESSED = 0.7  # of their effort, with which fingers hold it
 
 
 def lift_setup(robot: RobotCfg) -> lift.LiftSetup:
@@ -99,12 +98,12 @@ def _pick_place(robot: RobotCfg) -> EnvCfg:
 
 
 def _even(robot: RobotCfg) -> RobotCfg:
-    """Fingers with drives of their own close a little less than on nothing: drives that press against one another at their limits
-    let what they hold drift to either side, and springs keep it in the middle."""
+    """Fingers with drives of their own close no further than their full effort takes: drives that press against one another far
+    beyond their limits let what they hold drift to either side, and springs keep it in the middle."""
     fingers, held = robot.gripper, grasp.opened(robot, grasp.cube_for(robot).size[0]).gripper.open
     if len(fingers.joints) < 2:
         return robot
-    pressed = [PRESSED * effort / stiffness for effort, stiffness in zip(fingers.effort, fingers.stiffness, strict=True)]
+    pressed = [effort / stiffness for effort, stiffness in zip(fingers.effort, fingers.stiffness, strict=True)]
     close = (
         float(np.clip(at + np.sign(shut - at) * by, min(at, shut), max(at, shut)))
         for at, by, shut in zip(held, pressed, fingers.close, strict=True)

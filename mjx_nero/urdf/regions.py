@@ -19,6 +19,7 @@ from mjx_nero.urdf.workspace import Box
 CELLS = 16  # of the reach
 NEAR, ASIDE = 0.25, 0.3125  # of the reach: the nearest before the shoulder, the farthest to its side
 LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
+SPARE = 0.02  # of the reach: the hand gets so much further than the region to all sides
 OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
 TALL = 0.4  # of the reach: the highest above the table that anything is held
 LEANS = tuple(np.radians((15, 30, 45)))  # of a hand that cannot point down: as little as will do
@@ -172,9 +173,15 @@ def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
     ends = ends if axis == 0 else ends[::-1]
     for shrink in SHRINKS:
         box = (*_about(ends, shrink), (_rounded(low), _rounded(low + OVER)))
-        if reaching.everywhere(box):
+        if reaching.everywhere(_grown(box, SPARE * reach)):
             return _raised(reaching, box, TALL * reach, cell)
     return None
+
+
+def _grown(box: Box, by: float) -> Box:
+    """The box, larger by so much to each side [m]: an arm that is stretched out at its edge would not keep to a way there."""
+    x, y, z = box
+    return (x[0] - by, x[1] + by), (y[0] - by, y[1] + by), z
 
 
 def _hold(reaching: Reaching, pick: Box, reach: float) -> Box:

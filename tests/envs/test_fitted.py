@@ -201,12 +201,12 @@ def test_experts_wait_for_slow_fingers(hand):
 
 
 def test_fingers_with_drives_of_their_own_hold_by_their_springs():
-    """Two drives that push at their limits would let the cube drift to either side: they are to stop within their springs."""
+    """Two drives that push at their limits would let the cube drift to either side: they push no further than that."""
     cfg = env_cfg("pick_place", robot=NERO)
     edge, fingers = cfg.scene.objects["cube"].size[0], cfg.robot.gripper
     for at, shut, effort, stiffness in zip(fingers.close, (0.5, -0.5), fingers.effort, fingers.stiffness, strict=True):
         force = stiffness * abs(edge * shut - at)
-        assert np.sign(at) in (0, np.sign(shut)) and 0.4 * effort < force < 0.9 * effort
+        assert np.sign(at) in (0, np.sign(shut)) and 0.6 * effort < force < 1.01 * effort
 
 
 def test_a_hand_leaves_what_is_held_above_its_grasp_point(hand):
