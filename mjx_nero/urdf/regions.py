@@ -19,7 +19,7 @@ from mjx_nero.urdf.workspace import Box
 CELLS = 16  # of the reach
 NEAR, ASIDE = 0.25, 0.3125  # of the reach: the nearest before the shoulder, the farthest to its side
 LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
-SPARE = 0.02  # of the reach: the hand gets so much further than the region to all sides
+SPARE = 0.02  # of the reach: the hand gets so much further than the region to all sides, where there is such a region
 OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
 TALL = 0.4  # of the reach: the highest above the table that anything is held
 LEANS = tuple(np.radians((15, 30, 45)))  # of a hand that cannot point down: as little as will do
@@ -171,10 +171,10 @@ def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
     (a, b), (c, d) = found
     ends = np.sort([sign * ahead[[a, b]] + origin[axis], aside[[c, d]] + origin[1 - axis]], axis=1)
     ends = ends if axis == 0 else ends[::-1]
-    for shrink in SHRINKS:
+    for spare, shrink in itertools.product((SPARE * reach, 0.0), SHRINKS):
         box = (*_about(ends, shrink), (_rounded(low), _rounded(low + OVER)))
-        if reaching.everywhere(_grown(box, SPARE * reach)):
-            return _raised(reaching, box, TALL * reach, cell)
+        if reaching.everywhere(_grown(box, spare)):
+            return *box[:2], _raised(reaching, _grown(box, spare), TALL * reach, cell)[2]
     return None
 
 
