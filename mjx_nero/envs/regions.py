@@ -75,7 +75,7 @@ def of(robot: RobotCfg) -> Regions:
 
 def turns(robot: RobotCfg) -> bool:
     """Whether the arm can turn its hand at will while that points down."""
-    return len(robot.arm.joints) >= TURNS
+    return robot.turns and len(robot.arm.joints) >= TURNS
 
 
 def ik(robot: RobotCfg, prefix: str = "") -> dict[str, bool | float]:

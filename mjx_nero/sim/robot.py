@@ -85,6 +85,7 @@ class RobotCfg:
         pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the
             unrotated base frame [m]. Its lowest height is where to grasp a cube that fits the gripper (``sim.grasp``).
         lean: largest angle from straight down that the gripper needs in ``pick`` [rad]; 0: it points down everywhere.
+        turns: whether the gripper can be turned about the vertical there so that its fingers open along y.
         hold: box above, to which the gripper can bring what it holds, in the same frame [m]. Lift tasks draw their objects from
             ``pick`` and their goals from ``hold`` by default.
         folder: folder of an imported robot, which holds ``model.xml``; empty for the package's own.
@@ -109,6 +110,7 @@ class RobotCfg:
     grip: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pick: Box | None = None
     lean: NonNegative = 0.0
+    turns: bool = True
     hold: Box | None = None
     folder: str = ""
     mjcf: str = ""

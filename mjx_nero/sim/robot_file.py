@@ -44,6 +44,7 @@ _PLAIN = (
     "grip",
     "pick",
     "lean",
+    "turns",
     "hold",
 )
 _HEAD = """\
@@ -54,7 +55,8 @@ _HEAD = """\
 # opening, closed: distance between the pads of the open and of the closed gripper. pad: size of a pad along the approach, across
 # it and along the opening. A zero means unknown. grip: centre of a held object in the frame of ee_site.
 # pick, hold: boxes of lift tasks, in the frame of workspace. The gripper can point down everywhere in pick, which begins at the
-# height for grasping; lean is the largest angle from straight down that it needs there. hold: box of goals.
+# height for grasping; lean is the largest angle from straight down that it needs there, turns whether its fingers can open along
+# y there. hold: box of goals.
 """
 
 

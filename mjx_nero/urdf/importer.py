@@ -98,7 +98,8 @@ def import_urdf(
     at_home, down = homing.home(search, homes, place, tree.name, notes)
     made = _Model(tree, parts, hand, collisions, at_home, notes)
     rotors, rows = _drives(made, gains, notes)
-    robot = dataclasses.replace(_robot(made, stand, rows, down, (work[0], place.pick, place.hold), out), lean=place.lean)
+    robot = _robot(made, stand, rows, down, (work[0], place.pick, place.hold), out)
+    robot = dataclasses.replace(robot, lean=place.lean, turns=place.turns)
     text = made.xml({name: look.drawn for name, look in looks.of.items()}, rotors)
     report = Report(
         source=path.name,

@@ -38,6 +38,7 @@ class Place:
     Attributes:
         pick, hold: boxes as in ``RobotCfg``; None where there are none.
         lean: how far the hand leans [rad], 0 where it points down.
+        turns: whether it can be turned there so that its fingers open along y.
         ways: how the hand may be turned about the vertical, the usual way first: the direction of the grasp point's frame [3]
             that then lies along y, None where the turn does not count, and the orientation ``RobotCfg.down``.
     """
@@ -45,6 +46,7 @@ class Place:
     pick: Box | None
     hold: Box | None
     lean: float
+    turns: bool
     ways: tuple[tuple[Vec | None, Quat], ...]
 
 
@@ -102,18 +104,17 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
     along, turned = opening(down), _half_turn(down)
     either = (along, down), (-along, turned)
     if not hand.joints or not grasp.edge(hand.gap, hand.pad, hand.closed) or work is None:
-        return Place(None, None, 0.0, either[:1])
+        return Place(None, None, 0.0, True, either[:1])
     low = grasp.height(hand.gap, hand.pad, hand.closed) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
-    exact, few = "pointing down, fingers along y", len(cloud.arm) < TURNS
+    exact, any_way, few = "pointing down, fingers along y", "pointing down", len(cloud.arm) < TURNS
     tries = [
         *((exact, 0.0, (way,)) for way in either if not few),
-        ("pointing down", 0.0, ((None, down),) if few else either),
+        (any_way, 0.0, ((None, down),)),
         *(("leaning", tilt, ((None, down),)) for tilt in LEANS),
     ]
     for how, tilt, ways in tries:
-        opened = ways[0][0] if how == exact else None
-        pick = _pick(Reaching(cloud, shapes, shun, tilt, opened), work, low)
+        pick = _pick(Reaching(cloud, shapes, shun, tilt, ways[0][0]), work, low)
         if pick is None:
             continue
         hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
@@ -121,9 +122,9 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
         notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
         if how == exact and ways[0] is either[0] and Reaching(cloud, shapes, shun, tilt, -along).everywhere(pick):
             ways = either
-        return Place(pick, hold, round(float(tilt), 4), ways)
+        return Place(pick, hold, round(float(tilt), 4), how != any_way, ways)
     notes.add("warning", "robot", name, "no place found to grasp at on the table: lift needs pick and hold in robot.yaml")
-    return Place(None, None, 0.0, either[:1])
+    return Place(None, None, 0.0, True, either[:1])
 
 
 def _half_turn(down: Quat) -> Quat:

@@ -85,6 +85,23 @@ def test_links_that_always_touch_do_not_end_the_test_of_the_others(tmp_path):
     assert elbow > 0.3
 
 
+def test_a_hand_that_cannot_open_along_y_is_not_asked_to(tmp_path):
+    """A wrist that hardly turns, mounted an eighth of a turn off: the hand points down, askew."""
+    hand = files.fingers(tmp_path, "palm", at="0 0 0.02")
+    palm = files.link("palm", files.inertial(0.1)), files.joint("tool", "l5", "palm", "fixed", "0 0 0.05", "0 0 0.785")
+    names, axes = ["base", "l1", "l2", "l3", "l4", "l5"], ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1")
+    frames = ("0 0 0.1", "0 0 0.1", "0 0 0.3", "0 0 0.3", "0 0 0.05")
+    parts = [files.base()]
+    for i, axis in enumerate(axes):
+        parts.append(files.link(names[i + 1], files.inertial(0.3), files.shape('<box size="0.03 0.03 0.04"/>', xyz="0 0 0.02")))
+        limit = 'lower="-0.02" upper="0.02" effort="80" velocity="2"' if i == 4 else files.ROOM
+        parts.append(files.joint(f"j{i}", names[i], names[i + 1], xyz=frames[i], axis=axis, limit=limit))
+    import_urdf(files.write(tmp_path / "in", files.robot(*parts, *palm, *hand)), tmp_path / "out")
+    robot = robot_file.read(tmp_path / "out")
+    assert robot.pick is not None and not robot.turns and robot.lean == 0
+    assert env_cfg("pick_place", robot=robot).controllers["pick_place"]["ik.free_turn"]
+
+
 @pytest.mark.parametrize("lean", [0.0, 0.7])
 def test_a_lean_reaches_the_file_and_the_controllers(tmp_path, lean):
     folder = tmp_path / "arm"
