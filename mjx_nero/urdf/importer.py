@@ -132,6 +132,10 @@ def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
         if body.joint and sum(masses[n].mass for n in body.links) < inertia.PLACEHOLDER:
             masses |= {n: inertia.guessed(masses[n], shown[n], n, notes) for n in body.links}
     links = {n: dataclasses.replace(tree.links[n], mass=inertia.filled(m, seen[n], n, notes)) for n, m in masses.items()}
+    if wild := [repr(n) for n, m in masses.items() if inertia.absurd(m, seen[n])]:
+        named = ", ".join(wild[:3]) + (f" and {len(wild) - 3} more" if len(wild) > 3 else "")
+        text = f"the inertia of {named} is more than {inertia.ABSURD:g} times what its mass and shape can have"
+        notes.add("warning", "robot", tree.name, f"{text}: taken as a placeholder, and from the shape; correct its <inertia>")
     return dataclasses.replace(tree, links=links)
 
 

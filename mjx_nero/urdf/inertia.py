@@ -13,6 +13,7 @@ LIGHTEST_RADIUS = 0.01  # [m] ... spread like a ball of this size at least
 DENSITY = 1000.0  # [kg/m3]
 MAX_MASS = 1e6  # [kg]
 ABSURD = 100.0  # times the most inertia that a link of its shape and mass can have: exporters write 1 where nobody gave it
+HEAVY = 0.1  # [kg m2] less than that does little harm
 EXACT, ROUNDED = 1e-6, 0.02  # of the largest second moment: what floats lose, and what figures rounded to two digits can
 
 
@@ -45,7 +46,7 @@ def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
 
 def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero or such
-    as no body has (without a shape, the nearest that one can have), or ``ABSURD`` for that shape.
+    as no body has (without a shape, the nearest that one can have), or ``absurd``.
 
     Also notes what is suspicious and leaves it alone: a placeholder's mass, mass that would have to lie outside the shape.
     """
@@ -54,8 +55,10 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     if mass.mass < PLACEHOLDER:
         notes.add("note", "link", name, f"{mass.mass:g} kg looks like a placeholder")
     lack = _lack(mass.inertia)
-    over = _over(mass, points, name, notes) if lack <= ROUNDED and points is not None and mass.mass >= PLACEHOLDER else 0.0
-    if mass.inertia.any() and lack <= ROUNDED and over <= ABSURD:
+    wild = absurd(mass, points)
+    if mass.inertia.any() and lack <= ROUNDED and not wild:
+        if points is not None and mass.mass >= PLACEHOLDER:
+            _compare(mass, points, name, notes)
         return mass
     if points is not None:
         moments = np.maximum(np.ptp(points, axis=0), 1e-3) ** 2 * mass.mass / 12
@@ -65,9 +68,10 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
     else:
         tensor = _ball(mass.mass, max(LIGHTEST_RADIUS, (mass.mass / DENSITY / 4.19) ** (1 / 3)))
         what = f"that of a ball of {DENSITY:g} kg/m3"
-    if over > ABSURD:
-        text = f"{_principal(mass.inertia)} are {over:.3g} times what {mass.mass:g} kg within its shape can have: "
-        notes.add("warning", "link", name, f"{text}now {_principal(tensor)}, {what}; correct its <inertia>")
+    if wild:
+        notes.add(
+            "repaired", "link", name, f"the inertia {_principal(mass.inertia)} is a placeholder: now {_principal(tensor)}, {what}"
+        )
     elif lack > ROUNDED:
         text = f"{_impossible(mass.inertia)}: now {_principal(tensor)}, {what}; correct its <inertia>"
         notes.add("warning", "link", name, text)
@@ -112,24 +116,36 @@ def _ball(mass: float, radius: float) -> Matrix:
     return 0.4 * mass * radius**2 * np.eye(3)
 
 
-def _over(mass: Mass, points: Points, name: str, notes: Notes) -> float:
-    """How many times the most that fits the shape's ``points`` the inertia is, at most 1 where it does; notes what is odd.
+def absurd(mass: Mass, points: Points | None) -> bool:
+    """Whether the inertia is a placeholder: ``HEAVY``, and ``ABSURD`` for its mass within its shape's ``points`` [n, 3]."""
+    if points is None or mass.mass < PLACEHOLDER or _lack(mass.inertia) > ROUNDED:
+        return False
+    return float(np.linalg.eigvalsh(mass.inertia)[-1]) >= HEAVY and _excess(mass, points)[0] > ABSURD
 
-    Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis; one of which
-    nothing is known lies amid the shape.
+
+def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
+    """Notes what is odd about a mass within its shape's ``points``."""
+    ratio, outside = _excess(mass, points)
+    if outside:
+        notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
+    elif ratio > 1:
+        text = f"the inertia needs mass outside the link: {ratio:.1f} times the most that fits its shape (kept)"
+        notes.add("note", "link", name, text)
+
+
+def _excess(mass: Mass, points: Points) -> tuple[float, bool]:
+    """How many times the most that fits the shape the inertia is, and whether the centre of mass lies outside.
+
+    Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis; of a centre
+    outside, mass times the square of its distance from the far end.
     """
     lower, upper = points.min(0), points.max(0)
     slack = 0.02 * np.ptp(points, axis=0).max()
     moments = np.trace(mass.inertia) / 2 - np.diag(mass.inertia)
     outside = bool(((mass.com < lower - slack) | (mass.com > upper + slack)).any())
-    if outside:
-        notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
     above, under = upper - mass.com + slack, mass.com - lower + slack
-    ratio = float((moments / mass.mass / (np.maximum(above, under) ** 2 if outside else above * under)).max())
-    if 1 < ratio <= ABSURD and not outside:
-        text = f"the inertia needs mass outside the link: {ratio:.1f} times the most that fits its shape (kept)"
-        notes.add("note", "link", name, text)
-    return ratio
+    most = np.maximum(above, under) ** 2 if outside else above * under
+    return float((moments / (mass.mass * most)).max()), outside
 
 
 def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
