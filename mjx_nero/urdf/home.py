@@ -100,7 +100,7 @@ def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str
             poses = np.concatenate([poses, search.amid((x, y, (over, over)), True, place.lean)])
             values = _values(search, poses, place)
         if len(poses):
-            best, way = np.unravel_index(np.argmax(values), values.shape)
+            best, way = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
     if not len(poses):
         return _clear(search, name, notes), place.ways[0][1]
     where = "amid the workspace" if best < len(amid) else "over the place to grasp at"

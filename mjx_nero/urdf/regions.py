@@ -28,6 +28,7 @@ DESCENTS, STARTS = 8, 12  # of the inverse kinematics, for a cell and for a poin
 TURNS = 5  # joints of an arm that can turn its hand at will while that points down
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4)
 Quat = tuple[float, float, float, float]
+Way = tuple[Vec | None, Quat]  # to turn a hand
 Shapes = list[tuple[str, Primitive]]  # that meet the table, with their links
 
 
@@ -47,7 +48,7 @@ class Place:
     hold: Box | None
     lean: float
     turns: bool
-    ways: tuple[tuple[Vec | None, Quat], ...]
+    ways: tuple[Way, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +103,13 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
         shapes: what must not get below the table.
     """
     along, turned = opening(down), _half_turn(down)
-    either = (along, down), (-along, turned)
+    either: tuple[Way, ...] = (along, down), (-along, turned)
     if not hand.joints or not grasp.edge(hand.gap, hand.pad, hand.closed) or work is None:
         return Place(None, None, 0.0, True, either[:1])
     low = grasp.height(hand.gap, hand.pad, hand.closed) + hand.grip @ hand.approach - cloud.height
     shun = ~_above(cloud, shapes, cloud.poses)
     exact, any_way, few = "pointing down, fingers along y", "pointing down", len(cloud.arm) < TURNS
-    tries = [
+    tries: list[tuple[str, float, tuple[Way, ...]]] = [
         *((exact, 0.0, (way,)) for way in either if not few),
         (any_way, 0.0, ((None, down),)),
         *(("leaning", tilt, ((None, down),)) for tilt in LEANS),
