@@ -122,9 +122,8 @@ class Plant:
         begin = sent[0] - REST
         steps = int(np.ceil((times[-1] - begin) / self.dt)) + 1
         if len(drives) * steps * (m.nq + m.nv + m.nu) > MAX_NUMBERS:
-            raise UserError(
-                f"{times[-1] - begin:.0f} s are too many physics steps of {self.dt:g} s: a minute is enough; or give a larger --dt"
-            )
+            text = f"{times[-1] - begin:.0f} s are too many physics steps of {self.dt:g} s"
+            raise UserError(f"{text}: a minute is enough; or give a larger --dt")
         edges = begin + self.dt * np.arange(steps + 1)
         states = np.zeros((len(drives), 1 + m.nq + m.nv))
         states[:, 1 : 1 + m.nq] = m.qpos0

@@ -243,7 +243,7 @@ def _checked(seed: Any, options: Any) -> int | None:
     Raises:
         gymnasium.error.Error: as ``checked_seed``, or options ask for what is not done.
     """
-    if options is not None and options != {}:
+    if options is not None and not (isinstance(options, dict) and not options):
         named = ", ".join(map(str, options)) if isinstance(options, dict) else values.short(options)
         raise gymnasium.error.Error(f"reset takes no options here, got {named}: all episodes start anew")
     return checked_seed(seed)
