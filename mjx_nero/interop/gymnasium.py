@@ -205,7 +205,7 @@ def _made(env: Any, **kwargs: Any) -> ManipulationEnv:
 
 
 def _render_mode(mode: Any) -> str | None:
-    if mode is not None and mode != "rgb_array":
+    if mode is not None and not (isinstance(mode, str) and mode == "rgb_array"):
         raise UserError(f"render_mode takes rgb_array or None, got {values.short(mode)}")
     return mode
 
@@ -266,8 +266,8 @@ def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:
 
 
 def _converter(arrays: str) -> Callable[[jax.Array], Any]:
-    if arrays not in ARRAYS:
-        raise UserError(f"unknown arrays {arrays!r}: choose one of {', '.join(ARRAYS)}")
+    if not isinstance(arrays, str) or arrays not in ARRAYS:
+        raise UserError(f"unknown arrays {values.short(arrays)}: choose one of {', '.join(ARRAYS)}")
     if arrays == "torch":
         return need("torch", "torch").from_dlpack
     return np.asarray if arrays == "numpy" else lambda array: array

@@ -45,10 +45,14 @@ def entries(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[]
     for _ in range(draw.choice((1, 1, 2, 3))):
         name, kind = draw.choice(NAMES), draw.choice(list(KINDS))
         path = pathlib.Path(os.path.normpath(home / name))
-        if path in (home, home.parent):
-            continue
+        above = pathlib.Path(os.path.realpath(path.parent))
+        if path in (home, home.parent) or home.parent not in (above, *above.parents):
+            continue  # within a link that another has made
         said.append(f"{name} is a {kind}")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError:  # one of its folders is none any more
+            continue
         if path.is_dir() and not path.is_symlink():
             path.rename(path.with_name(f"{path.name}_{draw.randrange(10**9)}"))
         path.unlink(missing_ok=True)

@@ -61,6 +61,7 @@ def urdf(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], N
         text = draw.choice(("<package><name>pkg</name></package>", "<package/>", "[" * 1000, "<name>../mine</name>", ""))
         make.write(home / name, text, "package.xml")
     if draw.random() < 0.3:
+        (home / "pkg").mkdir(exist_ok=True)
         (home / draw.choice(("link.stl", "pkg/x", "mine"))).symlink_to(folder / "mine" / draw.choice(("m.stl", ".")))
     parts = [make.link("e", *(draw.choice(INNER)(draw, folder) for _ in range(draw.randint(1, 3)))), joint(draw)]
     if draw.random() < 0.5:
