@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mjx_nero.bounds import Bounds, NonNegative, Positive, check
+from mjx_nero.bounds import Bounds, NonNegative, Positive, Seed, check
 from mjx_nero.errors import UserError
 from mjx_nero.identify.excitation import RATE, sweeps
 from mjx_nero.identify.log import MAX_ROWS, Log
@@ -36,7 +36,7 @@ class RecordCfg:
     offset: NonNegative = 0.0
     delay: Annotated[float, Bounds(0.0, 10.0)] = 0.0
     amplitude: Positive = 0.5
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self):
         check(self)

@@ -14,7 +14,10 @@ import fuzz
 import numpy as np
 import server
 
-from mjx_nero.learn import checkpoint, checkpoints, logs, policy, resume, run_cfg, run_folder, seeds, training, trust
+from mjx_nero.learn import checkpoint, policy
+from mjx_nero.learn.runs import cfg as run_cfg
+from mjx_nero.learn.runs import checkpoints, logs, resume, seeds, training, trust
+from mjx_nero.learn.runs import folder as run_folder
 from mjx_nero.tools import train_run
 from mjx_nero.tools.view import agents
 from mjx_nero.tools.view import command as view_command

@@ -164,7 +164,7 @@ def gym(seed: int, count: int) -> Iterator[tuple[str, str]]:
 def signals(seed: int, count: int) -> Iterator[tuple[str, str]]:
     """Trainings that one to three signals end at any time: nothing is half-written, and what is left can be read."""
     from mjx_nero import UserError
-    from mjx_nero.learn import resume
+    from mjx_nero.learn.runs import resume
 
     draw = random.Random(f"signals {seed}")
     command = "train --env nero_reach --impl native --num-envs 8 --num-timesteps 1e9 --eval-every 100000 --no-video --out run"

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import mjx_nero
+from mjx_nero.identify.plant import Plant
+from mjx_nero.identify.simulate import RecordCfg
 from mjx_nero.interop.gymnasium import VectorEnv
-from mjx_nero.learn import rollout
-from mjx_nero.tools.gripper_demo import demo
-from mjx_nero.tools.identification.plant import Plant
-from mjx_nero.tools.identification.simulate import RecordCfg
+from mjx_nero.learn.play import rollout
 from mjx_nero.types import UserError
 
 PAST = {f"observations.{g}.{n}": 256 for g, terms in mjx_nero.env_cfg("nero_lift").observations.items() for n in terms}
@@ -58,10 +57,3 @@ def test_recordings():
     sent, targets = np.arange(3600.0), np.tile(plant.robot.arm.home, (3600, 1))
     with pytest.raises(UserError, match="too many physics steps"):
         plant.readings([plant.nominal] * 2, sent, targets, targets[0], sent)
-
-
-def test_movements_of_a_gripper():
-    env = mjx_nero.make("nero_lift", impl="native")
-    for cycles, seconds in ((10**12, 1.5), (2, 1e12), (1000, 1000.0)):
-        with pytest.raises(UserError, match="are more than 100,000 control steps"):
-            demo(env, cycles, None, seconds)
