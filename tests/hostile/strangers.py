@@ -7,6 +7,7 @@ folder, at most 30 s and 2 GB. The same seed makes the same inputs. What got thr
 
 import argparse
 import contextlib
+import datetime
 import functools
 import json
 import os
@@ -47,6 +48,11 @@ TOGETHER: dict[str, Callable[[int, int], Iterator[tuple[str, str]]]] = {
     "gym": misuse.gym,
     "signals": misuse.signals,
 }
+
+
+def today() -> int:
+    """A seed of the day, so that a find can be made again, and another day tries others."""
+    return int(datetime.date.today().strftime("%Y%m%d"))
 
 
 def forked(kind: str, seed: int) -> tuple[str, str]:
