@@ -5,6 +5,7 @@ import json
 import math
 import os
 import pathlib
+import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO, NoReturn
@@ -307,6 +308,19 @@ def write(path: pathlib.Path, data: bytes) -> None:
         except _FolderRemoved:
             if not left:
                 raise
+
+
+def own(path: pathlib.Path) -> None:
+    """Gives a file that has further names elsewhere (hard links) a copy to itself, before something is added to it in place.
+
+    Raises:
+        UserError: it cannot be copied.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        status = os.lstat(path)
+        if stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
+            with whole(path) as part:
+                shutil.copyfile(path, part)
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:

@@ -5,6 +5,7 @@ Flags are made from the configs themselves, and not by a library for command lin
 (its terms, by name), and one set of names, readers and messages serves ``make(**fields)`` and the files of robots too.
 """
 
+import copyreg
 import dataclasses
 import types
 import typing
@@ -47,6 +48,9 @@ def freeze(cfg: Any) -> None:
 
 def _read_only(value: Any) -> Any:
     return types.MappingProxyType({k: _read_only(v) for k, v in value.items()}) if isinstance(value, Mapping) else value
+
+
+copyreg.pickle(types.MappingProxyType, lambda value: (_read_only, (dict(value),)))  # else no config could be copied or sent
 
 
 def flatten(cfg: Any, prefix: str = "") -> dict[str, Any]:

@@ -30,13 +30,14 @@ def hint(name: str, valid: Iterable[str]) -> str:
 
 
 def short(value: Any) -> str:
-    """A value for a message, cut short however large it is."""
+    """A value for a message, cut short however large it is, in one line."""
     cut = reprlib.Repr()
     cut.maxlevel, cut.maxstring, cut.maxlong, cut.maxother = 2, 60, 40, 60
     try:
         text = cut.repr(value)
     except ValueError:  # Python writes no whole number of more than some thousand digits
         return f"{type(value).__name__} too long to show"
+    text = " ".join(text.split()) if "\n" in text else text  # of arrays
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 

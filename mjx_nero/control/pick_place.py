@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
-from mjx_nero.bounds import NonNegative
+from mjx_nero.config.bounds import NonNegative
 from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg

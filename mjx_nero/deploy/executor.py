@@ -5,10 +5,51 @@ an ONNX file: each type of it is a class here, and the tests hold both equal, st
 """
 
 import dataclasses
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+
+MOST_JOINTS, MOST_PARTS = 1000, 100
+LARGEST = 1e6  # of a number in a description
+
+
+def numbers(found: Any, name: str, size: int | None = None, above: float = -np.inf) -> np.ndarray:
+    """A field of a description that may be a stranger's: finite numbers [size], or one for all.
+
+    Args:
+        size: how many there have to be; None: one.
+        above: what all of them are above.
+
+    Raises:
+        ValueError: it holds something else; one line.
+    """
+    value = found.get(name) if isinstance(found, Mapping) else None
+    given = value if isinstance(value, list | tuple) else [value]
+    plain = all(isinstance(x, int | float) and not isinstance(x, bool) and above < x and abs(x) <= LARGEST for x in given)
+    if not plain or (isinstance(value, list | tuple) and len(value) != size):
+        count = "a number" if size is None else f"{size} numbers, or one,"
+        least = f" above {above:g}" if above > -np.inf else ""
+        raise ValueError(f"the description's {name!r} takes {count}{least} up to {LARGEST:g}, got {reprlib.repr(value)}")
+    return np.array(value, float)
+
+
+def names(found: Any, name: str) -> tuple[str, ...]:
+    """A field of a description that lists names, each once.
+
+    Raises:
+        ValueError: it does not; one line.
+    """
+    value = found.get(name) if isinstance(found, Mapping) else None
+    if (
+        not isinstance(value, list | tuple)
+        or not all(isinstance(each, str) for each in value)
+        or len(set(value)) < len(value)
+        or len(value) > MOST_JOINTS
+    ):
+        raise ValueError(f"the description's {name!r} takes a list of names, each once, got {reprlib.repr(value)}")
+    return tuple(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +70,28 @@ class Joints:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> "Joints":
-        """From the metadata of an exported policy."""
-        own = metadata["joints"]
-        arrays = {name: np.array(own[name], float) for name in ("home", "lower", "upper", "speed")}
-        return cls(names=tuple(own["names"]), **arrays, dt=float(metadata["control_dt"]))
+        """From the metadata of an exported policy.
 
-    def ids(self, names: Sequence[str]) -> np.ndarray:
-        """Places of some joints in all joint vectors."""
-        return np.array([self.names.index(name) for name in names], int)
+        Raises:
+            ValueError: they say something else than an exported policy's; one line.
+        """
+        own = metadata.get("joints")
+        called = names(own, "names")
+        least = {"home": -np.inf, "lower": -np.inf, "upper": -np.inf, "speed": 0.0}
+        arrays = {name: np.resize(numbers(own, name, len(called), above), len(called)) for name, above in least.items()}
+        if not called or (arrays["lower"] > arrays["upper"]).any():
+            raise ValueError("the description's 'joints' takes some, whose 'lower' ends are not above their 'upper' ones")
+        return cls(names=called, **arrays, dt=float(numbers(metadata, "control_dt", above=0.0)))
+
+    def ids(self, wanted: Sequence[str]) -> np.ndarray:
+        """Places of some joints in all joint vectors.
+
+        Raises:
+            ValueError: there is no such joint.
+        """
+        if unknown := [name for name in wanted if name not in self.names]:
+            raise ValueError(f"no joint {reprlib.repr(unknown[0])}: not one of {', '.join(self.names)}"[:400])
+        return np.array([self.names.index(name) for name in wanted], int)
 
 
 @dataclasses.dataclass
@@ -60,10 +115,15 @@ class Part(Protocol):
 
 class _Stateless:
     size = 0
+    reads: tuple[str, ...] = ()  # fields of its description: a number for each of its joints, or one for all
+    above_zero: tuple[str, ...] = ()  # further ones: one number
 
     def __init__(self, joints: Joints, what: Mapping[str, Any]):
-        self.joints, self.what = joints, what
-        self.ids = joints.ids(what.get("joints", what.get("of", ())))
+        self.joints = joints
+        key = "joints" if "joints" in what else "of"
+        self.ids = joints.ids(names(what, key) if key in what else ())
+        self.what = {name: numbers(what, name, len(self.ids)) for name in self.reads}
+        self.what |= {name: numbers(what, name, above=0.0) for name in self.above_zero}
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
         """Nothing to forget."""
@@ -80,9 +140,13 @@ class _Stateless:
 class JointPosition(_Stateless):
     """``offset + scale * action``."""
 
+    reads = ("offset", "scale")
+
     def __init__(self, joints: Joints, what: Mapping[str, Any]):
         super().__init__(joints, what)
         self.size = len(self.ids)
+        if not np.all(self.what["scale"]):
+            raise ValueError("the description's 'scale' of joint_position takes a number other than 0")
 
     def home(self) -> np.ndarray:
         """Zero, unless the offset is not home."""
@@ -94,6 +158,8 @@ class JointPosition(_Stateless):
 
 class JointVelocity(_Stateless):
     """Entries move set-points, which stay near the joints and which targets lead."""
+
+    reads, above_zero = ("ahead", "lag"), ("time",)
 
     def __init__(self, joints: Joints, what: Mapping[str, Any]):
         super().__init__(joints, what)
@@ -115,34 +181,41 @@ class JointVelocity(_Stateless):
 class Binary(_Stateless):
     """A gripper: closed below minus ``hysteresis``, open from plus that on, between as it was, at first open."""
 
-    size = 1
+    size, reads = 1, ("close", "open")
+
+    def __init__(self, joints: Joints, what: Mapping[str, Any]):
+        super().__init__(joints, what)
+        self.hysteresis = float(numbers({"hysteresis": 0.0, **what}, "hysteresis"))
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
         """Open."""
         self.closed = False
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
-        self.closed = bool(own[0] < self.what.get("hysteresis", 0.0) * (1 if self.closed else -1))
+        self.closed = bool(own[0] < self.hysteresis * (1 if self.closed else -1))
         step.targets[self.ids] = self.bounded(self.what["close" if self.closed else "open"])
 
 
 class Continuous(_Stateless):
     """A gripper: closed at -1, open at 1, and between in proportion."""
 
-    size = 1
+    size, reads = 1, ("close", "open")
 
     def home(self) -> np.ndarray:
         """As far open as it is at home."""
-        close, way = np.array(self.what["close"]), np.subtract(self.what["open"], self.what["close"])
+        close, open = (np.resize(self.what[end], len(self.ids)) for end in ("close", "open"))
+        way = open - close
         return np.array([2 * ((self.joints.home[self.ids] - close) @ way) / (way @ way or 1.0) - 1])
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
-        close, share = np.array(self.what["close"]), np.clip((1 + own[0]) / 2, 0, 1)
-        step.targets[self.ids] = self.bounded(close + share * (np.array(self.what["open"]) - close))
+        close, share = self.what["close"], np.clip((1 + own[0]) / 2, 0, 1)
+        step.targets[self.ids] = self.bounded(close + share * (self.what["open"] - close))
 
 
 class AntiWindup(_Stateless):
     """Targets that turn back start near the joints."""
+
+    reads = ("ahead",)
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
         now, to, at = (values[self.ids] for values in (step.last, step.targets, step.position))
@@ -160,6 +233,8 @@ class SpeedLimit(_Stateless):
 
 class LowPass(_Stateless):
     """A first-order filter of the action, for the parts after it."""
+
+    above_zero = ("dt", "time")
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
         """It has been home's."""
@@ -203,12 +278,14 @@ class Executor:
         home_action: the action that keeps the robot at home.
 
     Raises:
-        ValueError: a part is of a type that is not known here.
+        ValueError: a part is of a type that is not known here, or is described by something else than numbers.
     """
 
     def __init__(self, joints: Joints, parts: Sequence[Mapping[str, Any]], position: np.ndarray, clip: float = 0.0):
-        if unknown := [part.get("type") for part in parts if part.get("type") not in PARTS]:
-            raise ValueError(f"unknown type of action {unknown[0]!r}: not one of {', '.join(PARTS)}")
+        if not isinstance(parts, list | tuple) or not 0 < len(parts) <= MOST_PARTS:
+            raise ValueError(f"the description's 'actions' takes a list of up to {MOST_PARTS} parts, got {reprlib.repr(parts)}")
+        if unknown := [kind for kind in map(_kind, parts) if kind not in PARTS]:
+            raise ValueError(f"unknown type of action {reprlib.repr(unknown[0])}: not one of {', '.join(PARTS)}")
         self.joints, self.clip = joints, clip
         self._parts = [PARTS[part["type"]](joints, part) for part in parts]
         self._splits = np.cumsum([part.size for part in self._parts])[:-1]
@@ -218,22 +295,45 @@ class Executor:
     @classmethod
     def of(cls, metadata: Mapping[str, Any], position: np.ndarray) -> "Executor":
         """The chain of an exported policy."""
-        return cls(Joints.of(metadata), metadata["actions"], position, metadata.get("action_clip") or 0.0)
+        clip = {"action_clip": metadata.get("action_clip") or 0.0}
+        return cls(Joints.of(metadata), metadata.get("actions", ()), position, float(numbers(clip, "action_clip")))
 
     def reset(self, position: np.ndarray) -> None:
-        """Begins anew, with targets where the joints are."""
-        self.last = np.array(position, float)
+        """Begins anew, with targets where the joints are.
+
+        Raises:
+            ValueError: ``position`` is no finite number a joint.
+        """
+        self.last = _finite(position, len(self.joints.names), "position").copy()
         for part in self._parts:
             part.reset(self.last.copy(), self.home_action)
 
     def __call__(self, action: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """The targets for an action and where the joints are now, arrays along ``joints.names`` [rad or m]."""
-        action = np.asarray(action, float)
+        """The targets for an action and where the joints are now, arrays along ``joints.names`` [rad or m].
+
+        Raises:
+            ValueError: one of them has another size, or is not finite: no drive is told such.
+        """
+        action = _finite(action, len(self.home_action), "action")
+        position = _finite(position, len(self.joints.names), "position")
         if self.clip:
             action = np.clip(action, -self.clip, self.clip)
         home = np.clip(self.joints.home, self.joints.lower, self.joints.upper)
-        step = Step(action, np.asarray(position, float), self.last.copy(), home)
+        step = Step(action, position, self.last.copy(), home)
         for i, part in enumerate(self._parts):
             part(np.split(step.action, self._splits)[i], step)
         self.last = step.targets
         return self.last.copy()
+
+
+def _kind(part: Any) -> Any:
+    """The type of a part; None: it is none."""
+    kind = part.get("type") if isinstance(part, Mapping) else None
+    return kind if isinstance(kind, str) else None
+
+
+def _finite(value: Any, size: int, name: str) -> np.ndarray:
+    array = np.asarray(value, float)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} takes {size} finite numbers, got {reprlib.repr(value)}")
+    return array

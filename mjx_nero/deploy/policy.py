@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mjx_nero.deploy.executor import Executor
+from mjx_nero.deploy.executor import Executor, Joints, numbers
+
+MAX_TEXT = 1_000_000  # characters of the metadata
 
 
 class Policy:
@@ -19,6 +21,9 @@ class Policy:
     Attributes:
         metadata: what the file says: see ``docs/guides/deploy_onnx.md``.
         names: of the observations that ``act`` takes.
+
+    Raises:
+        ValueError: the file's metadata are not what ``export`` writes; one line.
     """
 
     def __init__(self, path: pathlib.Path | str):
@@ -27,8 +32,9 @@ class Policy:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        stored = self._session.get_modelmeta().custom_metadata_map
-        self.metadata: dict[str, Any] = {name: json.loads(text) for name, text in stored.items()}
+        self.metadata = _read(self._session.get_modelmeta().custom_metadata_map)
+        (taken,), (given,) = self._session.get_inputs(), self._session.get_outputs()
+        _check(self.metadata, taken.shape[-1], given.shape[-1])
         self.names = tuple(term["name"] for term in self.metadata["observations"])
         self.reset()
 
@@ -60,3 +66,39 @@ class Policy:
     def executor(self, position: np.ndarray) -> Executor:
         """What turns the policy's actions into targets, from where the joints are [rad or m]."""
         return Executor.of(self.metadata, position)
+
+
+def _read(stored: Mapping[str, str]) -> dict[str, Any]:
+    """The metadata as plain values.
+
+    Raises:
+        ValueError: they are no JSON, or too much of it; one line.
+    """
+    if sum(map(len, stored.values())) > MAX_TEXT:
+        raise ValueError(f"the metadata have more than {MAX_TEXT:,} characters: this is no policy that export wrote")
+    try:
+        return {name: json.loads(text) for name, text in stored.items()}
+    except (ValueError, RecursionError):
+        raise ValueError("the metadata are no JSON: this is no policy that export wrote") from None
+
+
+def _check(metadata: Mapping[str, Any], taken: Any, given: Any) -> None:
+    """Whether the metadata describe the network's ``taken`` inputs and ``given`` outputs.
+
+    Raises:
+        ValueError: they do not; one line.
+    """
+    terms, total = metadata.get("observations"), 0
+    if not isinstance(terms, list) or not terms:
+        raise ValueError("the description's 'observations' takes a list of terms: this is no policy that export wrote")
+    for term in terms:
+        size, history = (int(numbers(term, name, above=0.0)) for name in ("size", "history"))
+        whole = all(isinstance(term[name], int) for name in ("size", "history"))
+        if not whole or not isinstance(term.get("name"), str) or size % history:
+            raise ValueError("the description's 'observations' takes terms with a name, a size, and a history that divides it")
+        total += size
+    made = Executor.of(metadata, Joints.of(metadata).home)
+    if (total, len(made.home_action)) != (taken, given):
+        raise ValueError(
+            f"the metadata describe {total} observations and {len(made.home_action)} actions, the network has {taken} and {given}"
+        )

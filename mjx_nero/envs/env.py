@@ -92,6 +92,10 @@ class ManipulationEnv(Env):
         self._hold = Hold(round(cfg.success.hold_s / self.dt))
         self._resample_steps = round(cfg.command.resample_s / self.dt)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A pickle or a copy holds the arguments, and what comes out of it is made anew."""
+        return type(self), (self.cfg, self.impl, self.num_envs)
+
     def _drives(self) -> dict[str, Drives]:
         groups, at = {}, 0
         for name, cfg in (("arm", self.cfg.robot.arm), ("gripper", self.cfg.robot.gripper)):
@@ -120,9 +124,14 @@ class ManipulationEnv(Env):
         return len(self.home_action)
 
     @functools.cached_property
+    def state_shape(self) -> State:
+        """What ``reset`` returns, with shapes in place of arrays."""
+        return jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+
+    @functools.cached_property
     def observation_size(self) -> dict[str, Any]:
         """Shape of each observation group; of a group whose terms stay apart, of each by name."""
-        obs = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs
+        obs = self.state_shape.obs
         return jax.tree.map(lambda value: value.shape, {name: obs[name] for name in self.cfg.observations})
 
     @property

@@ -1,5 +1,6 @@
 """Robots and environments by name. Every module of ``arms`` brings its own."""
 
+import contextlib
 import dataclasses
 import importlib
 import pathlib
@@ -7,6 +8,7 @@ import pkgutil
 from typing import TYPE_CHECKING, Any
 
 from mjx_nero import config
+from mjx_nero.config import values
 from mjx_nero.envs import arms, fitted
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.sim import contacts, robot_file
@@ -90,6 +92,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
         UserError: unknown name, preset, robot or field, or a value of the wrong type.
     """
     own, presets = _pick(_ENVS, env, "env")
+    preset = values.read(str, preset, "preset")
     chosen = own if robot is None else robot if isinstance(robot, RobotCfg) else _find_robot(robot)
     if preset in list_robots() and preset not in presets:
         raise UserError(f"{preset!r} is a robot, not a preset of {env}: pass it as --robot")
@@ -130,15 +133,20 @@ def make(
 
 
 def _find_robot(name: str | pathlib.Path) -> RobotCfg:
+    if not isinstance(name, str | pathlib.Path):
+        raise UserError(f"robot takes a config, a name or a folder, got {values.short(name)}")
     if str(name) in _ROBOTS:
         return _ROBOTS[str(name)]
-    if pathlib.Path(name).is_dir():
-        return robot_file.read(pathlib.Path(name))
+    with contextlib.suppress(OSError):  # no file system has so long a name
+        if pathlib.Path(name).is_dir():
+            return robot_file.read(pathlib.Path(name))
     near = config.hint(str(name), _ROBOTS)
-    raise UserError(f"no robot {str(name)!r}{near}: choose one of {', '.join(_ROBOTS)}, or give the folder of an imported one")
+    raise UserError(
+        f"no robot {values.short(str(name))}{near}: choose one of {', '.join(_ROBOTS)}, or give the folder of an imported one"
+    )
 
 
 def _pick(table: Any, name: str, what: str) -> Any:
-    if name not in table:
-        raise UserError(f"unknown {what} {name!r}{config.hint(name, table)}: choose one of {', '.join(table)}")
+    if values.read(str, name, what) not in table:
+        raise UserError(f"unknown {what} {values.short(name)}{config.hint(name, table)}: choose one of {', '.join(table)}")
     return table[name]

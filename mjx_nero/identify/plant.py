@@ -22,6 +22,7 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 REST = 0.5  # [s] before a log, in which its first target holds the arm
 FRICTION = 0.01  # of a drive's effort: the first guess where a model has no joint friction
+MAX_NUMBERS = 100_000_000  # of states and targets, of all that is simulated at once
 POSITIVE = ("stiffness", "damping", "armature", "friction")
 
 
@@ -120,6 +121,9 @@ class Plant:
         m, n = self.model, self.n
         begin = sent[0] - REST
         steps = int(np.ceil((times[-1] - begin) / self.dt)) + 1
+        if len(drives) * steps * (m.nq + m.nv + m.nu) > MAX_NUMBERS:
+            text = f"{times[-1] - begin:.0f} s are too many physics steps of {self.dt:g} s"
+            raise UserError(f"{text}: a minute is enough; or give a larger --dt")
         edges = begin + self.dt * np.arange(steps + 1)
         states = np.zeros((len(drives), 1 + m.nq + m.nv))
         states[:, 1 : 1 + m.nq] = m.qpos0

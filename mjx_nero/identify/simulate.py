@@ -1,12 +1,14 @@
 """Logs of a simulated arm: what ``record`` writes, with all that makes a real one hard to read."""
 
 import dataclasses
+from typing import Annotated
 
 import numpy as np
 
-from mjx_nero.config.bounds import NonNegative, Positive, check
+from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Seed, check
+from mjx_nero.errors import UserError
 from mjx_nero.identify.excitation import RATE, sweeps
-from mjx_nero.identify.log import Log
+from mjx_nero.identify.log import MAX_ROWS, Log
 from mjx_nero.identify.plant import POSITIVE, Drives, Plant
 
 
@@ -26,18 +28,20 @@ class RecordCfg:
         seed: of all that is drawn.
     """
 
-    seconds: Positive = 60.0
-    rate: Positive = 200.0
+    seconds: Annotated[float, Bounds(0.0, 3600.0, above=True)] = 60.0
+    rate: Annotated[float, Bounds(0.0, 10_000.0, above=True)] = 200.0
     noise: NonNegative = 0.0
     resolution: NonNegative = 0.0
-    scatter: Positive = 1.0
+    scatter: Annotated[float, Bounds(0.0, 100.0, above=True)] = 1.0
     offset: NonNegative = 0.0
-    delay: NonNegative = 0.0
+    delay: Annotated[float, Bounds(0.0, 10.0)] = 0.0
     amplitude: Positive = 0.5
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self):
         check(self)
+        if self.seconds * self.rate > MAX_ROWS:
+            raise UserError(f"{self.seconds:g} s at {self.rate:g} Hz are more than {MAX_ROWS:,} readings: pass less of one")
 
 
 def record(plant: Plant, cfg: RecordCfg) -> tuple[Log, Drives]:

@@ -17,6 +17,7 @@ from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import missing, need
 from mjx_nero.interop.batch import Batch
+from mjx_nero.learn import device_memory
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import UserError
 
@@ -28,7 +29,7 @@ except ModuleNotFoundError as error:
 ARRAYS = ("numpy", "jax", "torch")
 
 
-class VectorEnv(gymnasium.vector.VectorEnv):
+class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
     """Many environments in one compiled program, by Gymnasium's vector API, with same-step autoreset.
 
     Where an episode ends, ``step`` returns the reward and the flags of its last step and the first observation of the next one;
@@ -36,7 +37,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     ...), valid where the masks ``info["_final_obs"]`` and ``info["_final_info"]`` are true. They are there at every step, so that
     the host need not wait for the device to ask.
 
-    The action space ends where the joints' limits do.
+    The action space ends where the joints' limits do. A pickle holds the arguments: what comes out of it is made anew, and has to
+    be reset.
 
     Args:
         env: name of an environment, or one made before.
@@ -63,9 +65,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         num_rendered: int = 1,
         **kwargs: Any,
     ):
+        gymnasium.utils.EzPickle.__init__(self, env, num_envs, arrays, group, render_mode, num_rendered, **kwargs)
         num_envs = values.read(bounds.Worlds, num_envs, "num_envs")
-        self.env = mjx_nero.make(env, num_envs=num_envs, **kwargs) if isinstance(env, str) else env
-        self.num_envs, self.render_mode, self._group, self._num_rendered = num_envs, render_mode, group, num_rendered
+        self._num_rendered = values.read(bounds.Count, num_rendered, "num_rendered")
+        self.env = _made(env, num_envs=num_envs, **kwargs)
+        device_memory.check_batch(self.env, num_envs, "num_envs")
+        self.num_envs, self.render_mode, self._group = num_envs, _render_mode(render_mode), group
         self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
         self._out, self._device, self._packed = _converter(arrays), jax.devices()[0], arrays == "torch"
         self.single_observation_space, self.single_action_space = _spaces(self.env, group)
@@ -78,17 +83,22 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Fresh episodes everywhere: observations and an empty info. A seed makes all that follows reproducible."""
+        _check_open(self.closed, "reset")
         seed = _checked(seed, options)
         super().reset(seed=seed)
         self._state, self._key = self._reset(_key(self.np_random, seed))
         return jax.tree.map(self._out, _group(self._state.obs, self._group)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step: observations, rewards, terminated, truncated, info."""
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        _check_shape(actions, self.action_space.shape)
-        self._state, self._key, out = self._step(self._state, self._key, _to_jax(actions, self._device))
+        """One control step: observations, rewards, terminated, truncated, info.
+
+        Raises:
+            gymnasium.error.InvalidAction: another shape, or no finite numbers. Values that are on the device already are not
+                looked at: where they are not finite, the episode ends, and its results say ``nan``.
+        """
+        _check_open(self.closed, "step", self._state)
+        action = _to_jax(actions, self.action_space.shape, self._device)
+        self._state, self._key, out = self._step(self._state, self._key, action)
         *given, done, results = jax.tree.map(self._out, out)
         results = dict(zip(_results(self.env), results, strict=True))
         info = {"final_obs": given.pop(), "_final_obs": done, "final_info": results, "_final_info": done}
@@ -100,8 +110,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             UserError: the machine cannot draw offscreen.
         """
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before render")
+        _check_open(self.closed, "render", self._state)
         self._renderer = self._renderer or Renderer(self.env.mj_model)
         return tuple(_frame(self.env, self._renderer, self._state, i) for i in range(min(self._num_rendered, self.num_envs)))
 
@@ -126,25 +135,27 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return state, key, (obs, last.reward, done & ~truncated, truncated, final_obs, done, packed)
 
 
-class Env(gymnasium.Env):
+class Env(gymnasium.Env, gymnasium.utils.EzPickle):
     """One environment with numpy arrays: what ``gymnasium.make("mjx_nero/nero_lift-v0")`` makes.
 
-    The info of an episode's last step holds its results. Arguments and errors are those of ``VectorEnv``.
+    The info of an episode's last step holds its results. Arguments, errors and pickles are those of ``VectorEnv``.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
     def __init__(self, env: str | ManipulationEnv, group: str | None = "state", render_mode: str | None = None, **kwargs: Any):
-        self.env = mjx_nero.make(env, **kwargs) if isinstance(env, str) else env
-        self.render_mode, self._group = render_mode, group
+        gymnasium.utils.EzPickle.__init__(self, env, group, render_mode, **kwargs)
+        self.env = _made(env, **kwargs)
+        self.render_mode, self._group, self._closed = _render_mode(render_mode), group, False
         self.metadata = {**self.metadata, "render_fps": 1 / self.env.dt}
         self.observation_space, self.action_space = _spaces(self.env, group)
-        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
+        self._reset, self._step, self._device = jax.jit(self.env.reset), jax.jit(self.env.step), jax.devices()[0]
         self._renderer: Renderer | None = None
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """A fresh episode: observation and an empty info."""
+        _check_open(self._closed, "reset")
         seed = _checked(seed, options)
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random, seed))
@@ -152,10 +163,9 @@ class Env(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step: observation, reward, terminated, truncated, info."""
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        _check_shape(action, self.action_space.shape)
-        self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        _check_open(self._closed, "step", self._state)
+        action = _to_jax(action, self.action_space.shape, self._device)
+        self._state = state = self._step(self._state, action)
         done, truncated = bool(state.done), bool(state.info["truncation"])
         info = {name: float(state.metrics[name]) for name in _results(self.env) if done}
         obs = jax.tree.map(np.asarray, _group(state.obs, self._group))
@@ -167,22 +177,51 @@ class Env(gymnasium.Env):
         Raises:
             UserError: the machine cannot draw offscreen.
         """
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before render")
+        _check_open(self._closed, "render", self._state)
         self._renderer = self._renderer or Renderer(self.env.mj_model)
         return _frame(self.env, self._renderer, jax.tree.map(lambda x: x[None], self._state), 0)
 
     def close(self) -> None:
         """Frees the renderer."""
+        self._closed = True
         if self._renderer:
             self._renderer.__exit__()
             self._renderer = None
 
 
-def _spaces(env: ManipulationEnv, group: str | None) -> tuple[Any, Any]:
+def _made(env: Any, **kwargs: Any) -> ManipulationEnv:
+    """The environment of a name, or the one that was made before.
+
+    Raises:
+        UserError: as ``mjx_nero.make``; or it is neither.
+    """
+    if isinstance(env, str):
+        return mjx_nero.make(env, **kwargs)
+    if not isinstance(env, ManipulationEnv):
+        raise UserError(f"env takes a name or an environment of mjx_nero.make, got {values.short(env)}")
+    if given := [name for name in kwargs if name != "num_envs"]:
+        raise UserError(f"{', '.join(given)}: fields of an environment that is made already: pass them to mjx_nero.make")
+    return env
+
+
+def _render_mode(mode: Any) -> str | None:
+    if mode is not None and not (isinstance(mode, str) and mode == "rgb_array"):
+        raise UserError(f"render_mode takes rgb_array or None, got {values.short(mode)}")
+    return mode
+
+
+def _check_open(closed: bool, what: str, state: Any = ()) -> None:
+    """Raises Gymnasium's own errors where an environment was closed, or has no episode yet (``state`` is None)."""
+    if closed:
+        raise gymnasium.error.ClosedEnvironmentError(f"{what} after close: make the environment anew")
+    if state is None:
+        raise gymnasium.error.ResetNeeded(f"call reset before {what}")
+
+
+def _spaces(env: ManipulationEnv, group: Any) -> tuple[Any, Any]:
     sizes, box = env.observation_size, gymnasium.spaces.Box
-    if group is not None and group not in sizes:
-        raise UserError(f"no observation group {group!r}: choose one of {', '.join(sizes)}, or None for all")
+    if group is not None and not (isinstance(group, str) and group in sizes):
+        raise UserError(f"no observation group {values.short(group)}: choose one of {', '.join(sizes)}, or None for all")
     boxes: dict[str, Any] = {name: box(-np.inf, np.inf, size, np.float32) for name, size in sizes.items()}
     observations = gymnasium.spaces.Dict(boxes) if group is None else boxes[group]
     return observations, box(*env.actions.bounds(), dtype=np.float32)
@@ -202,21 +241,24 @@ def _checked(seed: Any, options: Any) -> int | None:
     """The seed of a reset.
 
     Raises:
-        gymnasium.error.Error: it is no single one that JAX takes, or options ask for what is not done.
+        gymnasium.error.Error: as ``checked_seed``, or options ask for what is not done.
     """
-    if options:
-        raise gymnasium.error.Error(f"reset takes no options here, got {', '.join(map(str, options))}: all episodes start anew")
+    if options is not None and not (isinstance(options, dict) and not options):
+        named = ", ".join(map(str, options)) if isinstance(options, dict) else values.short(options)
+        raise gymnasium.error.Error(f"reset takes no options here, got {named}: all episodes start anew")
+    return checked_seed(seed)
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed as JAX takes it.
+
+    Raises:
+        gymnasium.error.Error: it is no single one that JAX takes.
+    """
     try:
         return None if seed is None else values.read(bounds.Seed, seed, "seed")
     except UserError as error:
         raise gymnasium.error.Error(f"{error}: one seed is for all environments") from None
-
-
-def _check_shape(action: Any, shape: tuple[int, ...] | None) -> None:
-    """Raises ``gymnasium.error.InvalidAction`` where actions have another shape; their values stay where they are."""
-    given = tuple(np.shape(action))
-    if given != shape:
-        raise gymnasium.error.InvalidAction(f"actions take the shape {shape}, got {given}")
 
 
 def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:
@@ -224,19 +266,37 @@ def _key(rng: np.random.Generator, seed: int | None) -> jax.Array:
 
 
 def _converter(arrays: str) -> Callable[[jax.Array], Any]:
-    if arrays not in ARRAYS:
-        raise UserError(f"unknown arrays {arrays!r}: choose one of {', '.join(ARRAYS)}")
+    if not isinstance(arrays, str) or arrays not in ARRAYS:
+        raise UserError(f"unknown arrays {values.short(arrays)}: choose one of {', '.join(ARRAYS)}")
     if arrays == "torch":
         return need("torch", "torch").from_dlpack
     return np.asarray if arrays == "numpy" else lambda array: array
 
 
-def _to_jax(action: Any, device: jax.Device) -> jax.Array:
-    if hasattr(action, "detach"):  # a torch tensor
-        action = jax.dlpack.from_dlpack(action.detach().contiguous())
-        if action.dtype == jnp.float32 and action.devices() == {device}:
-            return action
-    return jax.device_put(jnp.asarray(action, jnp.float32), device)
+def _to_jax(action: Any, shape: tuple[int, ...] | None, device: jax.Device) -> jax.Array:
+    """Actions as JAX takes them, float32; those of torch by DLPack.
+
+    Raises:
+        gymnasium.error.InvalidAction: they have another shape, or are no finite numbers, as far as they are on the host.
+    """
+    here = not (isinstance(action, jax.Array) or hasattr(action, "detach"))
+    try:
+        given = np.asarray(action) if here else action
+        if tuple(given.shape) != shape:
+            raise gymnasium.error.InvalidAction(f"actions take the shape {shape}, got {tuple(given.shape)}")
+        if hasattr(given, "detach"):  # a torch tensor
+            given = jax.dlpack.from_dlpack(given.detach().contiguous())
+        if given.dtype.kind not in "fiub" and given.dtype != jnp.bfloat16:
+            raise TypeError
+        with np.errstate(over="ignore"):
+            given = given.astype(np.float32) if here else given
+        if here and not np.isfinite(given).all():
+            raise gymnasium.error.InvalidAction("actions take finite numbers, got some that are not")
+        array = jnp.asarray(given, jnp.float32)
+        return array if array.devices() == {device} else jax.device_put(array, device)
+    except (TypeError, ValueError, AttributeError, ArithmeticError, BufferError, RuntimeError) as error:
+        what = values.short(action) if isinstance(error, TypeError) and here else " ".join(str(error).split())[:200]
+        raise gymnasium.error.InvalidAction(f"actions take numbers of the shape {shape}, got {what}") from None
 
 
 def _frame(env: ManipulationEnv, renderer: Renderer, state: Any, index: int) -> np.ndarray:

@@ -2,10 +2,14 @@
 
 from typing import Any
 
+import gymnasium
+import jax
 import numpy as np
 
+from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import missing
-from mjx_nero.interop.gymnasium import VectorEnv
+from mjx_nero.interop.gymnasium import VectorEnv, checked_seed
+from mjx_nero.types import UserError
 
 try:
     from stable_baselines3.common import vec_env
@@ -17,19 +21,25 @@ class VecEnv(vec_env.VecEnv):
     """``PPO("MlpPolicy", VecEnv("nero_reach", 256))``. The info of an ended episode tells ``is_success``, which is logged.
 
     Args:
-        env: name of an environment.
+        env: name of an environment, or one made before.
         num_envs: how many.
-        kwargs: of ``VectorEnv``.
+        kwargs: of ``VectorEnv``, whose errors these are, too.
+
+    Raises:
+        UserError: as ``VectorEnv``; or the arrays are not to be numpy's.
     """
 
-    def __init__(self, env: str, num_envs: int, **kwargs: Any):
+    def __init__(self, env: str | ManipulationEnv, num_envs: int, **kwargs: Any):
+        if kwargs.get("arrays", "numpy") != "numpy":
+            raise UserError("Stable-Baselines3 takes arrays of numpy: leave arrays out")
         self.envs = VectorEnv(env, num_envs, **kwargs)
         self._seed: int | None = None
+        self._actions: np.ndarray | None = None
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Sets the seed of the next ``reset``."""
-        self._seed = seed
+        self._seed = checked_seed(seed)
         return [seed] * self.num_envs
 
     def reset(self) -> np.ndarray:
@@ -43,12 +53,19 @@ class VecEnv(vec_env.VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, dones and infos of one control step."""
-        obs, rewards, terminated, truncated, info = self.envs.step(self._actions)
+        """Observations, rewards, dones and infos of one control step.
+
+        Raises:
+            gymnasium.error.NoAsyncCallError: no actions wait.
+        """
+        if self._actions is None:
+            raise gymnasium.error.NoAsyncCallError("call step_async before step_wait", "step")
+        actions, self._actions = self._actions, None
+        obs, rewards, terminated, truncated, info = self.envs.step(actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(info["_final_obs"]):
             infos[i] = {
-                "terminal_observation": info["final_obs"][i],
+                "terminal_observation": jax.tree.map(lambda x, i=i: x[i], info["final_obs"]),
                 "TimeLimit.truncated": bool(truncated[i]),
                 "is_success": bool(info["final_info"]["success"][i]),
             }

@@ -12,10 +12,12 @@ from typing import Any
 
 import jax
 
+from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import Learner
 
 _SCRATCH = 1.25  # a step's own arrays, beside what a backend keeps outside JAX
+_STATES = 3  # that a loop holds at once: the one before, the one after, and fresh starts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,10 +49,35 @@ def check(learner: Learner) -> None:
     Raises:
         UserError: it does not.
     """
-    Pool(_limit(learner), *learner.footprint()).check(learner)
+    Pool(_limit(learner.num_devices), *learner.footprint()).check(learner)
     physics = learner.env.unwrapped.physics.footprint(learner.num_devices)
     if physics.outside:
         Pool(physics.free, 0.0, _SCRATCH * physics.outside).check(learner)
+
+
+def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) -> None:
+    """Before anything of a batch is made: does it fit? Each number of a task may be within its bounds, and their product not.
+
+    Args:
+        count: environments side by side.
+        name: what the user calls that number.
+        kept: what a program keeps beside the environments themselves [bytes].
+
+    Raises:
+        UserError: it does not.
+    """
+    state = size(env.state_shape)
+    physics = env.physics.footprint()
+    for need, there in (
+        (kept + count * (_STATES * state + physics.in_program), _limit(1)),
+        (count * _SCRATCH * physics.outside, physics.free),
+    ):
+        if need > there:
+            raise UserError(
+                f"{name} {count:,} with {state / 1e3:,.0f} kB of state each, and {kept / 1e9:.1f} GB of records, needs about "
+                f"{need / 1e9:,.1f} GB of memory, and there are {there / 1e9:.1f} GB: pass fewer, shorter episodes, or smaller "
+                "histories and delays"
+            )
 
 
 def check_compiled(learner: Learner, program: Any) -> None:
@@ -63,7 +90,7 @@ def check_compiled(learner: Learner, program: Any) -> None:
     if used is not None:
         fixed, _ = learner.footprint()
         per_env = (used - fixed) * learner.num_devices / learner.num_envs
-        Pool(_limit(learner), fixed, per_env).check(learner)
+        Pool(_limit(learner.num_devices), fixed, per_env).check(learner)
 
 
 @contextlib.contextmanager
@@ -100,10 +127,10 @@ def size(tree: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
-def _limit(learner: Learner) -> float:
+def _limit(num_devices: int) -> float:
     """What XLA may take of a device: of a CPU what is free of the machine's memory, shared among its devices."""
     stats = jax.local_devices()[0].memory_stats() or {}
-    return stats.get("bytes_limit") or _free_of_machine() / learner.num_devices
+    return stats.get("bytes_limit") or _free_of_machine() / num_devices
 
 
 def _free_of_machine() -> float:

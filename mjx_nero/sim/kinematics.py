@@ -26,7 +26,7 @@ _ITSELF = (0.0, 1.0)
 class _Node(NamedTuple):
     """A joint that moves, its frame at the anchor."""
 
-    index: int  # of the joint in q that moves it: itself, or the one that it follows
+    driver: int  # place in q of the joint that moves it: itself, or the one that it follows
     parent: int  # node that carries it; -1: the world
     fixed: tuple[np.ndarray, np.ndarray]  # transform from there
     axis: np.ndarray
@@ -126,8 +126,8 @@ class Chain:
             axis_w = jnp.broadcast_to(math.rotate(turn, jnp.asarray(node.axis, jnp.float32)), pos.shape)
             linear = axis_w if node.slide else jnp.cross(axis_w, pos - anchor)
             column = jnp.concatenate([linear, jnp.zeros_like(linear) if node.slide else axis_w], axis=1)
-            ratio = _polynomial(tuple(np.polynomial.polynomial.polyder(node.powers)), off[node.index])
-            columns[node.index] += self._path[:, n, None] * ratio * column
+            ratio = _polynomial(tuple(np.polynomial.polynomial.polyder(node.powers)), off[node.driver])
+            columns[node.driver] += self._path[:, n, None] * ratio * column
         return pos, quat, jnp.stack(columns, axis=-1)
 
     def _forward(self, q: Float[Array, " nj"]) -> list[Pose]:
@@ -194,8 +194,8 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
 
 
 def _moved(model: mujoco.MjModel, ids: Sequence[int]) -> dict[int, tuple[int, tuple[float, ...]]]:
-    """``_Node.index`` and ``powers`` of each joint that moves: the listed ones, and those that follow them."""
-    moved = {j: (i, _ITSELF) for i, j in enumerate(ids)}
+    """``_Node.driver`` and ``powers`` of each joint that moves: the listed ones, and those that follow them."""
+    moved: dict[int, tuple[int, tuple[float, ...]]] = {j: (i, _ITSELF) for i, j in enumerate(ids)}
     joint = {int(address): j for j, address in enumerate(model.jnt_qposadr)}
     for coupling in linkage.couplings(model):  # leaders come before their followers
         follower, leader = joint[coupling.follower], joint[coupling.leader]
@@ -207,11 +207,11 @@ def _moved(model: mujoco.MjModel, ids: Sequence[int]) -> dict[int, tuple[int, tu
     return moved
 
 
-def _polynomial(powers: tuple[float, ...], x: Float[Array, ""]) -> Float[Array, ""] | float:
-    """Coefficients from the constant one on, at ``x``."""
+def _polynomial(powers: tuple[float, ...], x: Float[Array, ""]) -> Float[Array, ""]:
+    """Value at ``x`` of a polynomial given by its coefficients, the constant one first."""
     if powers == _ITSELF:
         return x
-    out: Float[Array, ""] | float = 0.0
+    out = jnp.zeros_like(x)
     for power in powers[::-1]:
         out = out * x + power
     return out

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -45,6 +46,16 @@ class DriveCfg:
         return tuple(d / k for d, k in zip(self.damping, self.stiffness, strict=True))
 
 
+def slides_gap(positions: Any) -> Any:
+    """Distance between the pads of two opposed slides [m], from their positions [m]."""
+    return positions[0] - positions[1]
+
+
+def slides_positions(gap: Any) -> Any:
+    """The inverse of ``slides_gap``."""
+    return jnp.stack([gap / 2, -gap / 2])
+
+
 @dataclasses.dataclass(frozen=True)
 class GripperCfg(DriveCfg):
     """Drives with an open and a closed target. A robot without a gripper has one without joints.
@@ -57,8 +68,8 @@ class GripperCfg(DriveCfg):
 
     open: tuple[float, ...] = ()
     close: tuple[float, ...] = ()
-    gap: Callable | None = dataclasses.field(default=lambda q: q[0] - q[1])
-    positions: Callable | None = dataclasses.field(default=lambda gap: jnp.stack([gap / 2, -gap / 2]))
+    gap: Callable | None = dataclasses.field(default=slides_gap)
+    positions: Callable | None = dataclasses.field(default=slides_positions)
 
 
 @dataclasses.dataclass(frozen=True)

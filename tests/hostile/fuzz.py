@@ -8,7 +8,9 @@ What was found once is in ``corpus``, one folder a reader, so that it is tried a
 
 import argparse
 import contextlib
+import dataclasses
 import functools
+import json
 import os
 import pathlib
 import resource
@@ -25,15 +27,23 @@ if __name__ == "__main__":
     sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent)]
 
 import hypothesis  # noqa: E402
+import matplotlib  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import urdf_files as make  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from mjx_nero import UserError, files  # noqa: E402
+from mjx_nero import UserError, config, files  # noqa: E402
 from mjx_nero.control import rmpflow_config  # noqa: E402
+from mjx_nero.envs import identified, registry  # noqa: E402
+from mjx_nero.identify import log as arm_log  # noqa: E402
 from mjx_nero.learn import checkpoint, header  # noqa: E402
+from mjx_nero.learn.runs import cfg as run_cfg  # noqa: E402
+from mjx_nero.learn.runs import logs, resume, seeds, training  # noqa: E402
 from mjx_nero.sim import model_file, robot_file  # noqa: E402
+from mjx_nero.tools import public_robots, results, train_run  # noqa: E402
+from mjx_nero.tools.robustness import command as robustness  # noqa: E402
+from mjx_nero.tools.view import command as view_command  # noqa: E402
 from mjx_nero.urdf import drives, import_urdf, meshes, xacro  # noqa: E402
 from mjx_nero.urdf import files as urdf_files  # noqa: E402
 from mjx_nero.urdf.report import Notes  # noqa: E402
@@ -203,6 +213,127 @@ def _expand(folder: pathlib.Path, root: make.etree._Element) -> None:
     xacro.expand(root, path, urdf_files.Roots(path, {}), {}, Notes())
 
 
+LOST = {"nan_count": 0, "overflow_count": 0, "lost": {"metrics.jsonl": 1}}
+SUMMARY = {"env_steps": 1024, "train_s": 1.5, "steps_per_s": 700, **LOST}
+SEED = {"seed": 0, "success_rate": 0.5, "success_rate_95": [0.4, 0.6], "seconds_to_95": None, "env_steps": 10, "train_s": 1.0}
+CURVES = {"cube mass [kg]": [{"value": 0.5, "success_rate": 0.9, "success_rate_95": [0.8, 0.95]}]}
+
+
+@functools.cache
+def a_run() -> dict[str, bytes]:
+    """The JSON files of a run's folder."""
+    run = run_cfg.resolve("nero_reach", "default", None, {"episode_length_s": "4"}, {"learning_rate": "1e-4"})
+    described = {**config.to_dict(run), "versions": {"mjx-nero": "0.5.0"}}
+    row = {"steps": 1, "train/success": 0.5, "reward/action_rate": -0.1, "eval/success_rate": None}
+    return {
+        "config.json": json.dumps(described, default=str).encode(),
+        "summary.json": json.dumps({**SUMMARY, "evaluation": {"success_rate": 0.5}}).encode(),
+        "seeds.json": json.dumps({"rows": [{**SEED, "seed": n, "stopped": "finished"} for n in (0, 7)]}).encode(),
+        "metrics.jsonl": "".join(f"{json.dumps({**row, 'steps': step})}\n" for step in (1, 20, 300)).encode(),
+    }
+
+
+def read_run(folder: pathlib.Path, content: bytes, name: str) -> None:
+    """A run's folder in which one of the JSON files is another: as it is gone on with, shown and told of."""
+    for other, own in a_run().items():
+        (folder / other).write_bytes(content if other == name else own)
+    with contextlib.redirect_stdout(open(os.devnull, "w")):
+        if name == "config.json":
+            view_command._described(folder)
+            resume.same_run(folder, run_cfg.resolve("nero_reach", "default", None, {}, {}), (), {})
+        elif name == "summary.json":
+            train_run.report({**training._summary(folder), "folder": "x"}, films=False)
+        elif name == "seeds.json":
+            train_run.report_seeds(seeds._earlier(folder / name), folder)
+        elif rows := logs.read(folder / name):
+            logs.plot_curve(rows, folder / "curve.png")
+
+
+def read_figures(folder: pathlib.Path, content: bytes, read: Callable[[pathlib.Path], object]) -> None:
+    """A JSON or YAML file of figures."""
+    (folder / "a.json").write_bytes(content)
+    found = read(folder / "a.json")
+    if read is results.read:
+        results.page(list(results.rows(found)), "a.json", "a.md")
+    if read is robustness.read and found["curves"]:
+        robustness.save_plot(folder / "a.png", [found])
+
+
+def read_identified(folder: pathlib.Path, content: bytes) -> None:
+    """A file of ``identify``, taken into a task."""
+    (folder / "a.yaml").write_bytes(content)
+    identified.applied(dataclasses.replace(registry.env_cfg("nero_reach"), identified=str(folder / "a.yaml")))
+
+
+def read_log(folder: pathlib.Path, content: bytes) -> None:
+    """A log of an arm."""
+    (folder / "a.csv").write_bytes(content)
+    arm_log.read(folder / "a.csv", ("joint1", "joint2"))
+
+
+def read_onnx(folder: pathlib.Path, content: bytes) -> None:
+    """An exported policy whose metadata are other texts by name; what runs it takes a ValueError for the file's fault."""
+    import onnx
+
+    from mjx_nero.deploy.policy import Policy
+
+    made = onnx.load_model_from_string(an_export()[0])
+    try:
+        stored = files.parse_json(content)
+        texts = {str(name)[:100].replace("\0", ""): json.dumps(value) for name, value in stored.items()}
+    except (ValueError, AttributeError, RecursionError, TypeError):
+        texts = {"joints": content.decode(errors="replace").replace("\0", "")}
+    del made.metadata_props[:]
+    onnx.helper.set_model_props(made, texts)
+    onnx.save(made, folder / "a.onnx")
+    try:
+        policy = Policy(folder / "a.onnx")
+        home = policy.metadata["joints"]["home"]
+        targets = policy.executor(np.resize(home, len(policy.metadata["joints"]["names"])))
+        sizes = {term["name"]: term["size"] // term["history"] for term in policy.metadata["observations"]}
+        action = policy.act({name: np.zeros(size) for name, size in sizes.items()})
+        assert np.isfinite(targets(action, targets.last)).all()
+    except ValueError as error:
+        raise error if isinstance(error, UserError) else UserError(_same(str(error))) from None
+
+
+def _same(text: str) -> str:
+    """The text, if it is one line as it stands."""
+    assert text.isprintable() and len(text) <= LONGEST, text
+    return text
+
+
+@functools.cache
+def an_export() -> tuple[bytes, bytes]:
+    """An exported policy, and its metadata as JSON."""
+    import onnxruntime  # noqa: F401  (reads a file of the system's at first)
+
+    from mjx_nero.interop import onnx
+    from mjx_nero.learn import policy
+
+    env = registry.make("nero_reach", impl="native")
+    trained = policy.load_for(env, "nero_reach", policy.shipped("nero_reach"))
+    made = onnx.model(trained, env)
+    return made.SerializeToString(), json.dumps({entry.key: json.loads(entry.value) for entry in made.metadata_props}).encode()
+
+
+@functools.cache
+def a_log() -> bytes:
+    """A log of two joints, as short as one may be."""
+    rows = [f"{0.02 * i:.3f},0.1,0.5,{0.1 + 1e-4 * i:.4f},0.5" for i in range(520)]
+    return "\n".join(["# a log", "time,target.joint1,target.joint2,position.joint1,position.joint2", *rows]).encode()
+
+
+@functools.cache
+def an_identified() -> bytes:
+    """What ``identify`` writes of Nero's arm."""
+    number = {"value": 10.0, "low": 9.0, "high": 11.0}
+    of = dict.fromkeys(("stiffness", "damping", "armature", "friction", "offset"), number)
+    joints = dict.fromkeys(registry.env_cfg("nero_reach").robot.arm.joints, of)
+    found = {"robot": "nero", "delay": {"value": 0.02, "low": 0.01, "high": 0.03}, "joints": joints}
+    return json.dumps(found).encode()  # JSON is YAML
+
+
 READERS: dict[str, Callable[[pathlib.Path, bytes], None]] = {
     "yaml": read_yaml,
     "gains": read_gains,
@@ -221,9 +352,20 @@ READERS: dict[str, Callable[[pathlib.Path, bytes], None]] = {
     "expression": read_expression,
     "eval": functools.partial(read_expression, form="$(eval %s)"),
     "loaded": read_loaded,
+    "run": functools.partial(read_run, name="config.json"),
+    "summary": functools.partial(read_run, name="summary.json"),
+    "seeds": functools.partial(read_run, name="seeds.json"),
+    "metrics": functools.partial(read_run, name="metrics.jsonl"),
+    "results": functools.partial(read_figures, read=results.read),
+    "robustness": functools.partial(read_figures, read=robustness.read),
+    "public_robots": functools.partial(read_figures, read=public_robots.read),
+    "identified": read_identified,
+    "log": read_log,
+    "onnx": read_onnx,
 }
 BATCH = 100  # files of a run of one seed, and ...
 SLOW = dict.fromkeys(("robot", "model_in_folder", "mesh_in_folder", "urdf"), 10)  # ... of readers that take longer
+SLOW |= dict.fromkeys(("run", "metrics", "robustness", "identified", "onnx"), 20)
 
 
 @functools.cache
@@ -241,6 +383,16 @@ def corpus(reader: str) -> list[bytes]:
         "mesh_in_folder": lambda: [made["meshes/m.stl"]],
         "policy": lambda: [_small_policy()],
         "stl": lambda: [made["meshes/m.stl"]],
+        "run": lambda: [a_run()["config.json"]],
+        "summary": lambda: [a_run()["summary.json"]],
+        "seeds": lambda: [a_run()["seeds.json"]],
+        "metrics": lambda: [a_run()["metrics.jsonl"]],
+        "results": lambda: [(ASSETS.parent / "docs" / "benchmarks.json").read_bytes()],
+        "robustness": lambda: [json.dumps({"env": "e", "preset": "p", "version": "v", "curves": CURVES}).encode()],
+        "public_robots": lambda: [(ASSETS.parent / "docs" / "public_robots.yaml").read_bytes()],
+        "identified": lambda: [an_identified()],
+        "log": lambda: [a_log()],
+        "onnx": lambda: [an_export()[1]],
         "urdf": lambda: [
             make.arm(2, make.link("e", make.inertial(0.1), make.mesh("m.stl")), make.joint("j", "l2", "e")).encode()
         ],
@@ -250,8 +402,6 @@ def corpus(reader: str) -> list[bytes]:
 
 def _small_policy() -> bytes:
     """The head of a policy that ships, with its smallest array alone."""
-    import json
-
     content = (ASSETS / "policies" / "nero_reach.safetensors").read_bytes()
     length = int.from_bytes(content[:8], "little")
     head = json.loads(content[8 : 8 + length])
@@ -264,6 +414,7 @@ def _small_policy() -> bytes:
 
 _RUNS = ("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 _OWN = (sys.prefix, sys.base_prefix, str(HERE.parents[1]), "/proc/", "/sys/", "/dev/null", "/dev/urandom")
+_OWN += (matplotlib.get_cachedir(), matplotlib.get_configdir())  # where it keeps its list of fonts
 _watched: list[str] = []  # the folder of the file that is being judged, while one is
 _seen: list[str] = []
 

@@ -4,6 +4,7 @@ The package is imported once; JAX starts no threads before a child needs it, so 
 """
 
 import contextlib
+import functools
 import json
 import os
 import pathlib
@@ -11,6 +12,7 @@ import resource
 import signal
 import sys
 import time
+from collections.abc import Callable, Sequence
 
 SECONDS, MEMORY = 30, 2e9  # of processor time and of the clock, of bytes that are really there
 _BACKSTOP = 16 << 30  # bytes of addresses: JAX asks for many that it never uses
@@ -18,12 +20,15 @@ _WRITES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.l
 _ELSEWHERE = ("/dev/", "/proc/self/")
 
 
-def child(argv: list[str], folder: pathlib.Path) -> None:
-    """Becomes the command, in ``folder/work``; what Python writes outside ``folder`` is noted in ``folder/outside``."""
+def child(call: Callable[[], None], folder: pathlib.Path, seconds: float) -> None:
+    """Does the call in ``folder/work``.
+
+    What Python writes outside of ``folder`` is noted in ``folder/outside``, and so is what it opens of ``folder/mine``.
+    """
     os.setsid()
     resource.setrlimit(resource.RLIMIT_AS, (_BACKSTOP, _BACKSTOP))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
+    resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
     home = {"HOME": "home", "TMPDIR": "home", "XDG_CACHE_HOME": "home/cache"}
     os.environ.update({name: str(folder / value) for name, value in home.items()})
     os.chdir(folder / "work")
@@ -37,16 +42,32 @@ def child(argv: list[str], folder: pathlib.Path) -> None:
             path = os.path.abspath(os.fsdecode(args[0]))
             if not path.startswith((f"{folder}/", *_ELSEWHERE)):
                 os.write(outside, f"{event} {path}\n".encode())
+        elif event == "open" and isinstance(args[0], str | bytes | os.PathLike):
+            if os.path.realpath(os.fsdecode(args[0])).startswith(mine):
+                os.write(outside, f"{event} {os.fsdecode(args[0])}\n".encode())
 
+    mine = os.path.realpath(folder / "mine") + "/"
     sys.addaudithook(watch)
-    sys.argv = ["mjx-nero", *argv]
+    call()
+
+
+def program(call: Callable[[], None]) -> None:
+    """A call as the console script does it: a user's mistake is one line and exit status 2."""
+    from mjx_nero.tools import cli
+
+    cli.run(lambda _: call())
+
+
+def command(argv: Sequence[object]) -> None:
+    """The console script."""
     from mjx_nero import __main__
     from mjx_nero.tools import cli
 
+    sys.argv = ["mjx-nero", *map(str, argv)]
     cli.run(__main__.main)
 
 
-def run(argv: list[str], folder: pathlib.Path) -> dict[str, object]:
+def run(call: Callable[[], None], folder: pathlib.Path, seconds: float = SECONDS) -> dict[str, object]:
     """Forks, waits, and says how it ended.
 
     The time in which a busy machine gives the child no core is none of the child's, so it is taken off the clock's.
@@ -56,7 +77,8 @@ def run(argv: list[str], folder: pathlib.Path) -> dict[str, object]:
     if not pid:
         code = 70
         try:
-            child(argv, folder)
+            child(call, folder, seconds)
+            code = 0
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 70
         except BaseException:
@@ -71,16 +93,16 @@ def run(argv: list[str], folder: pathlib.Path) -> dict[str, object]:
         if done:
             break
         memory, waited = max(memory, _resident(pid)), max(waited, _queued(pid))
-        if time.monotonic() - started - waited > SECONDS or memory > MEMORY:
+        if time.monotonic() - started - waited > seconds or memory > MEMORY:
             why = "time" if memory <= MEMORY else "memory"
             os.killpg(pid, signal.SIGKILL) if os.getpgid(pid) == pid else os.kill(pid, signal.SIGKILL)
             _, status, used = os.wait4(pid, 0)
             break
         time.sleep(0.02)
     memory = max(memory, 1024.0 * used.ru_maxrss)
-    code, seconds = os.waitstatus_to_exitcode(status), max(used.ru_utime + used.ru_stime, time.monotonic() - started - waited)
+    code, took = os.waitstatus_to_exitcode(status), max(used.ru_utime + used.ru_stime, time.monotonic() - started - waited)
     why = "time" if code in (-signal.SIGXCPU, -signal.SIGKILL) and not why else why
-    return {"code": code, "killed": why, "seconds": seconds, "memory": memory}
+    return {"code": code, "killed": why, "seconds": took, "memory": memory}
 
 
 def _resident(pid: int) -> float:
@@ -110,7 +132,7 @@ def main() -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         order = json.loads(line)
-        print(json.dumps(run(order["argv"], pathlib.Path(order["folder"]))), flush=True)
+        print(json.dumps(run(functools.partial(command, order["argv"]), pathlib.Path(order["folder"]))), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import fuzz
 import pytest
 
 TEXT = ("yaml", "loaded", "gains", "descriptor", "flow", "policy", "xacro", "expression", "eval")
+TEXT += ("run", "summary", "seeds", "metrics", "results", "robustness", "public_robots", "identified", "log", "onnx")
 
 
 @pytest.mark.slow

@@ -55,6 +55,16 @@ def test_nothing_outside_is_reached(theirs, name, kind):
     assert listing(mine) == before and (name == ".lock" or not (run / ".lock").exists())
 
 
+@pytest.mark.parametrize("name", [".lock", "metrics.jsonl"])
+def test_a_second_name_of_a_file_is_written_apart_from_it(theirs, name):
+    """A hard link looks like any file; what is written in place gets a copy of its own."""
+    run, mine = theirs / "run", theirs / "mine" / "file"
+    os.link(mine, run / name)
+    with run_folder.claim(run, "x", goes_on=True):
+        logs.Logs(run, print).write({"steps": 1})
+    assert mine.read_text() == "precious" and mine.stat().st_nlink == 1
+
+
 def test_links_that_wandb_makes_anew_are_no_fault(theirs):
     wandb = theirs / "run" / "wandb"
     wandb.mkdir()

@@ -15,6 +15,7 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import device_memory
 from mjx_nero.learn.play import figures, recorder
 from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Key, Scenery
@@ -176,6 +177,13 @@ def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
     return state, dict.fromkeys((*state.metrics, "return", "length"), zeros), jnp.ones_like(zeros)
 
 
+def _step_bytes(env: ManipulationEnv, episodes: int, record: int) -> int:
+    """What ``runner`` keeps of a step."""
+    state, action = env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    kept = jax.eval_shape(lambda *step: recorder.of_step(env, *step), state, action, state) if record else ()
+    return record * device_memory.size(kept) + episodes * device_memory.size(state.metrics["distance"])
+
+
 def runner(
     env: ManipulationEnv,
     act: Act | Agent,
@@ -188,7 +196,11 @@ def runner(
     Args:
         record: of how many of the episodes every step is kept.
         start: (parameters, states after the reset) -> the states to start from.
+
+    Raises:
+        UserError: so many episodes of such a length do not fit into the memory.
     """
+    device_memory.check_batch(env, episodes, "episodes:", env.episode_length * _step_bytes(env, episodes, record))
     agent = act if isinstance(act, Agent) else policy_agent(act)
 
     @jax.jit

@@ -18,10 +18,11 @@ import jax
 from mjx_nero import files
 from mjx_nero.errors import UserError
 from mjx_nero.learn import machines
+from mjx_nero.learn.runs.logs import METRICS
 
 CONFIG, SUMMARY = "config.json", "summary.json"
 _LOCK = ".lock"
-_WRITTEN = ("metrics.jsonl", "seeds.json", "policy.safetensors", "best.safetensors", "curve.png", "video.mp4")
+_WRITTEN = (METRICS, "seeds.json", "policy.safetensors", "best.safetensors", "curve.png", "video.mp4")
 _FOLDERS = ("checkpoints", "tensorboard", "wandb")
 _RELINKED = re.compile(r"wandb/(latest-run|debug[\w-]*\.log)")  # links that wandb itself makes anew at every start
 _RUNS = pathlib.Path("runs")
@@ -58,6 +59,7 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
         if (path / CONFIG).exists() and not goes_on:
             raise UserError(f"{path} already holds a run: pass another --out, or --restore {path} to go on with it")
         _tidy(path)
+        files.own(path / METRICS)
         yield path
     finally:
         with contextlib.suppress(OSError):
@@ -134,7 +136,9 @@ def _lock(folder: pathlib.Path) -> int:
         except OSError:
             return handle  # a file system without locks
         with contextlib.suppress(FileNotFoundError):
-            if os.stat(path).st_ino == os.fstat(handle).st_ino:  # else its owner took it away just before we had it
+            if os.fstat(handle).st_nlink > 1:  # somebody's file that has this name, too
+                path.unlink()
+            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # else its owner took it away just before we had it
                 os.truncate(handle, 0)
                 os.write(handle, f"process {os.getpid()} on {os.uname().nodename}\n".encode())
                 return handle

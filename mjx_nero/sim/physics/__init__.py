@@ -14,6 +14,7 @@ import jax
 import mujoco
 from jaxtyping import Array, Float
 
+from mjx_nero.config import values
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim, UserError
 
@@ -107,8 +108,8 @@ def resolve_impl(impl: str) -> str:
     Raises:
         UserError: the name is unknown, or this machine cannot run the backend.
     """
-    if impl not in impls():
-        raise UserError(f"unknown impl {impl!r}: choose one of {', '.join(impls())}")
+    if not isinstance(impl, str) or impl not in impls():
+        raise UserError(f"unknown impl {values.short(impl)}: choose one of {', '.join(impls())}")
     if impl == "auto":
         return "warp" if warp_available() else "native" if jax.default_backend() == "cpu" else "jax"
     if impl == "warp" and not warp_available():
