@@ -213,9 +213,9 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
     )
 
 
-def robot_model(robot: RobotCfg) -> mujoco.MjModel:
-    """The robot alone where it is mounted: what kinematics need."""
-    return _robot_spec(robot).compile()
+def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
+    """The robot alone where it is mounted: what kinematics need. ``whole``: with the shapes that meet obstacles alone."""
+    return _robot_spec(robot, whole).compile()
 
 
 def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:

@@ -1,0 +1,1 @@
+"""Arms in software that speak the real ones' protocols, with MuJoCo behind them."""
