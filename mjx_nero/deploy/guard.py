@@ -1,5 +1,7 @@
 """An arm behind its safety layer and its log: all that the runtime ever talks to."""
 
+import contextlib
+import os
 import time
 from collections.abc import Sequence
 from typing import Protocol
@@ -28,6 +30,12 @@ class WallClock:
             pass
 
 
+def urgent() -> None:
+    """Lets this process run before others, where the system lets it."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
 class Guarded(Protocol):
     """What the loop sees of an arm, be it in this process or in one of its own.
 
@@ -54,7 +62,7 @@ class Guard:
     """
 
     def __init__(self, arm: Arm, safety: Safety, clock: Clock, log: Log | None = None):
-        self.arm, self.safety, self.clock, self._log = arm, safety, clock, log
+        self.arm, self.safety, self.clock, self.log = arm, safety, clock, log
         self.sent = 0.0
         self._last: Feedback | None = None
 
@@ -82,8 +90,8 @@ class Guard:
         except ArmError as error:
             self.safety.hold(Fault("bus", str(error)))
         self.safety.check(self._last, self.clock.now())
-        if self._log:
-            self._log.read(self._last)
+        if self.log:
+            self.log.read(self._last)
         return self._last
 
     def command(self, target: np.ndarray, notes: Sequence[float] = ()) -> Command:
@@ -99,8 +107,8 @@ class Guard:
         except ArmError as error:
             self.safety.lost(Fault("bus", str(error)))
         self.sent = self.clock.now()
-        if self._log:
-            self._log.sent(self.sent, told, command, self.fault, notes)
+        if self.log:
+            self.log.sent(self.sent, told, command, self.fault, notes)
         return command
 
     def hold(self, fault: Fault) -> None:
@@ -122,8 +130,8 @@ class Guard:
         if self._last is not None:
             self.settle()
         self.arm.close()
-        if self._log:
-            self._log.close()
+        if self.log:
+            self.log.close()
 
 
 class Dry:

@@ -20,6 +20,11 @@ Stop = Callable[[], Fault | None]
 class Brain(Policy):
     """A policy with its chain of actions, its drives' lag and its observations: from feedback to where the joints are to be."""
 
+    def warm(self) -> None:
+        """Runs the network once, which takes longer than every time after."""
+        self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]})
+        gc.collect()
+
     def begin(self, observer: Observer, feedback: Feedback) -> None:
         """A new episode, from where the joints are."""
         self.reset()
@@ -81,10 +86,9 @@ def run(arm: Guarded, brain: Brain, observer: Observer, clock: Clock, seconds: f
         misses: so many late cycles in a row end it, too.
     """
     dt = float(brain.metadata["control_dt"])
+    gc.disable()  # a collection takes longer than the jitter that is allowed
     brain.begin(observer, arm.read())
     timing, limited, late, k = Timing(), dict[str, int](), 0, 0
-    gc.collect()
-    gc.disable()  # a collection takes longer than the jitter that is allowed
     begun = clock.now()
     try:
         while arm.fault is None:

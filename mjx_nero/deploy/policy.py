@@ -19,6 +19,7 @@ class Policy:
     Attributes:
         metadata: what the file says: see ``docs/guides/deploy_onnx.md``.
         names: of the observations that ``act`` takes.
+        actions: how many numbers an action has.
     """
 
     def __init__(self, path: pathlib.Path | str):
@@ -30,6 +31,7 @@ class Policy:
         stored = self._session.get_modelmeta().custom_metadata_map
         self.metadata: dict[str, Any] = {name: json.loads(text) for name, text in stored.items()}
         self.names = tuple(term["name"] for term in self.metadata["observations"])
+        self.actions = int(self._session.get_outputs()[0].shape[-1])
         self.reset()
 
     def reset(self) -> None:

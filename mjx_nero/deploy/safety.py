@@ -1,8 +1,9 @@
 """The layer between policy and driver: whatever comes in, what goes out is within every limit, and every fault ends in holding.
 
 A command is a position and the velocity with which it goes on. The layer keeps one promise from step to step: from every
-command the arm can brake, within its acceleration, to a rest that has been looked at already; all poses on that way are within the joints'
-ranges and inside the fence. A target that would break the promise is bent to the nearest that does not, or the arm brakes.
+command the arm can brake, within its acceleration, to a rest that has been looked at already; all poses on that way are within
+the joints' ranges and inside the fence. A target that would break the promise is bent to the nearest that does not, or the arm
+brakes.
 """
 
 import collections

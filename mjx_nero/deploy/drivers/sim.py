@@ -1,11 +1,15 @@
 """The simulated arm: MuJoCo's C library in real time, with the drives of training."""
 
+import dataclasses
 import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from mjx_nero.deploy.arm import Clock, Feedback
 from mjx_nero.deploy.emulators.plant import Plant
+from mjx_nero.deploy.places import sender
 
 
 class SimArm:
@@ -40,6 +44,28 @@ class SimArm:
         """See ``Arm``."""
 
 
-def of(model: str, joints: tuple[str, ...], start: np.ndarray, lead: np.ndarray, clock: Clock, **plant) -> SimArm:
-    """The arm of a model's file."""
-    return SimArm(Plant(pathlib.Path(model), joints, start, clock, **plant), joints, lead, clock)
+def of(
+    metadata: Mapping[str, Any],
+    joints: tuple[str, ...],
+    lead: np.ndarray,
+    clock: Clock,
+    model: str,
+    tracker: int | None = None,
+    start: Sequence[float] | None = None,
+    objects: Mapping[str, Sequence[float]] | None = None,
+    **faults: float,
+) -> SimArm:
+    """The arm of a model's file (``.mjb``).
+
+    Args:
+        tracker: port of this machine that is told where objects are.
+        start: where the joints are at first; None: at home [rad or m].
+        objects: where objects are at first, in the root frame [m].
+        faults: fields of ``emulators.plant.Faults``.
+    """
+    at = np.array(metadata["joints"]["home"] if start is None else start, float)
+    told = sender("127.0.0.1", tracker) if tracker else None
+    plant = Plant(pathlib.Path(model), joints, at, clock, metadata["base"]["position"], told)
+    plant.faults = dataclasses.replace(plant.faults, **faults)
+    plant.reset(at, {name: np.array(position, float) for name, position in (objects or {}).items()})
+    return SimArm(plant, joints, lead, clock)
