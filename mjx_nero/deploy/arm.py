@@ -48,6 +48,9 @@ class Arm(Protocol):
             ArmError: nothing answers.
         """
 
+    def ranges(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The least and the greatest positions that the arm, once connected, allows [rad or m]; None: those of its model."""
+
     def engage(self) -> None:
         """Lets the drives hold where they are.
 

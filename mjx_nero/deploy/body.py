@@ -21,16 +21,18 @@ def matrix(quat: Sequence[float]) -> np.ndarray:
     )
 
 
-def quaternion(turn: np.ndarray) -> np.ndarray:
-    """Of a rotation matrix [3, 3]: wxyz, w from zero on."""
-    xx, yy, zz = np.diag(turn)
-    squares = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
-    k = int(np.argmax(squares))  # the largest component, which nothing cancels in
-    a, b, c = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
-    d, e, f = turn[1, 0] + turn[0, 1], turn[0, 2] + turn[2, 0], turn[2, 1] + turn[1, 2]
-    row = ([squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]])[k]
-    quat = np.array(row) / (2 * np.sqrt(squares[k]))
-    return -quat if quat[0] < 0 else quat
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of quaternions (wxyz): the turn ``b`` first, then ``a``."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.array(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
 
 
 def transform(pos: Sequence[float], quat: Sequence[float] = STILL) -> np.ndarray:
@@ -94,6 +96,22 @@ class Body:
         ee = description["ee"]
         node, fixed = places[ee["body"]]
         self._ee = node, fixed @ transform(ee["pos"], ee["quat"])
+        self._turns = self._turns_to(description)
+
+    def _turns_to(self, description: Mapping[str, Any]) -> list[tuple[int, np.ndarray]]:
+        """Quaternions from the world to the end effector: fixed ones (joint -1), and the axes of hinges. A turn is told by two
+        quaternions; what a policy has learnt is the one that comes of their product."""
+        bodies, ee = {body["name"]: body for body in description["bodies"]}, description["ee"]
+        turns, name = [(-1, np.array(ee["quat"], float))], ee["body"]
+        while name is not None:
+            body = bodies[name]
+            for joint in reversed(body["joints"]):
+                if joint["name"] in self._columns and joint["type"] == "hinge":
+                    axis = np.asarray(joint["axis"], float)
+                    turns.append((self._columns[joint["name"]], axis / np.linalg.norm(axis)))
+            turns.append((-1, np.array(body["quat"], float)))
+            name = body["parent"]
+        return turns[::-1]
 
     def _place(self, body: Mapping[str, Any], node: int, fixed: np.ndarray) -> tuple[int, np.ndarray]:
         """The joint that carries a body, and where the body is from there."""
@@ -171,8 +189,10 @@ class Body:
     def ee(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position [m] and orientation (wxyz) of the end effector in the world, of one posture."""
         node, fixed = self._ee
-        pose = self.forward(q)[0, node] @ fixed
-        return pose[:3, 3], quaternion(pose[:3, :3])
+        half, quat = self._all(np.atleast_2d(np.asarray(q, float)))[0] / 2, STILL
+        for joint, turn in self._turns:
+            quat = product(quat, turn if joint < 0 else np.append(np.cos(half[joint]), np.sin(half[joint]) * turn))
+        return (self.forward(q)[0, node] @ fixed)[:3, 3], quat
 
     def shapes(self, q: np.ndarray) -> np.ndarray:
         """[k, shapes, 4, 4]: their frames."""

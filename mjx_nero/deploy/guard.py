@@ -149,6 +149,10 @@ class Dry:
         """See ``Arm``; the drives stay as they are."""
         self.arm.connect()
 
+    def ranges(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """See ``Arm``."""
+        return self.arm.ranges()
+
     def engage(self) -> None:
         """Leaves the drives as they are."""
 

@@ -37,10 +37,13 @@ class Brain(Policy):
         """Where the joints are to be next [rad or m].
 
         Raises:
-            ValueError: an object is not seen, or an observation is not finite.
+            ValueError: an object is not seen, or an observation or the action is not finite.
         """
         seen = self._observer(feedback, self._executor.last, self.action, now)
-        self.action = np.asarray(self.act(seen), float)
+        action = np.asarray(self.act(seen), float)
+        if not np.all(np.isfinite(action)):
+            raise ValueError("the policy's action is not finite")
+        self.action = action
         return self._lag(self._executor(self.action, feedback.position), self._meant)
 
     def sent(self, position: np.ndarray) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.arm import Feedback
-from mjx_nero.deploy.body import Body, matrix
+from mjx_nero.deploy.body import Body, matrix, product
 from mjx_nero.deploy.places import Place, Places
 from mjx_nero.errors import UserError
 
@@ -42,12 +42,6 @@ def _ways(seen: Seen, objects: list[str], limit: float) -> np.ndarray:
     return (ways * np.minimum(1.0, limit / np.maximum(far, 1e-6))).reshape(-1)
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of quaternions (wxyz): the turn ``b`` first, then ``a``."""
-    w, v, x, u = a[0], np.asarray(a[1:]), b[0], np.asarray(b[1:])
-    return np.concatenate([[w * x - v @ u], w * u + x * v + np.cross(v, u)])
-
-
 def rotation_vector(quat: np.ndarray) -> np.ndarray:
     """Axis times angle of a turn (wxyz), the short way [rad]."""
     quat = -quat if quat[0] < 0 else quat
@@ -57,6 +51,15 @@ def rotation_vector(quat: np.ndarray) -> np.ndarray:
 
 def _turn(seen: Seen) -> np.ndarray:
     return rotation_vector(product(seen.ee_quat * [1, -1, -1, -1], seen.goal_quat))
+
+
+def _object_turn(seen: Seen, fold: int = 1, object: str = "cube") -> np.ndarray:
+    """The shortest turn of an object, which looks the same ``fold`` times in a full turn about z, to the goal's orientation."""
+    halves = np.pi * np.arange(fold) / fold
+    turns = [np.array([np.cos(h), 0.0, 0.0, np.sin(h)]) for h in halves]
+    back = seen.objects[object].quaternion * [1, -1, -1, -1]
+    ways = [rotation_vector(product(product(seen.goal_quat, turn), back)) for turn in turns]
+    return min(ways, key=lambda way: float(np.linalg.norm(way)))
 
 
 # What ``mdp.observations`` calls them -> of a step, with the term's parameters.
@@ -79,6 +82,7 @@ TERMS: dict[str, Callable[..., np.ndarray]] = {
     "object_heading": lambda seen, object="cube": matrix(seen.objects[object].quaternion)[:2, 0],
     "ee_to_object": lambda seen, object="cube": seen.objects[object].position - seen.ee,
     "ee_to_objects": lambda seen, objects, limit: _ways(seen, objects, limit),
+    "object_turn_to_goal": _object_turn,
     "object_to_goal": lambda seen, object="cube": seen.goal - seen.objects[object].position,
 }
 

@@ -81,6 +81,20 @@ class Limits:
         arm = np.array([name not in metadata["gripper"] for name in own["names"]])
         return cls(tuple(own["names"]), arm, home, lower, upper, speed, speed / cfg.spin_up, float(metadata["control_dt"]))
 
+    def within(self, lower: np.ndarray, upper: np.ndarray) -> "Limits":
+        """With ranges that an arm has narrowed.
+
+        Raises:
+            UserError: home is outside.
+        """
+        narrow = dataclasses.replace(self, lower=np.maximum(self.lower, lower), upper=np.minimum(self.upper, upper))
+        for name, home, low, high in zip(self.names, self.home, narrow.lower, narrow.upper, strict=True):
+            if not low - 1e-3 <= home <= high + 1e-3:
+                raise UserError(
+                    f"home of {name} is {home:.2f}, and the arm's own range is {low:.2f} to {high:.2f}: calibrate it again"
+                )
+        return dataclasses.replace(narrow, home=np.clip(self.home, narrow.lower, narrow.upper))
+
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
@@ -123,7 +137,8 @@ class Safety:
         self.counts: collections.Counter[str] = collections.Counter()
         self.blocked_by = ""
         self._seen: Feedback | None = None
-        self._since: dict[str, float | None] = {"behind": None, "load": None}
+        self._since = {what: _Since(len(self.position)) for what in ("behind", "load")}
+        self._passed = self.position  # where joints were last seen to move, or to need little torque
         self._rest: np.ndarray | None = None  # where a stalled arm holds
         self._clear: np.ndarray | None = None  # clearances at the last command
 
@@ -260,27 +275,34 @@ class Safety:
                 return Fault("jump", f"{self._name(leap)} is read where it cannot have got to")
         if feedback.temperature is not None and not np.max(feedback.temperature) <= cfg.temperature:
             return Fault("temperature", f"{self._name(feedback.temperature)} has {np.max(feedback.temperature):.0f} degrees C")
-        if self._seen is not None and self._lasts("behind", np.abs(at - self.position), cfg.behind, cfg.behind_s, now):
-            return Fault("stall", f"{self._name(np.abs(at - self.position))} does not follow its commands")
+        if self._seen is not None:
+            behind = np.where(limits.arm, np.abs(at - self.position), 0.0)
+            if self._since["behind"].lasts(behind > cfg.behind, now, cfg.behind_s):
+                return Fault("stall", f"{self._name(behind)} does not follow its commands")
         if feedback.load is not None:
-            pushing = np.where(np.abs(speeds) < _SLOW * limits.speed / cfg.share, np.abs(feedback.load), 0.0)
-            if self._lasts("load", pushing, cfg.load, cfg.load_s, now):
-                return Fault("load", f"{self._name(np.where(limits.arm, pushing, 0.0))} is blocked: its drive gives all it has")
+            load = np.where(limits.arm, np.abs(feedback.load), 0.0)
+            moving = np.abs(at - self._passed) > _SLOW * limits.speed / cfg.share * cfg.load_s
+            pushing = ~(load <= cfg.load) & ~moving
+            self._passed = np.where(pushing, self._passed, at)
+            if self._since["load"].lasts(pushing, now, cfg.load_s):
+                return Fault("load", f"{self._name(np.where(pushing, load, 0.0))} is blocked: its drive gives all it has")
         return None
-
-    def _lasts(self, what: str, values: np.ndarray, most: float, seconds: float, now: float) -> bool:
-        """Whether one of the arm's joints has been beyond a limit for some time."""
-        if not np.max(np.where(self.limits.arm, values, 0.0)) > most:
-            self._since[what] = None
-            return False
-        since = self._since[what]
-        if since is None:
-            self._since[what] = since = now
-        return now - since >= seconds
 
     def _name(self, values: np.ndarray) -> str:
         """Of the worst joint; among the arm's where those are what matters."""
         return self.limits.names[int(np.argmax(values))]
+
+
+class _Since:
+    """For how long something has been so, for each of some joints."""
+
+    def __init__(self, count: int):
+        self._begun = np.full(count, np.nan)
+
+    def lasts(self, so: np.ndarray, now: float, seconds: float) -> bool:
+        """Whether it has been so for some time, for any of them."""
+        self._begun = np.where(so, np.where(np.isnan(self._begun), now, self._begun), np.nan)
+        return bool(np.any(now - self._begun >= seconds))
 
 
 def _stoppable(room: np.ndarray, unit: np.ndarray) -> np.ndarray:

@@ -63,10 +63,10 @@ class Server:
         self.spec, self.clock = spec, WallClock()
         self.cfg = SafetyCfg(**spec.safety)
         self.dt = float(spec.metadata["control_dt"])
-        safety = setup.safety_of(spec.metadata, self.cfg, FenceCfg(**spec.fence))
         arm = drivers.make(spec.kind, spec.options, spec.metadata, self.clock)
         self._arm = Dry(arm) if spec.dry else arm
         self._arm.connect()
+        safety = setup.safety_of(spec.metadata, self.cfg, FenceCfg(**spec.fence), self._arm.ranges())
         self.guard, self.running, self.heard = Guard(self._arm, safety, self.clock), False, 0.0
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from mjx_nero.deploy.fence import Box, Fence, FenceCfg
 from mjx_nero.deploy.safety import Limits, Safety, SafetyCfg
 from mjx_nero.errors import UserError
 
+Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
 NEEDED = ("joints", "gripper", "body", "command", "objects")
 
@@ -30,9 +31,20 @@ def body_of(metadata: Mapping[str, Any]) -> Body:
     return Body(metadata["body"], metadata["joints"]["names"], metadata["base"]["position"])
 
 
-def safety_of(metadata: Mapping[str, Any], cfg: SafetyCfg = USUAL, fence: FenceCfg = USUAL_FENCE) -> Safety:
-    """The layer with the limits of the policy's robot, and, where no box is given, the room that its task needs."""
+def safety_of(
+    metadata: Mapping[str, Any], cfg: SafetyCfg = USUAL, fence: FenceCfg = USUAL_FENCE, ranges: Ranges | None = None
+) -> Safety:
+    """The layer with the limits of the policy's robot, and, where no box is given, the room that its task needs.
+
+    Args:
+        ranges: of the arm, where it has its own; see ``Arm.ranges``.
+
+    Raises:
+        UserError: these leave home out.
+    """
     limits, body = Limits.of(metadata, cfg), body_of(metadata)
+    if ranges is not None:
+        limits = limits.within(*ranges)
     if fence.box is None:
         fence = dataclasses.replace(fence, box=room_for(metadata, body, fence.room))
     arm = tuple(name for name, mine in zip(limits.names, limits.arm, strict=True) if mine)

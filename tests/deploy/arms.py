@@ -29,7 +29,7 @@ class Clock:
 
 
 class Ideal:
-    """An arm that is at once where it is told to be; what was sent is in ``told``. Torque cannot be cut: there is no way to ask for it."""
+    """An arm that is at once where it is told to be; ``told`` has what was sent. There is no way to ask it to cut torque."""
 
     def __init__(self, joints, home, clock):
         self.joints, self.clock = joints, clock
@@ -38,6 +38,9 @@ class Ideal:
 
     def connect(self):
         pass
+
+    def ranges(self):
+        return None
 
     def engage(self):
         pass

@@ -25,6 +25,9 @@ class SimArm:
     def connect(self) -> None:
         """See ``Arm``."""
 
+    def ranges(self) -> None:
+        """See ``Arm``: the model's."""
+
     def engage(self) -> None:
         """See ``Arm``: the simulated drives hold from the start."""
 

@@ -23,6 +23,7 @@ from mjx_nero.deploy.drivers import feetech
 from mjx_nero.deploy.emulators.plant import Plant
 
 _EEPROM_END, _FACTORY = 40, 80
+_GEARS = 100.0  # [N m s/rad]: 1 to 345, so that an arm without power sinks slowly
 _BYTE = 1e-5  # [s] at 1 Mbaud
 
 
@@ -81,7 +82,7 @@ class Servos:
             known |= {"max_torque": 1000, "torque_limit": 1000, "p": 16, "d": 32, "i": 0, "protection_current": 500, "lock": 1}
             for name, value in {**known, "homing_offset": entry["homing_offset"], "voltage": 120, "overload_torque": 80}.items():
                 self._put(entry["id"], name, value)
-        self.plant.powered[:] = False
+        self.plant.powered[:], self.plant.gears = False, _GEARS
         self.refresh()
         for entry in self._calibration:
             self._put(entry["id"], "goal_position", self._get(entry["id"], "position"))

@@ -42,6 +42,7 @@ class Plant:
     Attributes:
         faults: what is wrong with the arm.
         powered: which drives have torque.
+        gears: how hard the others are to turn [N m s/rad].
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Plant:
         self._effort = np.abs(m.actuator_forcerange[self._act]).max(axis=1)
         free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         self.objects = {m.joint(j).name: int(m.jnt_qposadr[j]) for j in free}
-        self.faults, self.powered = Faults(), np.ones(len(ids), bool)
+        self.faults, self.powered, self.gears = Faults(), np.ones(len(ids), bool), 0.0
         self._waiting: collections.deque[tuple[float, np.ndarray]] = collections.deque()
         self.reset(start)
 
@@ -111,7 +112,7 @@ class Plant:
         """Their stiffness and power now."""
         m, share = self.model, np.where(self.powered, self.faults.stiffness, 0.0)
         m.actuator_gainprm[self._act, 0], m.actuator_biasprm[self._act, 1] = self._gain * share, self._bias[:, 1] * share
-        m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], 0.0)
+        m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], -self.gears)
 
     def _tell(self) -> None:
         if self._tracker:
