@@ -166,10 +166,13 @@ def test_faults_of_the_bus_end_in_hold_within_a_cycle(bench, fault):
     if fault == "unplugged":
         bench.arm._bus._port.close()
     else:
-        setattr(
-            bench.servos.faults,
-            *{"cut": ("cut", True), "corrupt": ("corrupt", 1.0)}.get(fault, ("errors", {3: 32 if fault == "overload" else 4})),
-        )
+        wrong = {
+            "cut": {"cut": True},
+            "corrupt": {"corrupt": 1.0},
+            "overload": {"errors": {3: 32}},
+            "overheating": {"errors": {3: 4}},
+        }
+        bench.servos.faults = emulated.BusFaults(turnaround=1e-4, **wrong[fault])
     bench.play([home + 0.5])
     assert bench.guard.fault.kind == "bus"
     bench.servos.faults = emulated.BusFaults(turnaround=1e-4)
@@ -235,10 +238,10 @@ def test_other_gains_are_told(bench):
 
 
 def test_the_calibrated_range_narrows_the_limits(told):
-    narrow = np.array(told["joints"]["lower"]) + 0.3
+    narrow = np.array(told["joints"]["lower"]) + 0.1
     limits = setup.safety_of(told, ranges=(narrow, np.array(told["joints"]["upper"]))).limits
     np.testing.assert_allclose(limits.lower[:5], narrow[:5])
-    with pytest.raises(UserError, match="home of shoulder_pan is 0.00, and the arm's own range is 0.20 to"):
+    with pytest.raises(UserError, match=r"home of shoulder_pan is 0\.00, and the arm's own range is 0\.20 to"):
         setup.safety_of(told, ranges=(np.full(6, 0.2), np.array(told["joints"]["upper"])))
 
 
