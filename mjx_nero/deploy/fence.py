@@ -17,12 +17,14 @@ class FenceCfg:
 
     Attributes:
         table: height of the table's top, in the world [m].
+        press: how far commands may press fingertips into it [m]. Policies slide them over the table to grasp; the drives give way.
         box: ranges of x, y and z in the world that no link may leave [m]; None: what the policy's task needs, and some room.
         apart: between links that do not follow one another, at least [m].
         room: about what the policy's task needs, where no box is given [m].
     """
 
     table: float = 0.0
+    press: float = 0.003
     box: Box | None = None
     apart: float = 0.0
     room: float = 0.3
@@ -52,8 +54,8 @@ class Fence:
         pairs = [(i, j) for i in solid for j in solid if i < j and abs(link[i] - link[j]) > 1]
         self._pairs = self._meeting(np.array(pairs, int).reshape(-1, 2), home, ranges)
         low, high = np.array(cfg.box).T
-        self._low, self._high = np.maximum(low, [-np.inf, -np.inf, cfg.table]), high
-        sides = ("x from below", "y from below", "the table" if cfg.table >= low[2] else "z from below")
+        self._low, self._high = np.maximum(low, [-np.inf, -np.inf, cfg.table - cfg.press]), high
+        sides = ("x from below", "y from below", "the table" if cfg.table - cfg.press >= low[2] else "z from below")
         sides += ("x from above", "y from above", "z from above")
         links = [
             f"{body.names[i]} at {side} of the box" if "from" in side else f"{body.names[i]} at {side}"

@@ -5,8 +5,8 @@ import json
 import pathlib
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
 
 from mjx_nero.errors import UserError
 
@@ -40,3 +40,34 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
         finally:
             process.stdin.close()
             process.wait(10)
+
+
+class Port(Protocol):
+    """An emulated arm at a port of this machine."""
+
+    name: str
+
+    def serve(self, until: Callable[[], bool] = ..., other: int | None = ...) -> None: ...
+
+
+def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
+    """An emulator's process: makes the plant that ``started`` describes, says its port, and serves until its input ends."""
+    import dataclasses
+
+    import numpy as np
+
+    from mjx_nero.deploy.emulators.plant import Plant
+    from mjx_nero.deploy.guard import WallClock, urgent
+    from mjx_nero.deploy.places import sender
+
+    told = json.loads(sys.argv[1])
+    metadata, own = told["metadata"], told["metadata"]["joints"]
+    tracker = sender("127.0.0.1", told["tracker"]) if told.get("tracker") else None
+    start = np.array(told.get("start") or own["home"], float)
+    plant = Plant(pathlib.Path(told["model"]), own["names"], start, WallClock(), metadata["base"]["position"], tracker)
+    plant.faults = dataclasses.replace(plant.faults, **told.get("faults", {}))
+    plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
+    urgent()
+    port = port_of(plant, told)
+    print(port.name, flush=True)
+    port.serve(other=sys.stdin.fileno())

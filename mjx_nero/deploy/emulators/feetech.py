@@ -11,10 +11,9 @@ import os
 import pathlib
 import random
 import select
-import sys
 import time
 import tty
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -187,12 +186,12 @@ class Port:
         self.name = os.ttyname(self._slave)
         self._bytes = b""
 
-    def serve(self, until=lambda: False, other: int | None = None) -> None:
+    def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Answers until somebody says so, or until a file descriptor ends."""
         while not until():
             watched = [self._master, *([] if other is None else [other])]
             ready, _, _ = select.select(watched, [], [], 0.02)
-            if other in ready and not os.read(other, 1000):
+            if other in ready and not os.read(other or 0, 1000):
                 return
             if self._master in ready:
                 self._take(os.read(self._master, 4096))
@@ -250,23 +249,15 @@ def servos_of(metadata: Mapping[str, Any], kind: str, entries: Mapping[str, Mapp
 
 def main() -> None:
     """The process."""
-    from mjx_nero.deploy.guard import WallClock, urgent
-    from mjx_nero.deploy.places import sender
+    from mjx_nero.deploy.emulators import process
 
-    urgent()
+    def port(plant: Plant, told: Mapping[str, Any]) -> Port:
+        entries = json.loads(pathlib.Path(told["calibration"]).read_text())
+        made = Port(servos_of(told["metadata"], told["kind"], entries, plant))
+        made.servos.faults = dataclasses.replace(made.servos.faults, **told.get("bus", {}))
+        return made
 
-    told = json.loads(sys.argv[1])
-    metadata, own = told["metadata"], told["metadata"]["joints"]
-    tracker = sender("127.0.0.1", told["tracker"]) if told.get("tracker") else None
-    start = np.array(told.get("start") or own["home"], float)
-    plant = Plant(pathlib.Path(told["model"]), own["names"], start, WallClock(), metadata["base"]["position"], tracker)
-    plant.faults = dataclasses.replace(plant.faults, **told.get("faults", {}))
-    plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
-    entries = json.loads(pathlib.Path(told["calibration"]).read_text())
-    port = Port(servos_of(metadata, told["kind"], entries, plant))
-    port.servos.faults = dataclasses.replace(port.servos.faults, **told.get("bus", {}))
-    print(port.name, flush=True)
-    port.serve(other=sys.stdin.fileno())
+    process(port)
 
 
 if __name__ == "__main__":
