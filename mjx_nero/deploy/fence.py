@@ -17,7 +17,7 @@ class FenceCfg:
 
     Attributes:
         table: height of the table's top, in the world [m].
-        press: how far commands may press fingertips into it [m]. Policies slide them over the table to grasp; the drives give way.
+        press: how far commands may press into it [m]: policies slide fingertips over the table, and drives give way.
         box: ranges of x, y and z in the world that no link may leave [m]; None: what the policy's task needs, and some room.
         apart: between links that do not follow one another, at least [m].
         room: about what the policy's task needs, where no box is given [m].

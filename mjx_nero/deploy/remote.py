@@ -1,15 +1,14 @@
 """The arm as the policy's process sees it: behind a socket, in a process that outlives this one until the arm holds."""
 
 import json
-import os
 import socket
 import subprocess
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from mjx_nero.deploy import children
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.deploy.safety import Command, Fault
 from mjx_nero.deploy.server import PACKET, Spec
@@ -31,10 +30,9 @@ class Remote:
         self.sent = 0.0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._channel.settimeout(_PATIENCE)
-        path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path[:1]]))
-        argv = [sys.executable, "-m", "mjx_nero.deploy.server", str(theirs.fileno())]
-        fds, environment = (theirs.fileno(),), {**os.environ, "PYTHONPATH": path}
-        self._process = subprocess.Popen(argv, pass_fds=fds, stdin=subprocess.DEVNULL, start_new_session=True, env=environment)
+        argv, own = children.command("mjx_nero.deploy.server", str(theirs.fileno())), children.environment()
+        fds, none = (theirs.fileno(),), subprocess.DEVNULL
+        self._process = subprocess.Popen(argv, pass_fds=fds, stdin=none, start_new_session=True, env=own)
         self.pid = self._process.pid
         theirs.close()
         self._channel.send(json.dumps(vars(spec)).encode())

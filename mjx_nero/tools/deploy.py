@@ -11,6 +11,7 @@ from typing import Any
 
 from mjx_nero import cli, files
 from mjx_nero.deploy import drivers
+from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
 
 _WARNING = (
@@ -37,6 +38,8 @@ def main(argv: Sequence[str]) -> None:
         files.check_writable(path)
     try:
         ended = _run(args)
+    except ArmError as error:
+        raise UserError(f"the arm is lost: {error}") from None
     except ModuleNotFoundError as error:
         extra = {"onnxruntime": "deploy", "serial": "deploy", "can": "deploy"}.get((error.name or "").partition(".")[0])
         if extra is None:
@@ -109,9 +112,15 @@ def _run(args: argparse.Namespace) -> bool:
     from mjx_nero.deploy.stop import operator
 
     files.read_bytes(args.policy, 100_000_000)
-    brain = Brain(args.policy)
+    try:
+        brain = Brain(args.policy)
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # ONNX Runtime has kinds of its own
+        raise UserError(f"{args.policy} is no policy that export wrote: {error}") from None
     metadata = brain.metadata
     setup.check(metadata)
+    drivers.check(args.arm, metadata)
     goal, clock = _numbers(args.goal, (3, 7), "--goal"), WallClock()
     with contextlib.ExitStack() as stack:
         places, options = stack.enter_context(_world(args, metadata))
@@ -163,11 +172,12 @@ def _world(args: argparse.Namespace, metadata: dict[str, Any]) -> Iterator[tuple
     from mjx_nero.deploy import places
 
     simulated = args.arm == "sim" or args.emulate
-    constant = args.object is not None and _is_point(args.object)
+    constant, told = args.object is not None and _is_point(args.object), None
     if args.object is None and not simulated:
         source: Any = places.Known()
     elif simulated and (args.object is None or constant):  # the simulated object starts there, and is seen
         source = places.FromSocket("udp", "127.0.0.1", 0)
+        told = source.port
     else:
         source = places.of(args.object)
     options: dict[str, Any] = {"port": args.port, "calibration": args.calibration and str(args.calibration)}
@@ -175,7 +185,7 @@ def _world(args: argparse.Namespace, metadata: dict[str, Any]) -> Iterator[tuple
         stack.callback(source.close)
         if simulated:
             folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            options = _simulated(args, metadata, folder, getattr(source, "port", None), constant)
+            options = _simulated(args, metadata, folder, told, constant)
             if args.emulate:
                 from mjx_nero.deploy.emulators import started
 

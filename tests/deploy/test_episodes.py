@@ -50,12 +50,10 @@ def success(lift, episodes, faults, seed=0):
     brain, clock, rng = Brain(lift / "policy.onnx"), arms.Clock(), np.random.default_rng(seed)
     told, ended, good = brain.metadata, [], 0
     home = np.array(told["joints"]["home"])
-    plant = Plant(lift / "scene.mjb", told["joints"]["names"], home, clock)
     entries = emulated.calibration(told, "so101")
     servos = {name: so_arm.Servo(**{f: entry[f] for f in so_arm._FIELDS}) for name, entry in entries.items()}
     for _ in range(episodes):
-        plant.faults = Faults()
-        plant.powered[:] = True
+        plant = Plant(lift / "scene.mjb", told["joints"]["names"], home, clock)
         x, y = rng.uniform([0.1, -0.2], [0.3, 0.2])
         goal = rng.uniform([0.15, -0.1, 0.2], [0.3, 0.1, 0.35]).tolist()
         plant.reset(home, {"cube": np.array([x, y, told["objects"]["cube"][2] / 2])})

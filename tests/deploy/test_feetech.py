@@ -8,7 +8,7 @@ import arms
 import numpy as np
 import pytest
 
-from mjx_nero.deploy import setup
+from mjx_nero.deploy import drivers, setup
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.drivers import feetech, so_arm
 from mjx_nero.deploy.emulators import feetech as emulated
@@ -294,7 +294,7 @@ def test_calibrations_that_are_wrong(tmp_path, told, field, value, message):
 
 def test_another_robots_policy_is_refused(told):
     with pytest.raises(UserError, match="the policy is for so_arm101, and --arm so100 is a so_arm100"):
-        so_arm.of("so100", told, arms.Clock(), "/dev/null", "c.json")
+        drivers.make("so100", {"port": "/dev/null", "calibration": "c.json"}, told, arms.Clock())
 
 
 def test_rubbish_on_the_line_is_survived(bench):

@@ -145,11 +145,6 @@ def test_wrong_ports_are_one_line(told, port):
         piper.of(told, arms.Clock(), port).connect()
 
 
-def test_another_robots_policy_is_refused():
-    with pytest.raises(UserError, match="the policy is for nero, and --arm piper is a piper"):
-        piper.of(arms.metadata("nero"), arms.Clock(), "virtual:x")
-
-
 def test_rubbish_on_the_line_is_survived(bench):
     rng = np.random.default_rng(0)
     bench.port._open = True

@@ -10,6 +10,21 @@ from mjx_nero.errors import UserError
 KINDS = ("sim", "so101", "so100", "piper")
 
 
+_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper"}
+
+
+def check(kind: str, metadata: Mapping[str, Any]) -> None:
+    """Whether an arm is the robot of a policy.
+
+    Raises:
+        UserError: it is not, or there is no such arm.
+    """
+    if kind not in KINDS:
+        raise UserError(f"no arm {kind!r}: choose one of {', '.join(KINDS)}")
+    if (wanted := _ROBOTS.get(kind, metadata["robot"])) != metadata["robot"]:
+        raise UserError(f"the policy is for {metadata['robot']}, and --arm {kind} is a {wanted}")
+
+
 def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clock: Clock) -> Arm:
     """A driver, not connected yet.
 
@@ -20,6 +35,7 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
     Raises:
         UserError: there is no such arm, a package or file is missing, or it is another robot than the policy's.
     """
+    check(kind, metadata)
     joints = tuple(metadata["joints"]["names"])
     if kind == "sim":
         from mjx_nero.deploy.drivers import sim
@@ -29,8 +45,6 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
         from mjx_nero.deploy.drivers import so_arm
 
         return so_arm.of(kind, metadata, clock, **options)
-    if kind == "piper":
-        from mjx_nero.deploy.drivers import piper
+    from mjx_nero.deploy.drivers import piper
 
-        return piper.of(metadata, clock, **options)
-    raise UserError(f"no arm {kind!r}: choose one of {', '.join(KINDS)}")
+    return piper.of(metadata, clock, **options)

@@ -1,6 +1,7 @@
 """AgileX Piper over CAN, by python-can: the frames that the maker publishes (agilexrobotics/piper_sdk, ``piper_msgs/msg_v2``).
 
-All numbers are big-endian. Targets go out in joint mode; nothing here sends 0x150, whose resume drops the arm, nor disables a motor.
+All numbers are big-endian. Targets go out in joint mode. Nothing here sends 0x150, whose resume drops the arm, and nothing
+disables a motor.
 """
 
 import struct
@@ -63,6 +64,7 @@ class Piper:
         self.joints = tuple(metadata["joints"]["names"])
         self._port, self._clock = port, clock
         self._frames: dict[int, tuple[float, bytes]] = {}
+        self._engaged = False
 
     def ranges(self) -> None:
         """See ``Arm``: the model's, which are the maker's."""
@@ -73,9 +75,7 @@ class Piper:
 
         interface, colon, channel = self._port.partition(":")
         if not colon or not channel:
-            raise UserError(
-                f"--port of a Piper is INTERFACE:CHANNEL, as in socketcan:can0 or slcan:/dev/ttyACM0, got {self._port!r}"
-            )
+            raise UserError(f"--port of a Piper is INTERFACE:CHANNEL, as in socketcan:can0, got {self._port!r}")
         options = {"sleep_after_open": 0.1} if interface == "slcan" else {}
         try:
             self._bus = can.Bus(interface=interface, channel=channel, bitrate=BITRATE, **options)
@@ -106,7 +106,7 @@ class Piper:
 
         try:
             for frame, data in frames:
-                self._bus.send(can.Message(arbitration_id=frame, data=data, is_extended_id=False), timeout=0.005)
+                self._bus.send(can.Message(arbitration_id=frame, data=data, is_extended_id=False), timeout=0.02)
         except (self._error, OSError, ValueError) as error:
             raise ArmError(f"the CAN bus fails: {error}") from None
 
@@ -122,8 +122,6 @@ class Piper:
             self._listen(0.02)
         self._send(target_frames(position[:6], position[6] - position[7]))
         self._engaged = True
-
-    _engaged = False
 
     def read_position(self) -> tuple[float, np.ndarray]:
         """When the oldest part of it came [s], and where the joints are [rad or m]."""
@@ -169,12 +167,6 @@ class Piper:
 
 
 def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, **_: Any) -> Piper:
-    """The arm at a port.
-
-    Raises:
-        UserError: the policy is another robot's.
-    """
-    if metadata["robot"] != "piper":
-        raise UserError(f"the policy is for {metadata['robot']}, and --arm piper is a piper")
+    """The arm at a port."""
     assert port
     return Piper(metadata, port, clock)

@@ -17,7 +17,6 @@ from mjx_nero.deploy.arm import ArmError, Clock, Feedback
 from mjx_nero.deploy.drivers import feetech
 from mjx_nero.errors import UserError
 
-ROBOTS = {"so101": "so_arm101", "so100": "so_arm100"}
 _TURN = 4095 / (2 * np.pi)  # counts a radian, as LeRobot has it
 _WAIT = 0.03  # [s] for an answer
 _GRIP = 500  # of 1000: the gripper's torque, at most, as LeRobot has it
@@ -173,10 +172,8 @@ def of(kind: str, metadata: Mapping[str, Any], clock: Clock, port: str | None, c
     """The arm at a port.
 
     Raises:
-        UserError: the policy is another robot's, or there is no calibration file.
+        UserError: there is no calibration file.
     """
-    if metadata["robot"] != ROBOTS[kind]:
-        raise UserError(f"the policy is for {metadata['robot']}, and --arm {kind} is a {ROBOTS[kind]}")
     if not calibration:
         raise UserError(f"--arm {kind} needs --calibration: LeRobot's file, as lerobot-calibrate writes it")
     assert port

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
+from mjx_nero.deploy import children
 from mjx_nero.errors import UserError
 
 _MODULES = {"so101": "feetech", "so100": "feetech", "piper": "piper"}
@@ -30,8 +31,8 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
 
         driver["calibration"] = told["calibration"] = str(folder / "calibration.json")
         (folder / "calibration.json").write_text(json.dumps(feetech.calibration(metadata, kind)))
-    argv = [sys.executable, "-m", f"mjx_nero.deploy.emulators.{_MODULES[kind]}", json.dumps(told)]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    argv = children.command(f"mjx_nero.deploy.emulators.{_MODULES[kind]}", json.dumps(told))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": children.environment()}
     with subprocess.Popen(argv, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         try:
             if not (port := process.stdout.readline().strip()):

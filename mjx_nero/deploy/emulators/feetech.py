@@ -82,6 +82,7 @@ class Servos:
             for name, value in {**known, "homing_offset": entry["homing_offset"], "voltage": 120, "overload_torque": 80}.items():
                 self._put(entry["id"], name, value)
         self.plant.powered[:], self.plant.gears = False, _GEARS
+        self.plant.stiffen()
         self.refresh()
         for entry in self._calibration:
             self._put(entry["id"], "goal_position", self._get(entry["id"], "position"))

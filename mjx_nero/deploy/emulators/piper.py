@@ -2,9 +2,10 @@
 
     python -m mjx_nero.deploy.emulators.piper '{"model": "scene.mjb", ...}'
 
-prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted in ``torque_cuts``.
+prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted: ``torque_cuts``.
 """
 
+import contextlib
 import dataclasses
 import os
 import select
@@ -48,6 +49,7 @@ class Arm:
         self.plant, self.faults, self.torque_cuts = plant, BusFaults(), 0
         self._goal = plant.position()
         plant.powered[:] = False
+        plant.stiffen()
 
     def take(self, frame: int, data: bytes) -> None:
         """A frame from the runtime."""
@@ -102,7 +104,7 @@ class Port:
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self.name, self._bytes, self._open = f"slcan:{os.ttyname(self._slave)}", b"", False
+        self.name, self._bytes, self._left, self._open = f"slcan:{os.ttyname(self._slave)}", b"", b"", False
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Sends and takes frames until somebody says so, or until a file descriptor ends."""
@@ -131,12 +133,11 @@ class Port:
                     continue
 
     def _say(self, frames: list[tuple[int, bytes]]) -> None:
-        text = "".join(f"t{frame:03X}{len(data)}{data.hex().upper()}\r" for frame, data in frames)
-        if self._open and text:
-            try:
-                os.write(self._master, text.encode())
-            except BlockingIOError:  # nobody reads: a bus loses frames, too
-                return
+        """Sends frames; where nobody reads, they are lost, as on a bus, but none in its middle."""
+        if self._open and not self._left:
+            self._left = "".join(f"t{frame:03X}{len(data)}{data.hex().upper()}\r" for frame, data in frames).encode()
+        with contextlib.suppress(BlockingIOError):
+            self._left = self._left[os.write(self._master, self._left) if self._left else 0 :]
 
     def close(self) -> None:
         """Unplugs it."""

@@ -11,6 +11,7 @@ import numpy as np
 from mjx_nero.deploy.arm import Clock
 from mjx_nero.deploy.places import Sender
 
+_SLOW = 0.02  # [s], damping over stiffness
 _LONGEST = 0.5  # [s] that are caught up at once; a program that stood still longer finds the arm where it left it
 
 
@@ -79,6 +80,14 @@ class Plant:
         self._waiting.clear()
         self._begun = self._clock.now()
         self._tell()
+
+    def stiffen(self) -> None:
+        """Makes drives that follow slowly position servos: ten times as stiff, and critically damped."""
+        soft = -self._bias[:, 2] > _SLOW * self._gain
+        inertia = 1 / self.model.dof_invweight0[self._dof]
+        stiffness = np.where(soft, 10 * self._gain, self._gain)
+        damping = np.where(soft, 2 * np.sqrt(stiffness * inertia), -self._bias[:, 2])
+        self._gain, self._bias[:, 1], self._bias[:, 2] = stiffness, -stiffness, -damping
 
     def _couple(self) -> None:
         """Joints that follow others, where these have them."""
