@@ -14,6 +14,7 @@ COMMANDS = {
     "eval": ("mjx_nero.tools.eval", "main", "play and measure a policy or a controller"),
     "view": ("mjx_nero.tools.view", "main", "environments in a browser: watch them and take part"),
     "export": ("mjx_nero.tools.export", "main", "a policy as ONNX, with all that a runtime has to know"),
+    "deploy": ("mjx_nero.tools.deploy", "main", "an exported policy on an arm, real, emulated or simulated"),
     "robustness": ("mjx_nero.tools.robustness", "main", "a policy's success over the range of each parameter of the world"),
     "benchmark": ("mjx_nero.tools.benchmark", "main", "what this machine does in a second"),
     "results": ("mjx_nero.tools.results", "main", "how every environment learns, and what the policies that ship achieve"),

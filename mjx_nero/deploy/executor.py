@@ -326,6 +326,35 @@ class Executor:
         return self.last.copy()
 
 
+class Lag:
+    """What the drives of training make of targets: joints that follow like a first-order filter of damping over stiffness.
+
+    Its output is where the joints are meant to be, which arms with stiff drives are told and which limits are for. Drives like
+    those of training are told ``position + lead * velocity``, which is the target again.
+
+    Args:
+        seconds: damping over stiffness, of each joint.
+        dt: control step [s].
+
+    Attributes:
+        lead: [s].
+    """
+
+    def __init__(self, seconds: np.ndarray, dt: float):
+        self._share = 1 - np.exp(-dt / np.maximum(seconds, 1e-9))
+        self.lead = dt / self._share - dt
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, Any]) -> "Lag":
+        """Of an exported policy's drives."""
+        joints = metadata["joints"]
+        return cls(np.array(joints["damping"], float) / np.array(joints["stiffness"], float), float(metadata["control_dt"]))
+
+    def __call__(self, target: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Where the joints get to in a step towards a target, from where they are meant to be [rad or m]."""
+        return position + self._share * (target - position)
+
+
 def _kind(part: Any) -> Any:
     """The type of a part; None: it is none."""
     kind = part.get("type") if isinstance(part, Mapping) else None

@@ -21,6 +21,7 @@ class Policy:
     Attributes:
         metadata: what the file says: see ``docs/guides/deploy_onnx.md``.
         names: of the observations that ``act`` takes.
+        actions: how many numbers an action has.
 
     Raises:
         ValueError: the file's metadata are not what ``export`` writes; one line.
@@ -36,6 +37,7 @@ class Policy:
         (taken,), (given,) = self._session.get_inputs(), self._session.get_outputs()
         _check(self.metadata, taken.shape[-1], given.shape[-1])
         self.names = tuple(term["name"] for term in self.metadata["observations"])
+        self.actions = int(given.shape[-1])
         self.reset()
 
     def reset(self) -> None:

@@ -4,7 +4,7 @@ import inspect
 import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.runs.folder import versions
+from mjx_nero.sim import description
 from mjx_nero.types import UserError
 
 OPSET = 17  # of 2021: what embedded runtimes know, too
@@ -95,13 +96,7 @@ def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
     """Collects what a runtime needs beside the graph; docs/guides/deploy_onnx.md explains every field."""
-    robot, drives = env.cfg.robot, (env.cfg.robot.arm, env.cfg.robot.gripper)
-
-    def both(field: str) -> list[float]:
-        return [float(x) for drive in drives for x in getattr(drive, field)]
-
-    joints = [env.physics_model.joint(name) for name in robot.joints]
-    units = ["m" if joint.type[0] == 2 else "rad" for joint in joints]  # mjJNT_SLIDE
+    robot = env.cfg.robot
     return {
         "env": policy.meta["env"],
         "preset": policy.meta["preset"],
@@ -109,18 +104,9 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
         "robot_fingerprint": policy.meta.get("fingerprint"),
         "control_dt": env.dt,
         "physics_dt": env.cfg.sim.dt,
-        "joints": {
-            "names": list(robot.joints),
-            "units": units,
-            "home": both("home"),
-            "lower": [float(joint.range[0]) for joint in joints],
-            "upper": [float(joint.range[1]) for joint in joints],
-            "speed": both("speed"),
-            "effort": both("effort"),
-            "stiffness": both("stiffness"),
-            "damping": both("damping"),
-        },
-        "base": {"position": list(robot.base_pos), "quaternion_wxyz": list(robot.base_quat)},
+        **description.robot(robot),
+        "command": {"term": env.cfg.command.name, **_plain(env.cfg.command.params)},
+        "objects": {name: list(item.size) for name, item in env.cfg.scene.objects.items()},
         "observations": _observations(env),
         "actions": env.actions.describe(),
         "action_clip": env.cfg.action_clip or None,
@@ -138,9 +124,15 @@ def _observations(env: ManipulationEnv) -> list[dict[str, Any]]:
         size = int(np.prod(sizes[name].shape)) * term.history
         unit = re.search(r"\[(.+?)\]", says)
         late = {"history": term.history, "delay_steps": list(term.delay)}
-        out.append({"name": name, "start": start, "size": size, "units": unit and unit[1], "what": says, **late})
+        term_of = {"term": term.name, "params": _plain(term.params)}
+        out.append({"name": name, "start": start, "size": size, "units": unit and unit[1], "what": says, **term_of, **late})
         start += size
     return out
+
+
+def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
+    """A term's parameters as JSON has them; what JSON does not know, by its text."""
+    return json.loads(json.dumps(dict(params), default=str))
 
 
 def check(made: Any, policy: Policy, observations: int = 10_000, seed: int = 0) -> tuple[float, float]:

@@ -213,9 +213,9 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
     )
 
 
-def robot_model(robot: RobotCfg) -> mujoco.MjModel:
-    """Compiles the mounted robot alone, for kinematics."""
-    return _robot_spec(robot).compile()
+def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
+    """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that meet obstacles only."""
+    return _robot_spec(robot, whole).compile()
 
 
 def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:

@@ -1,0 +1,50 @@
+"""Arms behind their drivers. Each module imports what its bus needs when it is asked for."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_nero.deploy.arm import Arm, Clock
+from mjx_nero.deploy.executor import Lag
+from mjx_nero.errors import UserError
+
+KINDS = ("sim", "so101", "so100", "piper")
+
+
+_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper"}
+
+
+def check(kind: str, metadata: Mapping[str, Any]) -> None:
+    """Whether an arm is the robot of a policy.
+
+    Raises:
+        UserError: it is not, or there is no such arm.
+    """
+    if kind not in KINDS:
+        raise UserError(f"no arm {kind!r}: choose one of {', '.join(KINDS)}")
+    if (wanted := _ROBOTS.get(kind, metadata["robot"])) != metadata["robot"]:
+        raise UserError(f"the policy is for {metadata['robot']}, and --arm {kind} is a {wanted}")
+
+
+def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clock: Clock) -> Arm:
+    """A driver, not connected yet.
+
+    Args:
+        options: of the driver, as plain values: ``model`` and ``tracker`` of the simulated arm, ``port`` and ``calibration`` of
+            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper.
+
+    Raises:
+        UserError: there is no such arm, a package or file is missing, or it is another robot than the policy's.
+    """
+    check(kind, metadata)
+    joints = tuple(metadata["joints"]["names"])
+    if kind == "sim":
+        from mjx_nero.deploy.drivers import sim
+
+        return sim.of(metadata, joints, Lag.of(metadata).lead, clock, **options)
+    if kind in ("so101", "so100"):
+        from mjx_nero.deploy.drivers import so_arm
+
+        return so_arm.of(kind, metadata, clock, **options)
+    from mjx_nero.deploy.drivers import piper
+
+    return piper.of(metadata, clock, **options)

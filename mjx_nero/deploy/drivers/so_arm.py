@@ -1,0 +1,181 @@
+"""SO-ARM100 and SO-ARM101: Feetech servos, by LeRobot's calibration file.
+
+LeRobot counts a joint's degrees from the middle of its calibrated range, ``(raw - middle) * 360 / 4095``, and a gripper from 0,
+closed, to 100, open. The middle is the zero of the SO-ARM101's model. The SO-ARM100's model has other zeros: there the middle of
+the calibrated range is taken for the middle of the model's.
+"""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import ArmError, Clock, Feedback
+from mjx_nero.deploy.drivers import feetech
+from mjx_nero.errors import UserError
+
+_TURN = 4095 / (2 * np.pi)  # counts a radian, as LeRobot has it
+_WAIT = 0.03  # [s] for an answer
+_GRIP = 500  # of 1000: the gripper's torque, at most, as LeRobot has it
+_USUAL = {"p": 16, "i": 0, "d": 32}  # of LeRobot's follower, which the models' drives are for
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo:
+    """One joint's entry in the calibration file."""
+
+    id: int
+    homing_offset: int
+    range_min: int
+    range_max: int
+
+
+def read_calibration(path: pathlib.Path, joints: tuple[str, ...]) -> dict[str, Servo]:
+    """LeRobot's calibration file.
+
+    Raises:
+        UserError: there is none, or it is of another arm.
+    """
+    try:
+        text = path.read_bytes()[:100_000]
+        found = json.loads(text)
+        if missing := [name for name in joints if name not in found]:
+            raise UserError(f"{path} has no joint {', '.join(missing)}: it is of {', '.join(map(str, found))[:200]}")
+        out = {name: Servo(*(_count(found[name][field]) for field in _FIELDS)) for name in joints}
+        driven = {name: _count(found[name].get("drive_mode", 0)) for name in joints}
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path} is no calibration file of LeRobot: each joint has {', '.join(_FIELDS)}") from None
+    for name, servo in out.items():
+        if not 0 <= servo.range_min < servo.range_max <= 4095 or not 0 < servo.id < 254 or abs(servo.homing_offset) > 2047:
+            raise UserError(f"{path}: {name} has no range within 0 to 4095, or no id within 1 to 253: calibrate it again")
+        if driven[name]:
+            raise UserError(f"{path}: {name} has a drive_mode of its own, which nobody has tried here: calibrate it with 0")
+    if len({servo.id for servo in out.values()}) < len(out):
+        raise UserError(f"{path}: two joints have one id")
+    return out
+
+
+_FIELDS = ("id", "homing_offset", "range_min", "range_max")
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError("a whole number")
+    return value
+
+
+class SoArm:
+    """An arm of STS3215 servos. It writes torque, acceleration, goals and the gripper's torque limit: RAM, and nothing else.
+
+    Args:
+        port: of ``feetech.Bus``.
+    """
+
+    def __init__(self, kind: str, metadata: Mapping[str, Any], servos: Mapping[str, Servo], port: str, clock: Clock):
+        self.joints = tuple(metadata["joints"]["names"])
+        self._port, self._clock, self._servos = port, clock, [servos[name] for name in self.joints]
+        self.ids = [servo.id for servo in self._servos]
+        low, high = (np.array(metadata["joints"][name], float) for name in ("lower", "upper"))
+        first, last = (np.array([getattr(s, name) for s in self._servos], float) for name in ("range_min", "range_max"))
+        self._grips = np.array([name in metadata["gripper"] for name in self.joints])
+        middle = np.where(self._grips | (kind == "so100"), (low + high) / 2, 0.0)
+        self._middle, self._zero = (first + last) / 2, middle
+        self._scale = np.where(self._grips, (last - first) / (high - low), _TURN)  # counts a radian
+        self._first, self._last = first, last
+        self.notes: list[str] = []
+
+    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the calibration lets the joints do [rad]."""
+        return self._radians(self._first), self._radians(self._last)
+
+    def _radians(self, raw: np.ndarray) -> np.ndarray:
+        return (raw - self._middle) / self._scale + self._zero
+
+    def _raw(self, position: np.ndarray) -> np.ndarray:
+        return np.clip(np.rint((position - self._zero) * self._scale + self._middle), self._first, self._last).astype(int)
+
+    def connect(self) -> None:
+        """See ``Arm``. Compares the servos' EEPROM with the calibration file."""
+        import serial  # pyserial, of the extra ``deploy``
+
+        try:
+            port = serial.Serial(self._port, feetech.BAUD, timeout=_WAIT, write_timeout=_WAIT, exclusive=True)
+        except (serial.SerialException, ValueError, OSError) as error:
+            raise UserError(f"cannot open {self._port}: {error}") from None
+        self._bus = feetech.Bus(port)
+        for name, servo in zip(self.joints, self._servos, strict=True):
+            self._check(name, servo)
+
+    def _check(self, name: str, servo: Servo) -> None:
+        """One servo is the one that the file is of.
+
+        Raises:
+            UserError: it is not.
+        """
+        try:
+            model = self._bus.read(servo.id, "model")
+        except ArmError as error:
+            raise UserError(f"{name}: {error}: is the arm powered, and is {self._port} its port?") from None
+        if model != feetech.MODEL:
+            raise UserError(f"{name}: servo {servo.id} is of model {model}, not an STS3215 ({feetech.MODEL})")
+        for register, wanted in (
+            ("homing_offset", servo.homing_offset),
+            ("min_position", servo.range_min),
+            ("max_position", servo.range_max),
+            ("mode", 0),
+        ):
+            if (found := self._bus.read(servo.id, register)) != wanted:
+                raise UserError(
+                    f"{name}: servo {servo.id} has {register} {found}, the calibration file {wanted}: it is of another arm, or "
+                    "LeRobot has not written it yet (lerobot-calibrate does)"
+                )
+        for register, usual in _USUAL.items():
+            if (found := self._bus.read(servo.id, register)) != usual:
+                self.notes.append(f"{name} has {register.upper()} {found}, LeRobot's followers {usual}")
+
+    def engage(self) -> None:
+        """See ``Arm``: each goal is where the servo is, and only then there is torque."""
+        for servo, grips in zip(self._servos, self._grips, strict=True):
+            here = self._bus.read(servo.id, "position")
+            self._bus.write(servo.id, "acceleration", 254)  # none of its own: targets have theirs already
+            if grips and self._bus.read(servo.id, "torque_limit") > _GRIP:
+                self._bus.write(servo.id, "torque_limit", _GRIP)
+            self._bus.write(servo.id, "goal_position", min(max(here, servo.range_min), servo.range_max))
+            self._bus.write(servo.id, "torque_enable", 1)
+
+    def read(self) -> Feedback:
+        """See ``Arm``: one request for all servos."""
+        blocks = self._bus.read_all(self.ids, *feetech.STATE)
+        rows = [feetech.registers(blocks[i], ("position", "velocity", "load", "temperature")) for i in self.ids]
+        raw, speed, load, heat = (np.array([row[name] for row in rows], float) for name in rows[0])
+        return Feedback(self._clock.now(), self._radians(raw), speed / self._scale, load / 1000, heat)
+
+    def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """See ``Arm``: one request for all servos, which follow goals as stiffly as they can."""
+        goals = self._raw(position)
+        self._bus.write_all("goal_position", dict(zip(self.ids, goals.tolist(), strict=True)))
+        return self._radians(goals)
+
+    def close(self) -> None:
+        """See ``Arm``: torque stays on."""
+        self._bus.close()
+
+
+def of(kind: str, metadata: Mapping[str, Any], clock: Clock, port: str | None, calibration: str | None, **_: Any) -> SoArm:
+    """The arm at a port.
+
+    Raises:
+        UserError: there is no calibration file.
+    """
+    if not calibration:
+        raise UserError(f"--arm {kind} needs --calibration: LeRobot's file, as lerobot-calibrate writes it")
+    assert port
+    joints = tuple(metadata["joints"]["names"])
+    return SoArm(kind, metadata, read_calibration(pathlib.Path(calibration), joints), port, clock)

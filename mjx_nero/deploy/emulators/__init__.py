@@ -1,0 +1,74 @@
+"""Arms in software that speak the real ones' protocols, with MuJoCo behind them."""
+
+import contextlib
+import json
+import pathlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+from mjx_nero.deploy import children
+from mjx_nero.errors import UserError
+
+_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "piper"}
+
+
+@contextlib.contextmanager
+def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """An emulated arm in a process of its own; gives the options of the driver that talks to it.
+
+    Args:
+        options: ``model`` (a file), ``tracker``, ``objects``, and perhaps ``start``, ``faults`` and ``bus``.
+
+    Raises:
+        UserError: it does not start.
+    """
+    folder, driver = pathlib.Path(options["model"]).parent, {}
+    told = {"kind": kind, "metadata": {name: metadata[name] for name in ("joints", "gripper", "base", "robot")}, **options}
+    if _MODULES[kind] == "feetech":
+        from mjx_nero.deploy.emulators import feetech
+
+        driver["calibration"] = told["calibration"] = str(folder / "calibration.json")
+        (folder / "calibration.json").write_text(json.dumps(feetech.calibration(metadata, kind)))
+    argv = children.command(f"mjx_nero.deploy.emulators.{_MODULES[kind]}", json.dumps(told))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": children.environment()}
+    with subprocess.Popen(argv, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
+        try:
+            if not (port := process.stdout.readline().strip()):
+                raise UserError(f"the emulated {kind} did not start")
+            yield {"port": port, **driver}
+        finally:
+            process.stdin.close()
+            process.wait(10)
+
+
+class Port(Protocol):
+    """An emulated arm at a port of this machine."""
+
+    name: str
+
+    def serve(self, until: Callable[[], bool] = ..., other: int | None = ...) -> None: ...
+
+
+def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
+    """An emulator's process: makes the plant that ``started`` describes, says its port, and serves until its input ends."""
+    import dataclasses
+
+    import numpy as np
+
+    from mjx_nero.deploy.emulators.plant import Plant
+    from mjx_nero.deploy.guard import WallClock, urgent
+    from mjx_nero.deploy.places import sender
+
+    told = json.loads(sys.argv[1])
+    metadata, own = told["metadata"], told["metadata"]["joints"]
+    tracker = sender("127.0.0.1", told["tracker"]) if told.get("tracker") else None
+    start = np.array(told.get("start") or own["home"], float)
+    plant = Plant(pathlib.Path(told["model"]), own["names"], start, WallClock(), metadata["base"]["position"], tracker)
+    plant.faults = dataclasses.replace(plant.faults, **told.get("faults", {}))
+    plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
+    urgent()
+    port = port_of(plant, told)
+    print(port.name, flush=True)
+    port.serve(other=sys.stdin.fileno())

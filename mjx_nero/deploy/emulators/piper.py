@@ -1,0 +1,156 @@
+"""A Piper in software, behind a serial CAN adapter (SLCAN) in a pseudo-terminal: its frames, 200 times a second.
+
+    python -m mjx_nero.deploy.emulators.piper '{"model": "scene.mjb", ...}'
+
+prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted: ``torque_cuts``.
+"""
+
+import contextlib
+import dataclasses
+import os
+import select
+import struct
+import time
+import tty
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_nero.deploy.drivers import piper
+from mjx_nero.deploy.emulators.plant import Plant
+
+_PERIOD = 0.005  # [s] between feedbacks
+_FINGERS = 2
+
+
+@dataclasses.dataclass
+class BusFaults:
+    """What can go wrong, to be set while it runs.
+
+    Attributes:
+        cut: nothing is heard, nothing arrives.
+        mute: frames that are not sent.
+        status: of the arm, as 0x2A1 tells it.
+        bits: of each joint's state, from 1.
+        heat: of the motors [degrees C].
+    """
+
+    cut: bool = False
+    mute: frozenset[int] = frozenset()
+    status: int = 0
+    bits: dict[int, int] = dataclasses.field(default_factory=dict)
+    heat: int = 35
+
+
+class Arm:
+    """What the arm makes of frames, and the frames that it sends by itself."""
+
+    def __init__(self, plant: Plant):
+        self.plant, self.faults, self.torque_cuts = plant, BusFaults(), 0
+        self._goal = plant.position()
+        plant.powered[:] = False
+        plant.stiffen()
+
+    def take(self, frame: int, data: bytes) -> None:
+        """A frame from the runtime."""
+        if self.faults.cut:
+            return
+        if frame in piper.TARGETS and len(data) == 8:
+            k = 2 * piper.TARGETS.index(frame)
+            self._goal[k : k + 2] = np.array(struct.unpack(">ii", data)) * piper.MILLIDEGREE
+        elif frame == piper.GRIPPER and len(data) == 8:
+            half = struct.unpack(">i", data[:4])[0] * piper.MICROMETRE / 2
+            self._goal[6:] = half, -half
+            self._aim()
+        elif frame == piper.ENABLE and len(data) >= 2:
+            on = data[1] == piper.ON
+            self.torque_cuts += bool(self.plant.powered.any()) and not on
+            self.plant.powered[:] = on
+            self._aim()
+        elif frame == 0x150:  # stop and resume: the arm sinks
+            self.torque_cuts += 1
+
+    def _aim(self) -> None:
+        self.plant.advance()
+        self.plant.target(self._goal)
+
+    def frames(self) -> list[tuple[int, bytes]]:
+        """All of one round."""
+        self.plant.advance()
+        if self.faults.cut:
+            return []
+        q, v = self.plant.position(), self.plant.velocity()
+        counts = [int(x) for x in np.rint(q[:6] / piper.MILLIDEGREE)]
+        out = [(piper.STATUS, bytes([1, self.faults.status, 1, 0, 0, 0, 0, 0]))]
+        out += [(frame, struct.pack(">ii", *counts[2 * k : 2 * k + 2])) for k, frame in enumerate(piper.JOINTS)]
+        out.append((piper.GRIPPED, struct.pack(">ihBB", round((q[6] - q[7]) / piper.MICROMETRE), 0, 0x40, 0)))
+        for k in range(6):
+            speed = int(np.clip(round(1000 * v[k]), -32768, 32767))
+            out.append((piper.FAST[k], struct.pack(">hHi", speed, 500, 0)))
+            state = self.faults.bits.get(k + 1, 0) | (piper.ENABLED if self.plant.powered[k] else 0)
+            out.append((piper.SLOW[k], struct.pack(">HhbBH", 240, self.faults.heat, self.faults.heat, state, 0)))
+        return [(frame, data) for frame, data in out if frame not in self.faults.mute]
+
+
+class Port:
+    """The serial adapter: SLCAN's lines, ``t`` + three digits of the frame, its length, and its bytes in hexadecimal.
+
+    Attributes:
+        name: as ``--port`` takes it.
+    """
+
+    def __init__(self, arm: Arm):
+        self.arm = arm
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.name, self._bytes, self._left, self._open = f"slcan:{os.ttyname(self._slave)}", b"", b"", False
+
+    def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
+        """Sends and takes frames until somebody says so, or until a file descriptor ends."""
+        due = time.monotonic()
+        while not until():
+            watched = [self._master, *([] if other is None else [other])]
+            ready, _, _ = select.select(watched, [], [], max(0.0, due - time.monotonic()))
+            if other in ready and not os.read(other or 0, 1000):
+                return
+            if self._master in ready:
+                self._take(os.read(self._master, 4096))
+            if time.monotonic() >= due:
+                due = max(due + _PERIOD, time.monotonic())
+                self._say(self.arm.frames())
+
+    def _take(self, data: bytes) -> None:
+        *lines, self._bytes = (self._bytes + data).split(b"\r")
+        self._bytes = self._bytes[-64:]
+        for line in lines:
+            if line[:1] in (b"O", b"C"):
+                self._open = line[:1] == b"O"
+            elif line[:1] == b"t" and self._open:
+                try:
+                    self.arm.take(int(line[1:4], 16), bytes.fromhex(line[5:].decode()))
+                except ValueError:
+                    continue
+
+    def _say(self, frames: list[tuple[int, bytes]]) -> None:
+        """Sends frames; where nobody reads, they are lost, as on a bus, but none in its middle."""
+        if self._open and not self._left:
+            self._left = "".join(f"t{frame:03X}{len(data)}{data.hex().upper()}\r" for frame, data in frames).encode()
+        with contextlib.suppress(BlockingIOError):
+            self._left = self._left[os.write(self._master, self._left) if self._left else 0 :]
+
+    def close(self) -> None:
+        """Unplugs it."""
+        for end in (self._master, self._slave):
+            os.close(end)
+
+
+def main() -> None:
+    """The process."""
+    from mjx_nero.deploy.emulators import process
+
+    process(lambda plant, told: Port(Arm(plant)))
+
+
+if __name__ == "__main__":
+    main()

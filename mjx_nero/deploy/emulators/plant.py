@@ -1,0 +1,149 @@
+"""A scene in MuJoCo's C library that keeps up with a clock: what stands behind the simulated arm and the emulators."""
+
+import collections
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from mjx_nero.deploy.arm import Clock
+from mjx_nero.deploy.places import Sender
+
+_SLOW = 0.02  # [s], damping over stiffness
+_LONGEST = 0.5  # [s] that are caught up at once; a program that stood still longer finds the arm where it left it
+
+
+@dataclasses.dataclass
+class Faults:
+    """What can go wrong, to be set while it runs.
+
+    Attributes:
+        stalled: joints that stand still, by number.
+        late: from a target's arrival until it is in force [s].
+        stiffness: the drives', as a share of the model's.
+    """
+
+    stalled: frozenset[int] = frozenset()
+    late: float = 0.0
+    stiffness: float = 1.0
+
+
+class Plant:
+    """Position drives with objects around them.
+
+    Args:
+        model: compiled scene, or a file of one (``.mjb``) whose actuators are the drives.
+        joints: in the order of targets and readings.
+        start: where they are at first [rad or m].
+        base: of the robot's root frame in the world [m].
+        tracker: told where objects are after every advance.
+
+    Attributes:
+        faults: what is wrong with the arm.
+        powered: which drives have torque.
+        gears: how hard the others are to turn [N m s/rad].
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel | pathlib.Path,
+        joints: Sequence[str],
+        start: np.ndarray,
+        clock: Clock,
+        base: Sequence[float] = (0.0, 0.0, 0.0),
+        tracker: Sender | None = None,
+    ):
+        self.model = model if isinstance(model, mujoco.MjModel) else mujoco.MjModel.from_binary_path(str(model))
+        self.data, self._clock, self._base, self._tracker = mujoco.MjData(self.model), clock, np.asarray(base, float), tracker
+        m, ids = self.model, [self.model.joint(name).id for name in joints]
+        self._qpos, self._dof = m.jnt_qposadr[ids], m.jnt_dofadr[ids]
+        self._act = np.array([int(np.flatnonzero(m.actuator_trnid[:, 0] == j)[0]) for j in ids])
+        self._gain, self._bias = m.actuator_gainprm[self._act, 0].copy(), m.actuator_biasprm[self._act].copy()
+        self._effort = np.abs(m.actuator_forcerange[self._act]).max(axis=1)
+        free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        self.objects = {m.joint(j).name: int(m.jnt_qposadr[j]) for j in free}
+        self.faults, self.powered, self.gears = Faults(), np.ones(len(ids), bool), 0.0
+        self._waiting: collections.deque[tuple[float, np.ndarray]] = collections.deque()
+        self.reset(start)
+
+    def reset(self, start: np.ndarray, objects: dict[str, np.ndarray] | None = None) -> None:
+        """The arm at rest somewhere, its drives told to stay; objects at positions [m] in the root frame."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._qpos] = self._targets = np.array(start, float)
+        self._couple()
+        for name, position in (objects or {}).items():
+            self.data.qpos[self.objects[name] :][:3] = position + self._base
+        self.data.ctrl[self._act] = self._targets
+        mujoco.mj_forward(self.model, self.data)
+        self._waiting.clear()
+        self._begun = self._clock.now()
+        self._tell()
+
+    def stiffen(self) -> None:
+        """Makes drives that follow slowly position servos: ten times as stiff, and critically damped."""
+        soft = -self._bias[:, 2] > _SLOW * self._gain
+        inertia = 1 / self.model.dof_invweight0[self._dof]
+        stiffness = np.where(soft, 10 * self._gain, self._gain)
+        damping = np.where(soft, 2 * np.sqrt(stiffness * inertia), -self._bias[:, 2])
+        self._gain, self._bias[:, 1], self._bias[:, 2] = stiffness, -stiffness, -damping
+
+    def _couple(self) -> None:
+        """Joints that follow others, where these have them."""
+        m, q = self.model, self.data.qpos
+        for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+            if m.eq_obj2id[e] >= 0:
+                follower, leader = (int(m.jnt_qposadr[j]) for j in (m.eq_obj1id[e], m.eq_obj2id[e]))
+                powers = (q[leader] - m.qpos0[leader]) ** np.arange(5)
+                q[follower] = m.qpos0[follower] + powers @ m.eq_data[e, :5]
+
+    def advance(self) -> None:
+        """Catches up with the clock."""
+        now = self._clock.now() - self._begun
+        if now - self.data.time > _LONGEST:
+            self._begun += now - self.data.time - _LONGEST
+            now = self.data.time + _LONGEST
+        if now < self.data.time + self.model.opt.timestep:
+            return
+        self._set_drives()
+        still, stalled = self.data.qpos[self._qpos].copy(), sorted(self.faults.stalled)
+        while self.data.time + self.model.opt.timestep <= now + 1e-9:
+            while self._waiting and self._waiting[0][0] <= self.data.time + 1e-9:
+                self._targets = self._waiting.popleft()[1]
+            self.data.ctrl[self._act] = self._targets
+            mujoco.mj_step(self.model, self.data)
+            if stalled:
+                self.data.qpos[self._qpos[stalled]], self.data.qvel[self._dof[stalled]] = still[stalled], 0.0
+        self._tell()
+
+    def _set_drives(self) -> None:
+        """Their stiffness and power now."""
+        m, share = self.model, np.where(self.powered, self.faults.stiffness, 0.0)
+        m.actuator_gainprm[self._act, 0], m.actuator_biasprm[self._act, 1] = self._gain * share, self._bias[:, 1] * share
+        m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], -self.gears)
+
+    def _tell(self) -> None:
+        if self._tracker:
+            for name, at in self.objects.items():
+                self._tracker(name, self.data.qpos[at:][:3] - self._base, self.data.qpos[at:][3:7])
+
+    def place(self, name: str) -> np.ndarray:
+        """An object's position in the root frame [m]."""
+        return self.data.qpos[self.objects[name] :][:3] - self._base
+
+    def position(self) -> np.ndarray:
+        """Of the joints, now [rad or m]."""
+        return self.data.qpos[self._qpos].copy()
+
+    def velocity(self) -> np.ndarray:
+        """Of the joints, now [rad/s or m/s]."""
+        return self.data.qvel[self._dof].copy()
+
+    def load(self) -> np.ndarray:
+        """Shares of the torque that the drives have, signed."""
+        return self.data.actuator_force[self._act] / self._effort
+
+    def target(self, targets: np.ndarray) -> None:
+        """New targets of the drives, in force after what ``faults.late`` says [rad or m]."""
+        self._waiting.append((self._clock.now() - self._begun + self.faults.late, np.array(targets, float)))

@@ -1,0 +1,172 @@
+"""An arm behind its safety layer and its log: all that the runtime ever talks to."""
+
+import contextlib
+import os
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Arm, ArmError, Clock, Feedback
+from mjx_nero.deploy.log import Log
+from mjx_nero.deploy.safety import Command, Fault, Safety
+
+
+class WallClock:
+    """Seconds of ``time.monotonic``."""
+
+    _SPIN = 5e-4  # [s] that are waited for awake: sleep is up to some tenths of a millisecond late
+
+    def now(self) -> float:
+        """See ``Clock``."""
+        return time.monotonic()
+
+    def sleep_until(self, time_: float) -> None:
+        """See ``Clock``."""
+        if (left := time_ - time.monotonic() - self._SPIN) > 0:
+            time.sleep(left)
+        while time.monotonic() < time_:
+            pass
+
+
+def urgent() -> None:
+    """Lets this process run before others, where the system lets it."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
+class Guarded(Protocol):
+    """What the loop sees of an arm, be it in this process or in one of its own.
+
+    Attributes:
+        fault: why it holds; None: it does not.
+        sent: when the last command was sent [s].
+    """
+
+    fault: Fault | None
+    sent: float
+
+    def start(self, anywhere: bool = False) -> Feedback: ...
+    def read(self) -> Feedback: ...
+    def command(self, target: np.ndarray, notes: Sequence[float] = ()) -> Command: ...
+    def hold(self, fault: Fault) -> None: ...
+    def close(self) -> None: ...
+
+
+class Guard:
+    """An arm in this process.
+
+    Args:
+        log: of what is read and sent; None: none.
+    """
+
+    def __init__(self, arm: Arm, safety: Safety, clock: Clock, log: Log | None = None):
+        self.arm, self.safety, self.clock, self.log = arm, safety, clock, log
+        self.sent = 0.0
+        self._last: Feedback | None = None
+
+    @property
+    def fault(self) -> Fault | None:
+        """See ``Guarded``."""
+        return self.safety.fault
+
+    def start(self, anywhere: bool = False) -> Feedback:
+        """Reads the arm, and from then on commands it.
+
+        Raises:
+            UserError: it is far from home, or at fault already.
+            ArmError: it does not answer.
+        """
+        self._last = feedback = self.arm.read()
+        self.safety.begin(feedback, self.clock.now(), anywhere)
+        return feedback
+
+    def read(self) -> Feedback:
+        """The newest feedback, checked; where the bus fails, the one before."""
+        assert self._last is not None, "start first"
+        try:
+            self._last = self.arm.read()
+        except ArmError as error:
+            self.safety.hold(Fault("bus", str(error)))
+        self.safety.check(self._last, self.clock.now())
+        if self.log:
+            self.log.read(self._last)
+        return self._last
+
+    def command(self, target: np.ndarray, notes: Sequence[float] = ()) -> Command:
+        """Sends the nearest safe command to a target [rad or m]; after a fault, what brakes and holds.
+
+        Args:
+            notes: for the log: when inference began and ended [s], and the action.
+        """
+        command = self.safety.step(target)
+        told = command.position
+        try:
+            told = self.arm.command(command.position, command.velocity)
+        except ArmError as error:
+            self.safety.lost(Fault("bus", str(error)))
+        self.sent = self.clock.now()
+        if self.log:
+            self.log.sent(self.sent, told, command, self.fault, notes)
+        return command
+
+    def hold(self, fault: Fault) -> None:
+        """The arm brakes and holds from the next command on."""
+        self.safety.hold(fault)
+
+    def settle(self) -> None:
+        """Brakes to rest, at the pace of commands."""
+        self.hold(Fault("stop", "the end"))
+        for _ in range(1000):
+            due = self.clock.now() + self.safety.limits.dt
+            self.command(self.safety.position)
+            if self.safety.at_rest:
+                return
+            self.clock.sleep_until(due)
+
+    def close(self) -> None:
+        """Brakes to rest, and leaves the arm holding there."""
+        if self._last is not None:
+            self.settle()
+        self.arm.close()
+        if self.log:
+            self.log.close()
+
+
+class Dry:
+    """An arm that is read, and never told anything: from the first command on it seems to be where it was sent.
+
+    Args:
+        say: shown each command.
+    """
+
+    def __init__(self, arm: Arm, say=print):
+        self.arm, self.joints, self._say = arm, arm.joints, say
+        self._at: tuple[np.ndarray, np.ndarray] | None = None
+
+    def connect(self) -> None:
+        """See ``Arm``; the drives stay as they are."""
+        self.arm.connect()
+
+    def ranges(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """See ``Arm``."""
+        return self.arm.ranges()
+
+    def engage(self) -> None:
+        """Leaves the drives as they are."""
+
+    def read(self) -> Feedback:
+        """See ``Arm``."""
+        seen = self.arm.read()
+        return seen if self._at is None else Feedback(seen.time, *self._at, seen.load, seen.temperature)
+
+    def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Shows what would be sent."""
+        self._at = position.copy(), velocity.copy()
+        self._say(" ".join(f"{name} {x:+.3f}" for name, x in zip(self.joints, position, strict=True)))
+        return position
+
+    def close(self) -> None:
+        """See ``Arm``."""
+        self.arm.close()

@@ -1,0 +1,73 @@
+"""The log of a run: the table that ``identify`` reads, with the gripper, velocities, actions and times in columns of their own.
+
+    time,target.joint1,...,position.joint1,...,velocity.joint1,...,inferring,inferred,limited,held,action.0,...
+
+A row is written when feedback was read, and one when a command was sent; all times are seconds since the log began.
+``target`` is what the drives were told. Rows are written as they come, so that a log ends where its program did.
+"""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Feedback
+from mjx_nero.deploy.safety import Command, Fault
+from mjx_nero.errors import UserError
+
+
+class Log:
+    """Writes a run's table.
+
+    Args:
+        joints: all, in the order of the arrays.
+        start: targets in force at the beginning [rad or m].
+        begun: time of the beginning [s].
+        actions: how many numbers an action has.
+        notes: lines for its head.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+
+    def __init__(
+        self, path: pathlib.Path, joints: Sequence[str], start: np.ndarray, begun: float, actions: int, notes: Sequence[str] = ()
+    ):
+        self._n, self._begun, self._actions, self._last = len(joints), begun, actions, -1e-6
+        columns = [f"{what}.{j}" for what in ("target", "position", "velocity") for j in joints]
+        head = ["time", *columns, "inferring", "inferred", "limited", "held", *(f"action.{i}" for i in range(actions))]
+        try:
+            self._file = open(path, "w", buffering=1)
+            self._file.writelines(f"# {' '.join(note.split())}\n" for note in notes)
+            self._file.write(",".join(head) + "\n")
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror or error}") from None
+        self._row(begun, start, None, None)
+
+    def read(self, feedback: Feedback) -> None:
+        """A row of what was read."""
+        if feedback.time > self._begun + self._last:  # what was told before is no news
+            self._row(feedback.time, None, feedback.position, feedback.velocity)
+
+    def sent(self, time: float, told: np.ndarray, command: Command, fault: Fault | None, notes: Sequence[float]) -> None:
+        """A row of what was sent.
+
+        Args:
+            notes: when inference began and ended [s], then the action.
+        """
+        times = [f"{t - self._begun:.6f}" for t in notes[:2]] or ["", ""]
+        action = [f"{x:.6g}" for x in notes[2:]] or [""] * self._actions
+        self._row(time, told, None, None, [*times, "+".join(command.limited), fault.kind if fault else "", *action])
+
+    def _row(
+        self, time: float, told: np.ndarray | None, at: np.ndarray | None, speed: np.ndarray | None, rest: Sequence[str] = ()
+    ) -> None:
+        self._last = max(time - self._begun, self._last + 1e-6)  # a reader wants times that ascend
+        cells = [f"{self._last:.7f}"]
+        for values in (told, at, speed):
+            cells += [""] * self._n if values is None else [f"{x:.7g}" for x in values]
+        self._file.write(",".join([*cells, *(rest or [""] * (4 + self._actions))]) + "\n")
+
+    def close(self) -> None:
+        """Ends the file."""
+        self._file.close()

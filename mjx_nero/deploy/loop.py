@@ -1,0 +1,171 @@
+"""The loop: at the policy's rate, from feedback to a safe command; and what it has to say about its timing."""
+
+import dataclasses
+import gc
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Clock, Feedback
+from mjx_nero.deploy.executor import Lag
+from mjx_nero.deploy.guard import Guarded
+from mjx_nero.deploy.observe import Observer
+from mjx_nero.deploy.policy import Policy
+from mjx_nero.deploy.safety import Fault
+
+Stop = Callable[[], Fault | None]
+
+
+class Brain(Policy):
+    """A policy with its chain of actions, its drives' lag and its observations: from feedback to where the joints are to be."""
+
+    def warm(self) -> None:
+        """Runs the network once, which takes longer than every time after."""
+        self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]})
+        gc.collect()
+
+    def begin(self, observer: Observer, feedback: Feedback) -> None:
+        """A new episode, from where the joints are."""
+        self.reset()
+        self._observer, self._lag = observer, Lag.of(self.metadata)
+        self._executor = self.executor(feedback.position)
+        self.action = np.zeros(len(self._executor.home_action))
+        self._meant = np.array(feedback.position, float)
+
+    def __call__(self, feedback: Feedback, now: float) -> np.ndarray:
+        """Where the joints are to be next [rad or m].
+
+        Raises:
+            ValueError: an object is not seen, or an observation or the action is not finite.
+        """
+        seen = self._observer(feedback, self._executor.last, self.action, now)
+        action = np.asarray(self.act(seen), float)
+        if not np.all(np.isfinite(action)):
+            raise ValueError("the policy's action is not finite")
+        self.action = action
+        return self._lag(self._executor(self.action, feedback.position), self._meant)
+
+    def sent(self, position: np.ndarray) -> None:
+        """What the safety layer made of it: from there the joints go on."""
+        self._meant = position
+
+
+@dataclasses.dataclass
+class Timing:
+    """What cycles took [s], each; ``missed``: the cycles that were late, and by how much."""
+
+    jitter: list[float] = dataclasses.field(default_factory=list)
+    read: list[float] = dataclasses.field(default_factory=list)
+    infer: list[float] = dataclasses.field(default_factory=list)
+    send: list[float] = dataclasses.field(default_factory=list)
+    missed: list[tuple[int, float]] = dataclasses.field(default_factory=list)
+
+    def summary(self) -> dict[str, float]:
+        """Medians and 99th percentiles [ms], and counts."""
+        out: dict[str, float] = {"cycles": len(self.jitter), "missed": len(self.missed)}
+        for name in ("jitter", "read", "infer", "send"):
+            values = getattr(self, name)
+            if values:
+                out |= {f"{name}_p{p}_ms": round(1e3 * float(np.percentile(values, p)), 3) for p in (50, 99)}
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """How a run ended. ``fault``: why the arm holds; the end of its time is one, too."""
+
+    fault: Fault
+    timing: Timing
+    limited: Mapping[str, int]
+
+
+def run(arm: Guarded, brain: Brain, observer: Observer, clock: Clock, seconds: float, stop: Stop, misses: int = 5) -> Report:
+    """Runs a policy until its time is over, somebody stops it, or something fails. Then the arm holds.
+
+    Args:
+        seconds: at most.
+        stop: asked every cycle; a fault ends the run.
+        misses: so many late cycles in a row end it, too.
+    """
+    dt = float(brain.metadata["control_dt"])
+    gc.disable()  # a collection takes longer than the jitter that is allowed
+    brain.begin(observer, arm.read())
+    timing, limited, late, k = Timing(), dict[str, int](), 0, 0
+    begun = clock.now()
+    try:
+        while arm.fault is None:
+            due = begun + k * dt
+            clock.sleep_until(due)
+            if ending := stop() or (Fault("stop", "its time is over") if k * dt >= seconds else None):
+                arm.hold(ending)
+                break
+            for name in _cycle(arm, brain, clock, due, timing):
+                limited[name] = limited.get(name, 0) + 1
+            k += 1
+            over = clock.now() - (begun + k * dt)
+            late = late + 1 if over > 0 else 0
+            if over > 0:
+                timing.missed.append((k - 1, over))
+                k += int(over / dt)  # what is past is past
+            if late >= misses:
+                arm.hold(Fault("deadline", f"{late} cycles in a row were late"))
+    finally:
+        gc.enable()
+    return Report(arm.fault or Fault("stop", "its time is over"), timing, limited)
+
+
+def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing) -> tuple[str, ...]:
+    """One step; which limits acted."""
+    started = clock.now()
+    feedback = arm.read()
+    inferring = clock.now()
+    try:
+        target = brain(feedback, inferring)
+    except ValueError as error:
+        arm.hold(Fault("object" if type(error) is not ValueError else "nan", str(error)))
+        target = feedback.position
+    inferred = clock.now()
+    command = arm.command(target, (inferring, inferred, *brain.action))
+    brain.sent(command.position)
+    timing.jitter.append(started - due)
+    timing.read.append(inferring - started)
+    timing.infer.append(inferred - inferring)
+    timing.send.append(clock.now() - inferred)
+    return command.limited
+
+
+def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop, share: float = 0.2, patience: float = 2.0) -> Fault | None:
+    """Moves an arm home in a straight line of its joints, slowly.
+
+    Args:
+        limits: ``safety.Limits`` of the arm.
+        share: of the joints' speeds, at most.
+        patience: how long it may make no way [s].
+
+    Returns:
+        why it stopped short; None: it is there.
+    """
+    at, home, dt = arm.read().position, limits.home, limits.dt
+    begun, moved = clock.now(), clock.now()
+    k = 0
+    while arm.fault is None:
+        clock.sleep_until(begun + k * dt)
+        k += 1
+        if ending := stop():
+            arm.hold(ending)
+            break
+        arm.read()
+        way = home - at
+        longest = float(np.max(np.abs(way) / (limits.speed * share * dt)))
+        there = arm.command(at + way / max(longest, 1.0)).position
+        if np.max(np.abs(home - there)) < 1e-4:
+            return arm.fault
+        if np.max(np.abs(there - at)) > 1e-5:
+            moved = clock.now()
+        if clock.now() - moved > patience:
+            return Fault(
+                "fence", "there is something in the straight way home: move the arm by hand, or give another --workspace"
+            )
+        at = there
+    return arm.fault

@@ -1,0 +1,235 @@
+"""Where objects are, as something outside says: a constant, a file, or datagrams and lines of a tracker.
+
+One message is one JSON object, of at most 4,096 bytes, in the robot's root frame (that of the base link, unturned):
+
+    {"object": "cube", "position": [0.35, 0.02, 0.015], "quaternion": [1, 0, 0, 0]}
+
+``object`` may be left out where there is one, ``quaternion`` (wxyz) where nobody needs it. A file holds one message, or a list.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import pathlib
+import socket
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from mjx_nero.errors import UserError
+
+LONGEST = 4096  # bytes of a message
+_FAR = 10.0  # [m] beyond which nothing is seen
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Position [m] and orientation (wxyz) in the robot's root frame."""
+
+    position: np.ndarray
+    quaternion: np.ndarray
+
+
+class Lost(ValueError):
+    """An object is not seen, or was too long ago."""
+
+
+class Places(Protocol):
+    """A source of places."""
+
+    def find(self, name: str, now: float) -> Place:
+        """Where an object is.
+
+        Args:
+            now: [s].
+
+        Raises:
+            Lost: nobody knows.
+        """
+
+    def close(self) -> None:
+        """Lets sockets go."""
+
+
+def parse(text: bytes | str) -> list[tuple[str | None, Place]]:
+    """The messages in a text.
+
+    Raises:
+        ValueError: it holds something else.
+    """
+    if len(text) > LONGEST:
+        raise ValueError(f"longer than {LONGEST} bytes")
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError("not JSON") from None
+    return [_message(item) for item in (found if isinstance(found, list) else [found])]
+
+
+def _message(item: Any) -> tuple[str | None, Place]:
+    if not isinstance(item, Mapping) or "position" not in item:
+        raise ValueError("no position in it")
+    name = item.get("object")
+    if not (name is None or isinstance(name, str)):
+        raise ValueError("object takes a name")
+    position, quat = _numbers(item["position"], 3), _numbers(item.get("quaternion", [1, 0, 0, 0]), 4)
+    if np.abs(position).max() > _FAR or not 0.99 < np.linalg.norm(quat) < 1.01:
+        raise ValueError(f"position takes metres up to {_FAR:g}, and quaternion has length 1 (wxyz)")
+    return name, Place(position, quat)
+
+
+def _numbers(value: Any, count: int) -> np.ndarray:
+    right = isinstance(value, list) and len(value) == count
+    if not right or not all(isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in value):
+        raise ValueError(f"takes {count} numbers")
+    return np.array(value, float)
+
+
+class Known:
+    """Places that were said, each with its time.
+
+    Args:
+        fresh: how long a place holds [s].
+    """
+
+    def __init__(self, fresh: float = math.inf):
+        self.fresh, self.refused = fresh, 0
+        self._places: dict[str | None, tuple[float, Place]] = {}
+
+    def say(self, text: bytes | str, now: float) -> None:
+        """Takes a message; what is none is counted in ``refused``."""
+        try:
+            self._places.update({name: (now, place) for name, place in parse(text)})
+        except ValueError:
+            self.refused += 1
+
+    def find(self, name: str, now: float) -> Place:
+        """See ``Places``."""
+        told, place = self._places.get(name) or self._places.get(None) or (-math.inf, None)
+        if place is None:
+            raise Lost(f"nobody has said where the {name} is")
+        if now - told > self.fresh:
+            raise Lost(f"the {name} was last seen {now - told:.1f} s ago")
+        return place
+
+    def close(self) -> None:
+        """Nothing to let go."""
+
+
+class FromFile(Known):
+    """A file that another program replaces as it likes.
+
+    Raises:
+        UserError: it cannot be read now, or holds no place.
+    """
+
+    def __init__(self, path: pathlib.Path):
+        super().__init__()
+        self._path, self._stamp = path, -1
+        try:
+            parse(path.read_bytes())
+        except OSError as error:
+            raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+        except ValueError as error:
+            raise UserError(f"{path} holds no place of an object: {error}") from None
+
+    def find(self, name: str, now: float) -> Place:
+        """See ``Places``."""
+        with contextlib.suppress(OSError):  # it is being replaced
+            if (stamp := self._path.stat().st_mtime_ns) != self._stamp:
+                self.say(self._path.read_bytes(), now)
+                self._stamp = stamp
+        return super().find(name, now)
+
+
+class FromSocket(Known):
+    """A tracker's datagrams, to ``udp://HOST:PORT``, or lines, from ``tcp://HOST:PORT``; the newest counts.
+
+    Raises:
+        UserError: the address is taken, or nobody is there.
+    """
+
+    def __init__(self, kind: str, host: str, port: int, fresh: float = 0.5):
+        super().__init__(fresh)
+        self._lines, self._rest = kind == "tcp", b""
+        try:
+            if self._lines:
+                self._socket = socket.create_connection((host, port), timeout=2.0)
+            else:
+                self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._socket.bind((host, port))
+        except OSError as error:
+            raise UserError(f"no place of an object from {kind}://{host}:{port}: {error.strerror or error}") from None
+        self._socket.setblocking(False)
+        self.port = self._socket.getsockname()[1]
+
+    def find(self, name: str, now: float) -> Place:
+        """See ``Places``."""
+        for text in self._news():
+            self.say(text, now)
+        return super().find(name, now)
+
+    def _news(self) -> list[bytes]:
+        """What has come since, the oldest first."""
+        found: list[bytes] = []
+        for _ in range(1000):  # of a sender that never stops, so much a step
+            try:
+                chunk = self._socket.recv(LONGEST + 1)
+            except OSError:
+                break
+            if self._lines and not chunk:
+                break
+            found.append(chunk)
+        if self._lines:
+            *found, self._rest = (self._rest + b"".join(found)).split(b"\n")
+            self._rest = self._rest[-LONGEST:]
+        return [text for text in found if text.strip()]
+
+    def close(self) -> None:
+        """See ``Places``."""
+        self._socket.close()
+
+
+def of(text: str) -> Places:
+    """The source that a flag names: ``0.35,0.02,0.015``, a file's path, ``udp://HOST:PORT`` or ``tcp://HOST:PORT``.
+
+    Raises:
+        UserError: it is none of these.
+    """
+    kind, separator, rest = text.partition("://")
+    if separator:
+        host, _, port = rest.rpartition(":")
+        if kind not in ("udp", "tcp") or not host or not port.isdecimal() or not 0 <= int(port) < 65536:
+            raise UserError(f"an address is udp://HOST:PORT or tcp://HOST:PORT, got {text[:80]!r}")
+        return FromSocket(kind, host, int(port))
+    return _constant(text) or FromFile(pathlib.Path(text))
+
+
+def _constant(text: str) -> Known | None:
+    try:
+        numbers = [float(x) for x in text.split(",")]
+    except ValueError:
+        return None
+    known = Known()
+    known.say(json.dumps({"position": numbers[:3], **({"quaternion": numbers[3:]} if len(numbers) > 3 else {})}), 0.0)
+    if known.refused:
+        raise UserError(f"an object's place is x,y,z [m], or these and an orientation w,x,y,z, got {text[:80]!r}")
+    return known
+
+
+Sender = Callable[[str, np.ndarray, np.ndarray], None]
+
+
+def sender(host: str, port: int) -> Sender:
+    """Sends places as such datagrams: ``(name, position, quaternion)``."""
+    out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    out.setblocking(False)
+
+    def send(name: str, position: np.ndarray, quaternion: np.ndarray) -> None:
+        message = {"object": name, "position": position.tolist(), "quaternion": quaternion.tolist()}
+        with contextlib.suppress(OSError):  # nobody listens
+            out.sendto(json.dumps(message).encode(), (host, port))
+
+    return send

@@ -1,0 +1,62 @@
+"""Arms for the tests of the runtime: what a policy says of a robot, a clock that stands still, an arm without physics."""
+
+import json
+
+import numpy as np
+
+from mjx_nero.deploy.arm import ArmError, Feedback
+from mjx_nero.envs import registry
+from mjx_nero.sim import description
+
+
+def metadata(name, dt=0.02):
+    """The part of a policy's metadata that is about its robot."""
+    told = {**description.robot(registry.robot(name)), "robot": name, "control_dt": dt, "command": {}, "objects": {}}
+    return json.loads(json.dumps(told))
+
+
+class Clock:
+    """Time passes where somebody waits."""
+
+    def __init__(self):
+        self.time = 100.0
+
+    def now(self):
+        return self.time
+
+    def sleep_until(self, time):
+        self.time = max(self.time, time)
+
+
+class Ideal:
+    """An arm that is at once where it is told to be; ``told`` has what was sent. There is no way to ask it to cut torque."""
+
+    def __init__(self, joints, home, clock):
+        self.joints, self.clock = joints, clock
+        self.at, self.told, self.broken = np.array(home, float), [], ""
+        self.bend = lambda feedback: feedback
+
+    def connect(self):
+        pass
+
+    def ranges(self):
+        return None
+
+    def engage(self):
+        pass
+
+    def read(self):
+        if "read" in self.broken:
+            raise ArmError("no answer")
+        still = np.zeros(len(self.at))
+        return self.bend(Feedback(self.clock.now(), self.at.copy(), still, still, still + 30.0))
+
+    def command(self, position, velocity):
+        if "send" in self.broken:
+            raise ArmError("the cable is cut")
+        self.at = position.copy()
+        self.told.append(position.copy())
+        return position
+
+    def close(self):
+        pass

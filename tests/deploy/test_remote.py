@@ -1,0 +1,154 @@
+"""The arm's own process: what becomes of the arm when the policy's process is killed or frozen, and when its own is."""
+
+import csv
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from mjx_nero.deploy.arm import ArmError
+from mjx_nero.deploy.remote import Remote
+from mjx_nero.deploy.safety import Fault
+from mjx_nero.deploy.server import Spec
+from mjx_nero.errors import UserError
+
+# A policy's process that swings a joint until it is killed.
+SWING = """
+import json, sys, time
+import numpy as np
+from mjx_nero.deploy.remote import Remote
+from mjx_nero.deploy.server import Spec
+remote = Remote(Spec(**json.loads(sys.argv[1])))
+remote.ready()
+at = remote.start(actions=0).position
+begun = time.monotonic()
+print(remote.pid, flush=True)
+while remote.fault is None:
+    at[0] = 0.5 * np.sin(3 * (time.monotonic() - begun))
+    remote.read()
+    remote.command(at)
+    time.sleep(0.02)
+print("fault", remote.fault.kind, flush=True)
+remote.close()
+"""
+
+
+@pytest.fixture
+def spec(lift, told, tmp_path):
+    kept = {name: told[name] for name in ("joints", "gripper", "body", "base", "regions", "command", "control_dt", "robot")}
+    return Spec("sim", {"model": str(lift / "scene.mjb")}, kept, log=str(tmp_path / "log.csv"))
+
+
+def rows(spec):
+    with open(spec.log) as file:
+        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+
+def wait_for(what, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def gone(pid):
+    try:
+        return pathlib.Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+@pytest.fixture
+def swinging(spec):
+    process = subprocess.Popen([sys.executable, "-c", SWING, json.dumps(vars(spec))], stdout=subprocess.PIPE, text=True)
+    arm = int(process.stdout.readline())
+    yield process, arm
+    process.kill()
+    process.wait()
+    wait_for(lambda: gone(arm))
+
+
+def targets(table):
+    return [float(row["target.shoulder_pan"]) for row in table if row["target.shoulder_pan"]]
+
+
+def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec):
+    process, arm = swinging
+    time.sleep(0.6)
+    process.kill()
+    wait_for(lambda: gone(arm))  # it left by itself
+    table = rows(spec)
+    held = [row for row in table if row["held"]]
+    last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
+    assert held[0]["held"] == "silence" and float(held[0]["time"]) - last < 0.1
+    steps = np.abs(np.diff(targets(table)))
+    # What the drives are told leads by their lag, some milliradians.
+    assert steps.max() <= 1.5 * 0.02 + 1e-4 and steps[-1] < 1e-4 and len(held) <= 5
+
+
+def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swinging, spec):
+    process, arm = swinging
+    time.sleep(0.6)
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(0.5)
+    table = rows(spec)
+    last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
+    first = next(float(row["time"]) for row in table if row["held"])
+    assert first - last < 0.13  # a tenth, and what a busy machine adds
+    assert not gone(arm) and targets(table)[-1] == pytest.approx(targets(table)[-2], abs=1e-4)
+    process.send_signal(signal.SIGCONT)  # nothing resumes
+    assert process.stdout.readline() == "fault silence\n"
+    process.wait(10)
+    assert targets(rows(spec))[-1] == targets(table)[-1]
+
+
+def test_ctrl_c_does_not_reach_the_arms_process(swinging):
+    process, arm = swinging
+    os.kill(arm, signal.SIGINT)
+    time.sleep(0.3)
+    assert not gone(arm) and process.poll() is None
+
+
+def test_an_arm_whose_process_is_killed_is_said(spec):
+    remote = Remote(spec)
+    remote.ready()
+    remote.start()
+    os.kill(remote.pid, signal.SIGKILL)
+    with pytest.raises(ArmError, match="the drives hold their last target"):
+        for _ in range(10):
+            remote.read()
+            time.sleep(0.02)
+    remote.close()
+
+
+def test_a_fault_is_told_and_stays(spec):
+    remote = Remote(spec)
+    remote.ready()
+    at = remote.start().position
+    remote.hold(Fault("stop", "enough"))
+    remote.command(at + 0.2)
+    assert remote.fault == Fault("stop", "enough")
+    np.testing.assert_allclose(remote.command(at + 0.2).position, at, atol=1e-2)
+    remote.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "toaster"}, "no arm 'toaster': choose one of sim, so101"),
+        ({"kind": "so101", "options": {"port": "/dev/nothing", "calibration": None}}, "needs --calibration"),
+        ({"log": "/nowhere/log.csv"}, "cannot write /nowhere/log.csv"),
+    ],
+)
+def test_mistakes_are_one_line(spec, change, message):
+    remote = Remote(Spec(**{**vars(spec), **change}))
+    with pytest.raises(UserError, match=message):
+        remote.ready()
+        remote.start()
+    remote.close()
