@@ -16,6 +16,7 @@ from mjx_nero.types import UserError
 
 SHARE, MOST = 0.4, 0.6  # of the opening: an edge, and the longest that leaves room to miss the middle
 LARGEST = 0.06  # [m]
+STROKE = 5e-3  # [m] pads that part by less do not open
 GRIPPED = 0.01  # [m] a cube is this much larger than the closed gripper's gap
 CLEAR = 0.005  # [m] the pads stay this far above the table
 DENSITY = 1000.0  # [kg/m3] 30 g at an edge of 31 mm
@@ -33,7 +34,7 @@ def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
     """
     wanted = min(max(SHARE * opening, pad[0] + 2 * CLEAR), MOST * opening, LARGEST)
     least = closed + min(GRIPPED, (opening - closed) / 4)
-    if wanted < least > opening - 2 * CLEAR:
+    if opening - closed < STROKE or wanted < least > opening - 2 * CLEAR:
         return 0.0
     return round(max(wanted, least), 3)
 

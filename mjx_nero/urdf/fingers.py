@@ -23,7 +23,7 @@ ALIKE = 0.8  # of what the two fingers part by that part most: a third one parts
 Chosen = tuple[Tree, tuple[str, ...], str]
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(kw_only=True)
 class Hand:
     """The gripper, or the last link of an arm that has none.
 

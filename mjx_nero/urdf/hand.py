@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_nero import config
 from mjx_nero.sim import grasp
@@ -29,8 +30,8 @@ NEAR = 0.06  # [m] a named frame this far from where the fingers meet is their g
 TOOL_AXIS = 50.0  # [degrees] a tool's frame has an axis along which it works: the one within this of where the fingers point
 ON_AXIS = 5e-3  # [m] a tool this near to the last joint's axis is turned by it, not carried around
 SHARES, NUDGE = 41, 0.02  # places of the way from closed to open, and how much of it tells where the fingers are going
+ASIDE = 4e-3  # [m] from a cube to the fixed jaw as the hand comes down: no arm is more exact than a few millimetres
 ROUNDS = 3  # of fitting pads where the cube is held, whose size follows from the pads
-LEAST = 5e-3  # [m] pads that part by less do not open
 
 
 def find(
@@ -134,7 +135,7 @@ class _Gripper:
             sides = {finger.name: finger.outward for finger in (*(f for f, _ in moving), *([jaw] if jaw else []))}
             gaps = np.array([self._gap(k, fit, sides) for k in range(SHARES)])
             held = _Held(frame, frame @ pads.middle(fit.held, frame), share, fit, (float(gaps[0]), float(gaps[-1])))
-            edge = grasp.edge(held.gaps[1], pads.extents(fit.held[0], frame), held.gaps[0])
+            edge = grasp.edge(held.gaps[1], self._extents(held), held.gaps[0])
             if not gaps[0] < edge < gaps[-1]:
                 break
             share = float(np.interp(edge, np.maximum.accumulate(gaps) + 1e-9 * self._shares, self._shares))
@@ -145,26 +146,30 @@ class _Gripper:
 
     def _frame(self, share: float, ahead: Vec | None) -> Matrix:
         """Where the fingers point there, how they open, and across both."""
-        a, b = self.grip.meeting.names
-        at, spots = self.poses(self._around(share)), self.grip.meeting.spots
-        one = at[a][:, :3, :3] @ spots[0] + at[a][:, :3, 3]
-        other = at[b][:, :3, :3] @ spots[1] + at[b][:, :3, 3] if not self.grip.jaw else self._fixed_spot(spots[1])
-        way = (one - other)[1] - (one - other)[0]
+        spots = self._spots(share)
+        moved = spots[:, 1] - spots[:, 0]
+        sides = [way - np.delete(moved, k, 0).mean(0) for k, way in enumerate(moved)]  # of three fingers one against the others
+        way = max(sides, key=lambda v: float(np.linalg.norm(v)) + 1e-9)
         if self.grip.jaw and not self.swing.blind:  # from face to face: the bisector of jaws that hold something points ahead
-            way = (one - other).mean(0)
+            way = (spots[0] - spots[1]).mean(0)
         pivot, axis = self._hinge(share)
         opening = snapped(_unit(way - axis * (axis @ way), np.array([0.0, 1.0, 0.0])))
         if ahead is None:
-            tip, across = (one + other).mean(0) / 2, np.cross(axis, opening)
+            tip, across = spots.mean((0, 1)), np.cross(axis, opening)
             ahead = _ahead(tip, opening, self._wrist())
             if np.linalg.norm(across) > 0.8:
                 ahead = across / np.linalg.norm(across) * (np.sign(across @ (tip - pivot)) or 1.0)
         opening = _unit(opening - ahead * (ahead @ opening), opening)
         return np.column_stack([ahead, opening, np.cross(ahead, opening)])
 
-    def _fixed_spot(self, spot: Vec) -> Points:
-        base = np.linalg.inv(self._at_link)
-        return np.tile(base[:3, :3] @ spot + base[:3, 3], (2, 1))
+    def _spots(self, share: float) -> Float[np.ndarray, "fingers 2 3"]:
+        """Where the faces of the fingers are that meet, the fixed jaw's last: a little before and after."""
+        at, (one, two) = self.poses(self._around(share)), self.grip.meeting.spots
+        met = dict(zip(self.grip.meeting.names, (one, two), strict=True))
+        if self.grip.jaw:
+            base = np.linalg.inv(self._at_link) @ np.append(two, 1.0)
+            return np.array([_placed_at(at[self.grip.fingers[0]], one), np.tile(base[:3], (2, 1))])
+        return np.array([_placed_at(at[n], met.get(n, self.swing.shapes[n].mean(0))) for n in self.grip.fingers])
 
     def _around(self, share: float) -> Values:
         return np.clip([share - NUDGE, share + NUDGE], 0, 1)
@@ -206,29 +211,38 @@ class _Gripper:
     def hand(self, held: _Held) -> Hand:
         """As it is, the grasp point amid its pads."""
         grip, frame = self.grip, held.frame
-        site = primitives.pose(np.eye(3), np.round(held.site, 6) + 0.0)  # [m]: what is guessed has no more digits
-        extents = pads.extents(held.pads.held[0], frame)
+        extents = self._extents(held)
         closed, gap = (round(float(v), 4) for v in held.gaps)
         hand = Hand(
-            grip.joints,
-            grip.open,
-            grip.close,
-            grip.link,
-            grip.fingers,
-            site,
-            frame[:, 0],
-            frame[:, 1],
-            held.pads.pads,
-            held.pads.backs,
-            tuple(self.swing.inside),
-            gap if gap - closed > LEAST and np.isfinite(grip.meeting.worth) else 0.0,
-            closed,
-            extents,
+            joints=grip.joints,
+            open=grip.open,
+            close=grip.close,
+            link=grip.link,
+            fingers=grip.fingers,
+            site=primitives.pose(np.eye(3), np.round(held.site, 6) + 0.0),  # [m]: what is guessed has no more digits
+            approach=frame[:, 0],
+            opening=frame[:, 1],
+            pads=held.pads.pads,
+            backs=held.pads.backs,
+            inside=tuple(self.swing.inside),
+            gap=gap if np.isfinite(grip.meeting.worth) else 0.0,
+            closed=closed,
+            pad=extents,
         )
-        if self.swing.blind and grip.jaw:  # the fixed jaw is half a cube away from its middle: the other one comes to it
-            moved = self._fingers(held.share, frame)[0][0][0].outward
-            hand.grip = frame[:, 1] * moved * grasp.edge(hand.gap, extents, closed) / 2
+        if grip.jaw:  # room between the cube and the fixed jaw: the other one pushes it there
+            edge = grasp.edge(hand.gap, extents, closed)
+            aside = min(ASIDE, max(0.0, hand.gap - edge) / 4) + (edge / 2 if self.swing.blind else 0.0)
+            hand.grip = np.round(frame[:, 1] * self._fingers(held.share, frame)[0][0][0].outward * aside, 4) + 0.0
         return hand
+
+    def _extents(self, held: _Held) -> tuple[float, float, float]:
+        """Of a pad, as long as the fingers reach anywhere between open and the cube, beyond the grasp point."""
+        along, across, between = pads.extents(held.pads.held[0], held.frame)
+        way = self._shares >= held.share
+        row = np.append(-held.frame[:, 0], 0.0)
+        shapes = [(n, shape) for found in (held.pads.pads, held.pads.backs) for n, shape in found.items()]
+        reach = max(-float(shape.lowest(row @ self._way[n][way]).min()) for n, shape in shapes) - held.site @ held.frame[:, 0]
+        return round(max(along, 2 * float(reach)), 4), across, between
 
     def hand_at(self, held: _Held, link: str, at: Vec) -> Hand:
         """With the grasp point in the frame of a named link, which has an axis that tells where the fingers point.
@@ -262,6 +276,11 @@ class _Gripper:
         return np.linalg.inv(world[fork][0] @ self._at_link) @ world[body.name][0] @ body.links[link]
 
 
+def _placed_at(poses: Poses, spot: Vec) -> Points:
+    """A point of a body in each of its poses."""
+    return poses[:, :3, :3] @ spot + poses[:, :3, 3]
+
+
 def _shifted(pad: primitives.Primitive, pose: Pose, by: Vec) -> primitives.Primitive:
     """A pad of a body that has the ``pose``, moved."""
     there = pose @ pad.pose
@@ -286,12 +305,15 @@ def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
         notes.add("guessed", "robot", name, f"{known} (--open and --closed change it)")
         return
     between = ", ".join((*grip.fingers, *([grip.jaw] if grip.jaw else [])))
-    meshes = "no mesh of its fingers was found, and " if blind else ""
-    why = known if hand.gap else f"{meshes}the pads on {between} do not part between {shut} and {opened}"
+    lack = "how far its gripper opens is unknown" if hand.gap < grasp.STROKE else "no cube fits between its fingers"
+    why = (
+        "no mesh of its fingers was found, and " if blind else ""
+    ) + f"between {shut} and {opened} the pads on {between} do not part"
+    if hand.gap >= grasp.STROKE:
+        lack, why = ("closing moves its pads apart", known) if hand.gap < hand.closed else (lack, known)
     flags = " ".join(f"--{flag} {','.join(f'{j}=VALUE' for j in grip.joints)}" for flag in ("open", "closed"))
-    other = "; --gripper names other joints"
-    lack = "no cube fits between its fingers" if hand.gap else "how far its gripper opens is unknown"
-    notes.add("warning", "robot", name, f"{lack}, and tasks that grasp need it: {why}. Give {flags}{other}")
+    text = f"{lack}, and tasks that grasp need it: {why}. Give {flags}; --gripper names other joints"
+    notes.add("warning", "robot", name, text)
 
 
 def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) -> Hand:
@@ -310,7 +332,20 @@ def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) 
     approach = snapped(frame[:3, :3].T @ _unit(direction, frame[:3, 2]))
     across = np.array([0.0, 1.0, 0.0]) if abs(approach[1]) < 0.7 else np.array([1.0, 0.0, 0.0])
     opening = _unit(across - approach * (approach @ across), across)
-    return Hand((), (), (), link, (), primitives.pose(np.eye(3), at), approach, opening, {}, {}, ())
+    site = primitives.pose(np.eye(3), at)
+    return Hand(
+        joints=(),
+        open=(),
+        close=(),
+        link=link,
+        fingers=(),
+        site=site,
+        approach=approach,
+        opening=opening,
+        pads={},
+        backs={},
+        inside=(),
+    )
 
 
 def _tool(parts: dict[str, Body]) -> str:

@@ -177,7 +177,9 @@ def test_an_opening_that_is_unknown_is_said_and_what_to_give(tmp_path):
     parts = [p.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"') for p in fingers(tmp_path, "link6")]
     _, report = imported(tmp_path, base(), *six(), *parts, gripper=["left"])
     assert report.robot.opening == 0 and report.robot.pick is None
-    assert warned(report, "how far its gripper opens is unknown") and warned(report, "do not part between left")
+    assert warned(report, "how far its gripper opens is unknown") and warned(
+        report, "between left 0.01 and left 0.05 the pads on"
+    )
     assert warned(report, "--open left=VALUE --closed left=VALUE") and warned(report, "--gripper names other joints")
     with pytest.raises(UserError, match="is unknown"):
         grasp.cube_for(report.robot)
@@ -191,6 +193,10 @@ def test_open_and_closed_may_be_given(tmp_path, capsys):
     assert robot.opening == pytest.approx(0.06, abs=1e-3) and robot.closed == pytest.approx(0.04, abs=1e-3)
     assert report["gap"] == {"open": robot.opening, "closed": robot.closed}
     assert "40 mm between its pads when closed, 60 mm when open" in capsys.readouterr().out.replace("\n", " ")
+    _, report = imported(
+        tmp_path / "swapped", base(), *six(), *fingers(tmp_path / "swapped", "link6"), open={"left": 0.01}, closed={"left": 0.05}
+    )
+    assert report.robot.pick is None and warned(report, "closing moves its pads apart")
     for argv, message in (
         (["--open", "lift=0.03"], "--open names joint 'lift'.*the gripper has left"),
         (["--closed", "right=0.03"], "--closed names joint 'right'.*the gripper has left"),
