@@ -440,7 +440,8 @@ def test_an_inertia_of_one_is_a_placeholder(tmp_path):
     model, report = imported(tmp_path, text)
     np.testing.assert_allclose(np.sort(model.body("a").inertia), np.array([0.005, 0.0125, 0.0125]) / 12, rtol=1e-6)
     np.testing.assert_allclose(model.body("c").inertia, 0.01, rtol=1e-6)
-    assert len(report.warnings) == 1 and "the inertia of 'a' is more than 100 times" in report.warnings[0]
+    found = [text for text in report.warnings if "inertia" in text]
+    assert len(found) == 1 and "the inertia of 'a' is more than 100 times" in found[0]
 
 
 def test_arm_without_gripper(tmp_path):
@@ -832,13 +833,16 @@ def test_fingers_overcome_their_joints_own_friction(tmp_path):
         report = imported(tmp_path / name, hand(tmp_path / name, *joints))[1]
         return report, report.robot.gripper
 
+    def weak(report):
+        return [text for text in report.warnings if "too little for a cube" in text]
+
     _, free = grips("free", 'friction="0" damping="0"')
     report, rough = grips("rough", 'friction="4" damping="0"')
-    assert rough.effort[0] == pytest.approx(free.effort[0] + 8, rel=1e-4) and not report.warnings
+    assert rough.effort[0] == pytest.approx(free.effort[0] + 8, rel=1e-4) and not weak(report)
     report, _ = grips("stuck", 'friction="12" damping="0"')
-    assert any("effort 20 grips with 0 N" in text for text in report.warnings)
+    assert len(weak(report)) == 1 and "grips with 0 N" in weak(report)[0]
     report, slow = grips("slow", 'friction="0" damping="100"')
-    assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) < free.speed[0]
+    assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) and slow.speed[0] < free.speed[0]
     assert any("its own damping" in note for note in report.notes.of("joint", "f1"))
 
 
