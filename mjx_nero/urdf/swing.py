@@ -143,9 +143,9 @@ class Swing:
         """Where the joint is, alone, when shapes meet, and when they are apart."""
         joint = self.joints[name]
         if endless(joint):
-            found = self.jaw(name, rest)
-            self.assumed += [] if found else [name]
-            return found or (0.0, np.pi / 2)
+            ends = self.jaw(name, rest)
+            self.assumed += [] if ends else [name]
+            return ends or (0.0, np.pi / 2)
         lower, upper = limits(joint)
         q = np.linspace(lower, upper, STEPS)
         found = self.meetings({**{j: np.repeat(v, STEPS) for j, v in rest.items()}, name: q})
