@@ -123,6 +123,13 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
             if name not in joints:
                 raise UserError(f"{flag} names joint {name!r}{config.hint(name, joints)}: the gripper has {', '.join(joints)}")
     close, wide = swing.ends(joints, open, closed)
+    for name in swing.assumed:
+        if name not in open or name not in closed:
+            ends = f"closed at {close[name]:.3g} and open at {wide[name]:.3g}"
+            text = f"it has no limits, and its link meets nothing: {ends} are assumed"
+            notes.add(
+                "warning", "joint", name, f"{text}; give its limits in the URDF, or --open {name}=VALUE and --closed {name}=VALUE"
+            )
     meetings = swing.between(close, wide)
     if not meetings:
         raise UserError(

@@ -106,6 +106,8 @@ class _Gripper:
     def __init__(self, swing: Swing, looks: Mapping[str, Look], grip: Grip):
         self.swing, self.looks, self.grip, self.parts = swing, looks, grip, swing.parts
         self._at_link = self.parts[grip.fork].links[grip.link]
+        # Without shapes there is no pose that holds a cube; fingers that curl by joints of their own do not keep step on the way.
+        self._known = not swing.blind and len(grip.joints) <= len(grip.fingers)
         self._shares = np.linspace(0, 1, SHARES)
         self._way = self.poses(self._shares)
 
@@ -118,17 +120,17 @@ class _Gripper:
         return links | {n: base @ found[n] for n in self.swing.inside}
 
     def held(self, ahead: Vec | None = None) -> _Held:
-        """With the pads fitted where they hold the cube that fits them; closed, where no shape is known.
+        """With the pads fitted where they hold the cube that fits them, or closed, where that pose is not known.
 
         Args:
             ahead: where the fingers point [3], in place of the guess.
         """
         share = 0.0
-        if not self.swing.blind:
+        if self._known:
             apart = self.grip.meeting.apart
             parted = np.maximum.accumulate(apart) - apart[0]
             share = float(np.interp(grasp.SHARE * parted[-1], parted, np.linspace(0, 1, len(parted))))
-        for _ in range(1 if self.swing.blind else ROUNDS):
+        for _ in range(ROUNDS if self._known else 1):
             frame = self._frame(share, ahead)
             moving, jaw = self._fingers(share, frame)
             fit = pads.fitted(moving, jaw, frame)
@@ -172,7 +174,7 @@ class _Gripper:
         return np.array([_placed_at(at[n], met.get(n, self.swing.shapes[n].mean(0))) for n in self.grip.fingers])
 
     def _around(self, share: float) -> Values:
-        return np.clip([share - NUDGE, share + NUDGE], 0, 1)
+        return np.clip([share - NUDGE, share + NUDGE], 0, 1) if self._known or self.swing.blind else np.array([0.0, 1.0])
 
     def _hinge(self, share: float) -> tuple[Vec, Vec]:
         """Where the joint turns that turns the first finger, and its axis; zeros if none does."""

@@ -22,6 +22,7 @@ LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
 SPARE = 0.02  # of the reach: the hand gets so much further than the region to all sides, where there is such a region
 OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
 TALL = 0.4  # of the reach: the highest above the table that anything is held
+WIDTH = 0.15  # of the reach: a hand leans further where its region is narrower, if that helps
 LEANS = tuple(np.radians((15, 30, 45)))  # of a hand that cannot point down: as little as will do
 HELD = np.radians(60)  # of one that holds something
 DESCENTS, STARTS = 8, 12  # of the inverse kinematics, for a cell and for a point of a region
@@ -114,10 +115,15 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
         (any_way, 0.0, ((None, down),)),
         *(("leaning", tilt, ((None, down),)) for tilt in LEANS),
     ]
+    found = []
     for how, tilt, ways in tries:
         pick = _pick(Reaching(cloud, shapes, shun, tilt, ways[0][0]), work, low)
-        if pick is None:
-            continue
+        if pick is not None:
+            found.append((_width(pick), pick, how, tilt, ways))
+            if not tilt or _width(pick) > WIDTH * _reach(cloud):
+                break
+    if found:
+        _, pick, how, tilt, ways = max(found, key=lambda item: item[0])
         hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
         notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
         notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
@@ -126,6 +132,11 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
         return Place(pick, hold, round(float(tilt), 4), how != any_way, ways)
     notes.add("warning", "robot", name, "no place found to grasp at on the table: lift needs pick and hold in robot.yaml")
     return Place(None, None, 0.0, True, either[:1])
+
+
+def _width(box: Box) -> float:
+    """The shorter side of a region on the table [m]."""
+    return min(upper - lower for lower, upper in box[:2])
 
 
 def _half_turn(down: Quat) -> Quat:

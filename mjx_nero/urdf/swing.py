@@ -57,10 +57,12 @@ class Swing:
         shapes: of those that have any their surfaces, in their frames [n, 3]; a single point each, if none has.
         fixed: likewise of the links of the fork, in its frame.
         blind: no shape is known.
+        assumed: joints without limits, of which ``ends`` found nothing that they meet, and took a quarter turn.
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], looks: Mapping[str, Look], joints: Sequence[str], fork: str):
         self.parts, self.fork = parts, fork
+        self.assumed: list[str] = []
         self.joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
         self.inside = _moved(parts, joints)
         found = {n: surface(parts[n].links, looks) for n in self.inside}
@@ -141,7 +143,9 @@ class Swing:
         """Where the joint is, alone, when shapes meet, and when they are apart."""
         joint = self.joints[name]
         if endless(joint):
-            return self.jaw(name, rest) or (0.0, np.pi / 2)
+            ends = self.jaw(name, rest)
+            self.assumed += [] if ends else [name]
+            return ends or (0.0, np.pi / 2)
         lower, upper = limits(joint)
         q = np.linspace(lower, upper, STEPS)
         found = self.meetings({**{j: np.repeat(v, STEPS) for j, v in rest.items()}, name: q})

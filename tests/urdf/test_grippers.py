@@ -172,6 +172,14 @@ def test_a_wrist_without_limits_is_no_jaw_but_may_be_named_one(tmp_path):
     assert "--gripper roll --open roll=VALUE --closed roll=VALUE" in " ".join(report.notes.of("robot", "arm"))
 
 
+def test_a_jaw_without_limits_that_meets_nothing_is_said(tmp_path):
+    turn = make.link("gripper", make.inertial(0.1), make.shape('<cylinder radius="0.03" length="0.06"/>', xyz="0 0 0.03"))
+    joint = make.joint("roll", "link6", "gripper", "continuous", xyz="0 0 0.08", limit='effort="3" velocity="2"')
+    _, report = imported(tmp_path, base(), *six(), turn, joint, gripper=["roll"])
+    assert warned(report, "joint roll: it has no limits, and its link meets nothing")
+    assert warned(report, "--open roll=VALUE and --closed roll=VALUE")
+
+
 def test_an_opening_that_is_unknown_is_said_and_what_to_give(tmp_path):
     """Both fingers slide the same way: they never part."""
     parts = [p.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"') for p in fingers(tmp_path, "link6")]

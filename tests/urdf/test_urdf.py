@@ -407,8 +407,8 @@ def test_a_jaw_without_mesh_closes_on_a_pad_at_the_tools_frame(tmp_path):
     turn = data.site("ee").xmat.reshape(3, 3)
     np.testing.assert_allclose(moving + fixed, 0, atol=2e-6)  # not 2 cm beside
     assert np.linalg.norm(moving - fixed) == pytest.approx(0.006, abs=1e-6)  # a pad's thickness apart: they touch
-    toward = (moving - fixed) / 0.006  # a held cube's middle is on the moving jaw's side, half an edge away
-    np.testing.assert_allclose(turn @ robot.grip, toward * grasp.edge(robot.opening, robot.pad) / 2, atol=1e-4)
+    toward = (moving - fixed) / 0.006  # the cube's middle is on the moving jaw's side, half an edge and 4 mm away
+    np.testing.assert_allclose(turn @ robot.grip, toward * (grasp.edge(robot.opening, robot.pad) / 2 + 0.004), atol=1e-4)
     assert robot.opening > 0.03
 
 
