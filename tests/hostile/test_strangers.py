@@ -141,7 +141,11 @@ def test_a_delay_beyond_reason(tmp_path, seconds):
 def test_a_delay_flag_beyond_reason(call, steps):
     command = ("eval", "--env", "nero_reach", "--episodes", 1, "--env.actions.delay.params.steps", steps)
     code, _, err = call(*command)
-    assert code == 2 and re.fullmatch(r"error: actions\.delay\.params\.steps\S* (must|takes|is a range) .*\n", err) and len(err) < 500
+    assert (
+        code == 2
+        and re.fullmatch(r"error: actions\.delay\.params\.steps\S* (must|takes|is a range) .*\n", err)
+        and len(err) < 500
+    )
 
 
 @pytest.mark.parametrize("seed", ["-1", str(2**32), str(2**64), "0.5", "nan", "1e30", "x", "9" * 400])
