@@ -225,4 +225,4 @@ def names(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], 
         restored(home)
         assert {path: pathlib.Path(path).read_text() for path in own} == own
 
-    return ", ".join(map(ascii, own)), functools.partial(server.program, use)
+    return ", ".join(ascii(pathlib.Path(path).name) for path in own), functools.partial(server.program, use)

@@ -163,32 +163,53 @@ def gym(seed: int, count: int) -> Iterator[tuple[str, str]]:
 
 def signals(seed: int, count: int) -> Iterator[tuple[str, str]]:
     """Trainings that one to three signals end at any time: nothing is half-written, and what is left can be read."""
+    draw = random.Random(f"signals {seed}")
+    for number in (signal.SIGINT, signal.SIGHUP):  # what a shell has put in the background ignores them
+        signal.signal(number, signal.SIG_DFL)
+    for i in range(count):
+        sent = [(draw.choice(("TERM", "INT", "HUP", "USR1")), draw.uniform(0, 8))]
+        sent += [(draw.choice(("TERM", "INT", "USR1")), draw.choice((0.0, 0.05, 1.0))) for _ in range(draw.randint(0, 2))]
+        training = i % 2 == 1  # else they come as the program starts
+        with tempfile.TemporaryDirectory() as folder:
+            yield f"signals {sent}, training: {training}", _signalled(pathlib.Path(folder), sent, training)
+
+
+TRAIN = "train --env nero_reach --impl native --num-envs 8 --num-timesteps 1e9 --eval-every 100000 --no-video --out run"
+
+
+def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bool) -> str:
+    """What is wrong with how a training ended; empty if nothing is.
+
+    Args:
+        sent: signals, and how long to wait before each [s].
+        training: the first wait begins when its first update is made.
+    """
     from mjx_nero import UserError
     from mjx_nero.learn.runs import resume
 
-    draw = random.Random(f"signals {seed}")
-    command = "train --env nero_reach --impl native --num-envs 8 --num-timesteps 1e9 --eval-every 100000 --no-video --out run"
-    for _ in range(count):
-        sent = [(draw.choice(("TERM", "INT", "HUP", "USR1")), draw.uniform(0, 25), draw.choice((0, 0.02, 0.3, 3)))]
-        sent += [(draw.choice(("TERM", "INT", "USR1")), 0.0, draw.choice((0.0, 0.05, 1.0))) for _ in range(draw.randint(0, 2))]
-        with tempfile.TemporaryDirectory() as folder:
-            env = {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
-            with open(f"{folder}/said", "w") as said:
-                run = subprocess.Popen(
-                    [sys.executable, "-m", "mjx_nero", *command.split()], cwd=folder, env=env, stdout=said, stderr=said
-                )
-            for name, wait, further in sent:
-                time.sleep(wait + further)
-                run.send_signal(getattr(signal, f"SIG{name}"))
-            try:
-                code, why = run.wait(SECONDS), ""
-            except subprocess.TimeoutExpired:
-                run.kill()
-                code, why = run.wait(), "did not end within 30 s of the last signal"
-            text = pathlib.Path(folder, "said").read_text()
-            left = [str(path) for path in pathlib.Path(folder).glob("run/**/*.part*")]
-            if not why and ("Traceback" in text or (left and len(sent) == 1) or code not in range(128, 128 + 16)):
-                why = f"exit {code}, left {left}: {text[-2000:]}"
-            with contextlib.suppress(UserError):
-                resume.find(pathlib.Path(folder, "run"), lambda line: None)
-            yield f"signals {sent}", why
+    env = {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+    with open(folder / "said", "w") as said:
+        run = subprocess.Popen([sys.executable, "-m", "mjx_nero", *TRAIN.split()], cwd=folder, env=env, stdout=said, stderr=said)
+    deadline = time.monotonic() + 300
+    while training and run.poll() is None and not (folder / "run" / "config.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    for name, wait in sent:
+        time.sleep(wait)
+        run.send_signal(getattr(signal, f"SIG{name}"))
+    try:
+        code = run.wait(SECONDS)
+    except subprocess.TimeoutExpired:
+        run.kill()
+        run.wait()
+        return f"did not end within {SECONDS:g} s of the last signal: {(folder / 'said').read_text()[-2000:]}"
+    text, left = (folder / "said").read_text(), [str(path) for path in folder.glob("run/**/*.part*")]
+    ways = [-getattr(signal, f"SIG{name}") for name, _ in sent if not training]  # before the program has begun
+    ways += [128 + getattr(signal, f"SIG{name}") for name, _ in sent]
+    try:
+        resume.find(folder / "run", lambda line: None)
+    except UserError as error:
+        if training and len(sent) == 1:
+            return f"nothing to go on from: {error}"
+    if "Traceback" in text or (left and len(sent) == 1) or code not in ways:
+        return f"exit {code}, left {left}: {text[-2000:]}"
+    return ""

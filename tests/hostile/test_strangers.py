@@ -71,7 +71,7 @@ def test_the_same_seed_makes_the_same_input(kind, tmp_path):
         (tmp_path / name / "mine" / "keys.yaml").write_text("x")
         (tmp_path / name / "mine" / "000000000512.safetensors").write_text("x")
         what, _ = kind(random.Random(f"{kind} {seed}"), tmp_path / name)
-        said.append(re.sub(r"/[\w/-]+/(?=[abc]/)", "", what).replace(f"{name}/mine", "mine"))
+        said.append(what.replace(str(tmp_path / name), ""))
     assert said[0] == said[1] != said[2]
 
 
@@ -121,7 +121,7 @@ def test_a_cell_beyond_reason(tmp_path):
         if cell.startswith("0."):
             log.read(tmp_path / "a.csv", ("joint1", "joint2"))
             continue
-        with pytest.raises(UserError, match=r"takes a number up to 10000, got") as error:
+        with pytest.raises(UserError, match=r"takes a number up to 10000, got|has news of some joints") as error:
             log.read(tmp_path / "a.csv", ("joint1", "joint2"))
         assert len(str(error.value)) < 500
 
@@ -139,9 +139,13 @@ def test_a_delay_beyond_reason(tmp_path, seconds):
 
 @pytest.mark.parametrize("steps", ["(0,1000000)", "(1e6,1e6)", "(-1,1)", "(2,1)", "(0,257)", "(0,nan)", "(0,0.5)"])
 def test_a_delay_flag_beyond_reason(call, steps):
-    command = ("eval", "--env", "nero_reach", "--episodes", 1, "--env.actions.delay.steps", steps)
+    command = ("eval", "--env", "nero_reach", "--episodes", 1, "--env.actions.delay.params.steps", steps)
     code, _, err = call(*command)
-    assert code == 2 and re.fullmatch(r"error: .*steps.*\n", err) and len(err) < 500
+    assert (
+        code == 2
+        and re.fullmatch(r"error: actions\.delay\.params\.steps\S* (must|takes|is a range) .*\n", err)
+        and len(err) < 500
+    )
 
 
 @pytest.mark.parametrize("seed", ["-1", str(2**32), str(2**64), "0.5", "nan", "1e30", "x", "9" * 400])

@@ -32,6 +32,14 @@ FILES += (
     "link.stl",
 )
 NUMBERS = (0, -1, 1, 0.5, 1e-9, -1e-9, 1e9, 1e25, 1e-300, float("nan"), float("inf"), -120, 180, 3.15, 1.9, 57.3, 1e308, "x", "")
+KEPT = 0.85  # how often a number is one of those that robots have
+
+
+def number(draw: random.Random, *usual: float) -> float | str:
+    """One of the usual numbers, or another."""
+    return draw.choice(usual if draw.random() < KEPT else NUMBERS)
+
+
 SHAPES = (
     '<capsule radius="{}" length="{}"/>',
     '<cylinder radius="{}" length="{}"/>',
@@ -52,29 +60,29 @@ TAGS = ("joint", "mimicJoint", "multiplier", "offset", "maxEffort", "sensitivene
 
 
 def urdf(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], None]]:
-    """An import of an arm with one to three things that are odd, among packages and links that are."""
+    """An import of an arm with one to three things that may be odd, among packages and links that are."""
     home = folder / "home" / "w" / "in"  # what stands beside ``home`` is the user's
     make.box(folder / "mine" / "m.stl", (0, 0, 0), (0.1, 0.06, 0.02))
     for name in draw.sample(("m.stl", "pkg/m.stl", "other/m.stl", "../pkg/m.stl", "../../pkg/m.stl", "m n.stl"), 3):
-        make.box(home / name, (0, 0, 0), (0.1, 0.06, draw.choice((0.02, 20.0, 1e-7))))
+        make.box(home / name, (0, 0, 0), (0.1, 0.06, draw.choice((0.02, 0.03, 20.0, 1e-7))))
     for name in draw.sample(("pkg", "other", ".", ".."), 2):
-        text = draw.choice(("<package><name>pkg</name></package>", "<package/>", "[" * 1000, "<name>../mine</name>", ""))
-        make.write(home / name, text, "package.xml")
+        names = "<package><name>pkg</name></package>", "<package/>", "[" * 1000, "<name>../mine</name>", ""
+        make.write(home / name, draw.choice(names), "package.xml")
     if draw.random() < 0.3:
         (home / "pkg").mkdir(exist_ok=True)
         (home / draw.choice(("link.stl", "pkg/x", "mine"))).symlink_to(folder / "mine" / draw.choice(("m.stl", ".")))
-    parts = [make.link("e", *(draw.choice(INNER)(draw, folder) for _ in range(draw.randint(1, 3)))), joint(draw)]
-    if draw.random() < 0.5:
-        inner = "".join(f"<{tag}>{draw.choice((*NUMBERS, 'j1', 'j', 'j2'))}</{tag}>" for tag in draw.sample(TAGS, 4))
-        parts.append(draw.choice((f"<gazebo>{PLUGINS.format(inner)}</gazebo>", f"<gazebo reference='{inner[:3]}'/>")))
-    text = make.arm(draw.choice((2, 3)), *parts)
-    said = text[text.index('<link name="e"') :][:400]
+    last = draw.choice((2, 3, 6))
+    inner = (draw.choice(INNER)(draw, folder) for _ in range(draw.randint(0, 2)))
+    parts = [make.link("e", _inertia(draw, folder), *inner), joint(draw, f"l{last}")]
+    if draw.random() < 0.3:
+        said = "".join(f"<{tag}>{draw.choice((*NUMBERS, 'j1', 'j', 'j2'))}</{tag}>" for tag in draw.sample(TAGS, 4))
+        parts.append(f"<gazebo reference='{draw.choice(('e', 'x', ''))}'>{PLUGINS.format(said)}</gazebo>")
+    text = make.arm(last, *parts)
     make.write(home, text)
-    flags = draw.choice(
-        ([], [], ["--strict"], ["--degrees"], ["--package", "pkg=."], ["--package", "../mine"], ["--chain", "base:e"])
-    )
+    flags = draw.choice(([], [], [], [], ["--strict"], ["--degrees"], ["--package", "pkg=in/pkg"], ["--chain", "base:e"]))
     argv = ["import-urdf", "in/robot.urdf", "--out", "out", *flags]
-    return f"{said} {flags}", functools.partial(_in, home.parent, functools.partial(server.command, argv))
+    odd = text[text.index(parts[0]) :][:600]
+    return f"{odd} {flags}", functools.partial(_in, home.parent, functools.partial(server.command, argv))
 
 
 def _in(folder: pathlib.Path, call: Callable[[], None]) -> None:
@@ -84,33 +92,45 @@ def _in(folder: pathlib.Path, call: Callable[[], None]) -> None:
 
 def _mesh(draw: random.Random, folder: pathlib.Path) -> str:
     file = draw.choice(FILES).format(mine=folder / "mine", long="x" * 300)
-    scale = draw.choice(("1 1 1", "0.001 0.001 0.001", f"{draw.choice(NUMBERS)} 1 1", "1", "-1 1 1", "0 0 0"))
+    scale = draw.choice(("1 1 1", "0.001 0.001 0.001", "-1 1 1", f"{number(draw, 1, 2)} 1 1", "1", "0 0 0"))
     return make.mesh(file, draw.choice(("visual", "collision")), scale)
 
 
 def _shape(draw: random.Random, folder: pathlib.Path) -> str:
-    return make.shape(
-        draw.choice(SHAPES).format(*draw.choices((*NUMBERS, 0.02, 0.05), k=4)), draw.choice(("visual", "collision"))
-    )
+    sizes = [number(draw, 0.02, 0.03, 0.05) for _ in range(4)]
+    return make.shape(draw.choice(SHAPES).format(*sizes), draw.choice(("visual", "collision")))
 
 
 def _inertia(draw: random.Random, folder: pathlib.Path) -> str:
-    moments = " ".join(str(draw.choice((0.001, 0.002, -0.001, *NUMBERS[:-2]))) for _ in range(6))
-    return make.inertial(draw.choice((1.0, *NUMBERS[:-2])), moments=moments)
+    moments = [
+        str(draw.choice((1e-3, 2e-3, -1e-3, 5e-3, 1e-9)) if draw.random() < 0.97 else draw.choice(NUMBERS)) for _ in range(6)
+    ]
+    moments = ["0" if i in (1, 2, 4) and draw.random() < 0.6 else moment for i, moment in enumerate(moments)]
+    return make.inertial(number(draw, 0.5, 1.0, 0.0), moments=" ".join(each or "0" for each in moments))
 
 
-INNER = (_mesh, _shape, _inertia)
+INNER = (_mesh, _shape)
 
 
-def joint(draw: random.Random) -> str:
+def joint(draw: random.Random, parent: str) -> str:
     """The joint that holds the odd link."""
-    values = {name: draw.choice(NUMBERS) for name in ("lower", "upper", "effort", "velocity")}
-    limit = " ".join(f'{name}="{value}"' for name, value in values.items() if draw.random() < 0.9)
-    kind = draw.choice(("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "universal", ""))
-    driver, by, offset = draw.choice(("j1", "j", "j9", "")), draw.choice(NUMBERS), draw.choice(NUMBERS)
+    usual = {
+        "lower": (-1.0, -1.9, -120.0, -0.05),
+        "upper": (1.0, 1.9, 120.0, 0.05),
+        "effort": (10, 0, 0.18),
+        "velocity": (2, 180),
+    }
+    values = {name: number(draw, *numbers) for name, numbers in usual.items()}
+    limit = " ".join(f'{name}="{value}"' for name, value in values.items() if draw.random() < 0.95)
+    kind = draw.choice(("revolute", "revolute", "continuous", "prismatic", "fixed", "floating"))
+    driver, by, offset = draw.choice(("j1", "j2", "j", "j9")), number(draw, 1, -1, 2), number(draw, 0, 0.1)
     mimic = f'<mimic joint="{driver}" multiplier="{by}" offset="{offset}"/>'
-    axis = draw.choice(("0 0 1", "0 0 0", "1 1", "nan 0 0", "1e25 0 0", "1e-30 0 0"))
-    return make.joint("j", "l2", "e", kind, axis=axis, limit=limit, inner=draw.choice(("", "", mimic)))
+    axis = (
+        draw.choice(("0 0 1", "0 1 0", "1 1 0"))
+        if draw.random() < 0.95
+        else draw.choice(("0 0 0", "nan 0 0", "1e-30 0 0", "1 1"))
+    )
+    return make.joint("j", parent, "e", kind, axis=axis, limit=limit, inner=draw.choice(("", "", "", mimic)))
 
 
 def changed(draw: random.Random, content: bytes) -> bytes:
