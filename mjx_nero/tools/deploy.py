@@ -155,7 +155,7 @@ def _spec(args: argparse.Namespace, metadata: dict[str, Any], options: dict[str,
     from mjx_nero.deploy.server import Spec
 
     box = _numbers(args.workspace, (6,), "--workspace")
-    pairs = box and [box[0:2], box[2:4], box[4:6]]
+    pairs = [(box[k], box[k + 1]) for k in (0, 2, 4)] if box else None
     for low, high in pairs or ():
         if not low < high:
             raise UserError(f"--workspace takes ranges from low to high, got {low:g} to {high:g}")
@@ -208,7 +208,7 @@ def _simulated(args: argparse.Namespace, metadata: dict[str, Any], folder: pathl
     model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
     path = folder / "scene.mjb"
     mujoco.mj_saveModel(model, str(path), None)
-    objects = {}
+    objects: dict[str, Any] = {}
     for name, item in cfg.scene.objects.items():
         x, y, above = item.pos
         event = next((t for t in cfg.events.values() if t.params.get("object", "cube") == name and "x" in t.params), None)
