@@ -9,11 +9,12 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
-from mjx_nero import cli, files
-from mjx_nero.bounds import Bounds
+from mjx_nero import files
+from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
 
 _WARNING = (
     "nobody has tried this on hardware: all that is known comes from the makers' and LeRobot's sources and from emulators. "

@@ -71,7 +71,7 @@ def test_files_that_are_no_policy(call, tmp_path):
 PROBE = """
 import sys
 from mjx_nero.tools import deploy
-from mjx_nero import cli
+from mjx_nero.tools import cli
 sys.argv[0] = "mjx_nero"
 try:
     flags = ["--port", "/dev/nothing", "--calibration", sys.argv[2], "--object", "0.2,0,0.015"]

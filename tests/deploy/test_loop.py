@@ -13,7 +13,7 @@ from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.loop import Brain, go_home, run
 from mjx_nero.deploy.observe import Observer
 from mjx_nero.deploy.safety import Fault, SafetyCfg
-from mjx_nero.tools.identification import log as logs
+from mjx_nero.identify import log as logs
 
 
 class Sees(places.Known):
