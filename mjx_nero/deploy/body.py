@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+Vector = Sequence[float] | np.ndarray
 STILL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def matrix(quat: Sequence[float]) -> np.ndarray:
+def matrix(quat: Vector) -> np.ndarray:
     """[3, 3] of a quaternion (wxyz), which need not be of unit length."""
     w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
     return np.array(
@@ -35,7 +36,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
-def transform(pos: Sequence[float], quat: Sequence[float] = STILL) -> np.ndarray:
+def transform(pos: Vector, quat: Vector = STILL) -> np.ndarray:
     """[4, 4] of a position [m] and an orientation (wxyz)."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = matrix(quat), pos
@@ -137,7 +138,9 @@ class Body:
             self._owner.append(node)
             frames.append(fixed @ transform(shape.get("pos", np.zeros(3)), shape.get("quat", STILL)))
             edges, round_, ball = _extent(shape["type"], np.asarray(shape["size"], float))
-            half.append(edges), rounds.append(round_), radius.append(ball)
+            half.append(edges)
+            rounds.append(round_)
+            radius.append(ball)
             capsules.append(_capsule(edges, round_, ball))
         self.names = tuple(shape["name"] for shape in (*shapes, *origins))
         self.solid = len(shapes)  # so many have an extent

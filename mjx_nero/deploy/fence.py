@@ -55,8 +55,8 @@ class Fence:
         self._pairs = self._meeting(np.array(pairs, int).reshape(-1, 2), home, ranges)
         low, high = np.array(cfg.box).T
         self._low, self._high = np.maximum(low, [-np.inf, -np.inf, cfg.table - cfg.press]), high
-        sides = ("x from below", "y from below", "the table" if cfg.table - cfg.press >= low[2] else "z from below")
-        sides += ("x from above", "y from above", "z from above")
+        below = "the table" if cfg.table - cfg.press >= low[2] else "z from below"
+        sides = ("x from below", "y from below", below, "x from above", "y from above", "z from above")
         links = [
             f"{body.names[i]} at {side} of the box" if "from" in side else f"{body.names[i]} at {side}"
             for i in self._moving

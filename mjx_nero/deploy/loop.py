@@ -1,5 +1,6 @@
 """The loop: at the policy's rate, from feedback to a safe command; and what it has to say about its timing."""
 
+import collections
 import dataclasses
 import gc
 from collections.abc import Callable, Mapping
@@ -25,13 +26,19 @@ class Brain(Policy):
         self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]})
         gc.collect()
 
-    def begin(self, observer: Observer, feedback: Feedback) -> None:
-        """A new episode, from where the joints are."""
+    def begin(self, observer: Observer, feedback: Feedback, delay: float = 0.0) -> None:
+        """A new episode, from where the joints are.
+
+        Args:
+            delay: from a target's sending until it is in force [s]; what the policy sees of targets are those in force.
+        """
         self.reset()
         self._observer, self._lag = observer, Lag.of(self.metadata)
         self._executor = self.executor(feedback.position)
         self.action = np.zeros(len(self._executor.home_action))
         self._meant = np.array(feedback.position, float)
+        past = 1 + round(delay / float(self.metadata["control_dt"]))
+        self._targets = collections.deque([self._meant] * past, maxlen=past)
 
     def __call__(self, feedback: Feedback, now: float) -> np.ndarray:
         """Where the joints are to be next [rad or m].
@@ -39,7 +46,8 @@ class Brain(Policy):
         Raises:
             ValueError: an object is not seen, or an observation or the action is not finite.
         """
-        seen = self._observer(feedback, self._executor.last, self.action, now)
+        self._targets.append(self._executor.last)
+        seen = self._observer(feedback, self._targets[0], self.action, now)
         action = np.asarray(self.act(seen), float)
         if not np.all(np.isfinite(action)):
             raise ValueError("the policy's action is not finite")
@@ -80,17 +88,27 @@ class Report:
     limited: Mapping[str, int]
 
 
-def run(arm: Guarded, brain: Brain, observer: Observer, clock: Clock, seconds: float, stop: Stop, misses: int = 5) -> Report:
+def run(
+    arm: Guarded,
+    brain: Brain,
+    observer: Observer,
+    clock: Clock,
+    seconds: float,
+    stop: Stop,
+    misses: int = 5,
+    delay: float = 0.0,
+) -> Report:
     """Runs a policy until its time is over, somebody stops it, or something fails. Then the arm holds.
 
     Args:
         seconds: at most.
         stop: asked every cycle; a fault ends the run.
         misses: so many late cycles in a row end it, too.
+        delay: of the arm's targets, see ``Brain.begin`` [s].
     """
     dt = float(brain.metadata["control_dt"])
     gc.disable()  # a collection takes longer than the jitter that is allowed
-    brain.begin(observer, arm.read())
+    brain.begin(observer, arm.read(), delay)
     timing, limited, late, k = Timing(), dict[str, int](), 0, 0
     begun = clock.now()
     try:

@@ -52,7 +52,7 @@ class SafetyCfg:
     load_s: float = 0.5
     temperature: float = 60.0
     misses: int = 5
-    silence: float = 0.1
+    silence: float = 0.08
 
 
 @dataclasses.dataclass(frozen=True)

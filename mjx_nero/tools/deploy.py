@@ -7,9 +7,10 @@ import json
 import pathlib
 import tempfile
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 from mjx_nero import files
+from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
@@ -71,6 +72,8 @@ def _parser() -> cli.Parser:
         help="commanded point, and perhaps orientation W,X,Y,Z (default: the middle of the task's region)",
     )
     add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts (default: %(default)s)")
+    text = "until a target is in force, s, as identify finds it: what the policy sees of its targets is then as late"
+    add("--delay", type=cli.number(Annotated[float, Bounds(0.0, 1.0)]), default=0.0, help=f"{text} (default: %(default)s)")
     add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line of its joints")
     add("--dry-run", action="store_true", help="read the arm, and show what would be sent; nothing is")
     add("--log", type=cli.path(".csv"), help="table of what was read and sent, as identify reads it")
@@ -141,7 +144,7 @@ def _run(args: argparse.Namespace) -> bool:
                 return fault.kind != "stop"
             print("the arm is at home")
         urgent()
-        report = run(remote, brain, observer, clock, args.seconds, stop, safety.misses)
+        report = run(remote, brain, observer, clock, args.seconds, stop, safety.misses, args.delay)
     print(f"the arm holds: {report.fault.text}")
     print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
     print("timing: " + json.dumps(report.timing.summary()))
@@ -156,7 +159,7 @@ def _spec(args: argparse.Namespace, metadata: dict[str, Any], options: dict[str,
     from mjx_nero.deploy.server import Spec
 
     box = _numbers(args.workspace, (6,), "--workspace")
-    pairs = box and [box[0:2], box[2:4], box[4:6]]
+    pairs = [(box[k], box[k + 1]) for k in (0, 2, 4)] if box else None
     for low, high in pairs or ():
         if not low < high:
             raise UserError(f"--workspace takes ranges from low to high, got {low:g} to {high:g}")
@@ -209,7 +212,7 @@ def _simulated(args: argparse.Namespace, metadata: dict[str, Any], folder: pathl
     model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
     path = folder / "scene.mjb"
     mujoco.mj_saveModel(model, str(path), None)
-    objects = {}
+    objects: dict[str, Any] = {}
     for name, item in cfg.scene.objects.items():
         x, y, above = item.pos
         event = next((t for t in cfg.events.values() if t.params.get("object", "cube") == name and "x" in t.params), None)

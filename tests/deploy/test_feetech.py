@@ -210,6 +210,16 @@ def test_one_damaged_answer_is_asked_for_again(bench):
     assert bench.guard.fault is None
 
 
+def test_a_late_answer_is_not_taken_for_the_next_one(bench):
+    """An answer that comes after its time was over belongs to nobody."""
+    bench.start()
+    bench.servos.faults.turnaround = 0.04  # of one servo; the driver waits for 0.03
+    with pytest.raises(ArmError, match="servo 1 does not answer"):
+        bench.arm._bus.read(1, "homing_offset")
+    bench.servos.faults.turnaround = 1e-4
+    assert bench.arm._bus.read(1, "max_position") == bench.arm._servos[0].range_max
+
+
 @pytest.mark.parametrize(
     ("register", "value", "message"),
     [

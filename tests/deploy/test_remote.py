@@ -100,7 +100,7 @@ def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swi
     table = rows(spec)
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
     first = next(float(row["time"]) for row in table if row["held"])
-    assert first - last < 0.13  # a tenth, and what a busy machine adds
+    assert first - last < 0.13  # 0.08, and what a busy machine adds
     assert not gone(arm) and targets(table)[-1] == pytest.approx(targets(table)[-2], abs=1e-4)
     process.send_signal(signal.SIGCONT)  # nothing resumes
     assert process.stdout.readline() == "fault silence\n"

@@ -142,9 +142,19 @@ class Bus:
             try:
                 return {servo: self._answer(servo, size) for servo in servos}
             except ArmError:
+                self._quiet()
                 if not left:
                     raise
         raise AssertionError
+
+    def _quiet(self) -> None:
+        """Waits until nothing comes any more: an answer that is late must not be taken for that to the next request."""
+        for _ in range(4):
+            try:
+                if not self._port.read(256):
+                    return
+            except OSError as error:
+                raise ArmError(f"the port is gone: {error}") from None
 
     def _answer(self, servo: int, size: int) -> bytes:
         try:

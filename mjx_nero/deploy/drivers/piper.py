@@ -76,7 +76,7 @@ class Piper:
         interface, colon, channel = self._port.partition(":")
         if not colon or not channel:
             raise UserError(f"--port of a Piper is INTERFACE:CHANNEL, as in socketcan:can0, got {self._port!r}")
-        options = {"sleep_after_open": 0.1} if interface == "slcan" else {}
+        options: dict[str, Any] = {"sleep_after_open": 0.1} if interface == "slcan" else {}
         try:
             self._bus = can.Bus(interface=interface, channel=channel, bitrate=BITRATE, **options)
         except (can.CanError, OSError, ValueError, TypeError) as error:

@@ -56,7 +56,7 @@ def of(
     tracker: int | None = None,
     start: Sequence[float] | None = None,
     objects: Mapping[str, Sequence[float]] | None = None,
-    **faults: float,
+    **faults: Any,
 ) -> SimArm:
     """The arm of a model's file (``.mjb``).
 
