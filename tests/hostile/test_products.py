@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 import mjx_nero
+from mjx_nero import config
 from mjx_nero.identify.plant import Plant
 from mjx_nero.identify.simulate import RecordCfg
 from mjx_nero.interop.gymnasium import VectorEnv
 from mjx_nero.learn.play import rollout
 from mjx_nero.types import UserError
 
-PAST = {f"observations.{g}.{n}": 256 for g, terms in mjx_nero.env_cfg("nero_lift").observations.items() for n in terms}
-LONG = {f"{name}.history": steps for name, steps in PAST.items()}
-LATE = {f"{name}.delay": (0, steps) for name, steps in PAST.items()}
+_FIELDS = [name for name in config.flatten(mjx_nero.env_cfg("nero_lift")) if name.startswith("observations.")]
+LONG = {name: 256 for name in _FIELDS if name.endswith(".history")}
+LATE = {name: (0, 256) for name in _FIELDS if name.endswith(".delay")}
 
 
 @pytest.fixture(autouse=True)
