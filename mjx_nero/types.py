@@ -5,13 +5,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero.errors import UserError as UserError
 
 Key = jax.Array  # a JAX random key
 TARGET = "target"  # in ``View.objects``: the one of ``CommandTerm.targets`` that the episode commands
 LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
+PHASE = "phase"  # in ``Carry.memory``: which of an expert's phases the episode began in (``Start.phase``); not there: in none
 
 
 @struct.dataclass
@@ -61,7 +62,29 @@ class Start:
     object_pos_w: dict[str, Float[Array, "3"]]  # [m]
     object_quat_w: dict[str, Float[Array, "4"]]  # wxyz
     goal_pos_w: Float[Array, "3"] = struct.field(default_factory=lambda: jnp.zeros(3))  # the first command, drawn before [m]
+    goal_quat_w: Float[Array, "4"] = struct.field(default_factory=lambda: jnp.array([1.0, 0.0, 0.0, 0.0]))
     target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``CommandTerm.targets``
+    pull: Float[Array, " nj"] | float = 0.0  # how far the drives' targets are from the joints: what fingers press with [rad, m]
+    phase: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # of the expert's; 0: not its
+
+
+@struct.dataclass
+class Bank:
+    """States that an expert has visited, in rows [n]; of ``k`` phases, row i is of phase 1 + i % k."""
+
+    start: Start
+    arrived: Bool[Array, " n"]  # the object is nearer to its goal than to where it began, so that goal stays
+
+
+@struct.dataclass
+class Progress:
+    """What ``envs.wrappers.ExpertStarts`` knows. Of a batch, all is [n, ...], to be spread over devices and saved as the
+    environments are."""
+
+    bank: Bank  # an environment has a row of it
+    share: Float[Array, ""]  # of all episodes at most; 0: there is no bank
+    last: Int[Array, ""]  # in which phase the environment's last episode began; -1: none has ended
+    won: Float[Array, ""]  # 1 where that succeeded, else 0
 
 
 @struct.dataclass

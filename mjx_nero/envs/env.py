@@ -22,19 +22,21 @@ from mjx_nero.config import bounds, values
 from mjx_nero.envs import identified
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
-from mjx_nero.mdp import terms
+from mjx_nero.mdp import events, terms
 from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import linkage, obstacles, scene, touch
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, TARGET, Appearance, Carry, Key, Scenery, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, PHASE, TARGET, Appearance, Bank, Carry, Key, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
 _LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key: what draws apart changes no other draw.
-_FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E
+_FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING, _VISITED = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E, 0x715173D
+
+Starts = tuple[Bank, Float[Array, " phases"]]  # states that an expert has visited, and how likely each of its phases is
 
 
 def _precise(method: Callable) -> Callable:
@@ -140,15 +142,16 @@ class ManipulationEnv(Env):
         return {"native": "mujoco", "jax": "mjx-jax", "warp": "mjx-warp"}.get(self.impl, self.impl)
 
     @_precise
-    def reset(self, rng: Key, level: float | Float[Array, ""] | None = None) -> State:
+    def reset(self, rng: Key, level: float | Float[Array, ""] | None = None, starts: Starts | None = None) -> State:
         """A fresh episode: joints at home, objects and command sampled anew.
 
         Args:
             rng: random key of this environment.
             level: what share of all that differs from episode to episode it has; None: all of it.
+            starts: what an expert has visited, to begin there by chance (``events.visited``).
         """
         k_sample, k_obs = jax.random.split(rng)
-        sim, carry = self.sample(k_sample, None if level is None else jnp.asarray(level, jnp.float32))
+        sim, carry = self.sample(k_sample, None if level is None else jnp.asarray(level, jnp.float32), starts)
         obs, carry = self.observe(sim, carry, k_obs)
         names = [f"reward/{name}" for name in self.cfg.rewards]
         names += ["success", "distance", "final_distance", "dropped", "nan", "overflow", *self.cfg.metrics]
@@ -158,26 +161,24 @@ class ManipulationEnv(Env):
         return State(sim, obs, zero, zero, dict.fromkeys(names, zero), info)
 
     @_precise
-    def sample(self, rng: Key, level: Float[Array, ""] | None = None) -> tuple[Sim, Carry]:
-        """The start of an episode, before it is observed. ``level``: see ``reset``."""
-        k_fields, k_memory = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY))
+    def sample(self, rng: Key, level: Float[Array, ""] | None = None, starts: Starts | None = None) -> tuple[Sim, Carry]:
+        """The start of an episode, before it is observed. ``level`` and ``starts``: see ``reset``."""
+        k_fields, k_memory, k_visited = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY, _VISITED))
         rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
         command, command_quat = self._sample_command(k_command)
-        poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
-        start = Start(
-            joint_pos=jnp.asarray(self.cfg.robot.home),
-            object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
-            object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
-            goal_pos_w=jnp.asarray(self.cfg.robot.base_pos) + command,
-        )
+        base = jnp.asarray(self.cfg.robot.base_pos)
+        start = dataclasses.replace(self.blank().start, goal_pos_w=base + command, goal_quat_w=command_quat)
         for key, event in zip(k_events, self.cfg.events.values(), strict=True):
             start = event(key, start)
+        if starts:
+            start = events.visited(k_visited, start, bank=starts[0], chances=starts[1])
+            command = jnp.where(start.phase > 0, start.goal_pos_w - base, command)
         fields = self._randomization(k_fields, level)
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
         sim = Sim(
             qpos=qpos,
             qvel=jnp.zeros(nv),
-            ctrl=qpos[self._viewer.qpos_ids],
+            ctrl=qpos[self._viewer.qpos_ids] + start.pull,
             warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
             fields=fields,
@@ -188,13 +189,28 @@ class ManipulationEnv(Env):
             step=jnp.zeros((), jnp.int32),
             action=jnp.zeros(self.action_size),
             command=command,
-            command_quat=command_quat,
+            command_quat=start.goal_quat_w,
             memory={**({TARGET: start.target} if self.cfg.command.targets else {}), **({} if level is None else {LEVEL: level})},
         )
+        if starts:  # as if the last action had been the one that asks for these targets
+            last = self.actions.invert(sim.ctrl, qpos[self._viewer.qpos_ids])
+            memory = {**carry.memory, PHASE: start.phase}
+            carry = dataclasses.replace(carry, action=jnp.where(start.phase > 0, last, carry.action), memory=memory)
         if self.cfg.obstacles:  # between what is already there: the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
             sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
         return sim, dataclasses.replace(carry, memory=self._memory(k_memory, sim, carry))
+
+    def blank(self) -> Bank:
+        """One row of a bank: joints at home, objects as the scene has them, no goal."""
+        poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
+        start = Start(
+            joint_pos=jnp.asarray(self.cfg.robot.home),
+            object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
+            object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
+            pull=jnp.zeros(len(self.cfg.robot.home)),
+        )
+        return Bank(start, jnp.zeros((), bool))
 
     def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
         """Joints within their ranges, linkages closed, objects in their places; of another size, as far above the table."""
@@ -214,9 +230,17 @@ class ManipulationEnv(Env):
         k_actions, k_terms = jax.random.split(key)
         view = self._viewer(sim, carry, carry.action)
         apart = jax.random.fold_in(key, _SENSORS)
+        acting = self.actions.init(k_actions, view.joint_pos)
+        if PHASE in carry.memory:
+            begun = self.actions.init(k_actions, view.joint_pos, carry.action)
+            begun = self.actions.step({**carry.memory, **begun}, carry.action, view.joint_pos, sim.ctrl)[0]
+            acting = {
+                name: jax.tree.map(functools.partial(jnp.where, carry.memory[PHASE] > 0), begun[name], acting[name])
+                for name in acting
+            }
         return {
             **carry.memory,
-            **self.actions.init(k_actions, view.joint_pos),
+            **acting,
             **terms.init({"sensors": self.cfg.sensors, "pushes": self.cfg.pushes}, apart, view),
             **terms.init(self.cfg.view_terms(), k_terms, view),
             "success.hold": self._hold.init(k_terms, view),
@@ -285,10 +309,10 @@ class ManipulationEnv(Env):
         return self.finish(state, action, sim, overflow)
 
     @_precise
-    def following(self, state: State) -> tuple[Sim, Carry]:
-        """The start of the episode that comes after the one of ``state``, before it is observed."""
+    def following(self, state: State, starts: Starts | None = None) -> tuple[Sim, Carry]:
+        """The start of the episode that comes after the one of ``state``, before it is observed. ``starts``: see ``reset``."""
         carry = state.info["carry"]
-        return self.sample(jax.random.fold_in(carry.rng, _FOLLOWING), carry.memory.get(LEVEL))
+        return self.sample(jax.random.fold_in(carry.rng, _FOLLOWING), carry.memory.get(LEVEL), starts)
 
     @_precise
     def step_and_reset(self, state: State, action: Float[Array, " na"], start: tuple[Sim, Carry] | None = None) -> State:
@@ -307,8 +331,8 @@ class ManipulationEnv(Env):
         rng, k_sample, k_obs = jax.random.split(state.info["carry"].rng, 3)
         level, old = self._next_level(state), (state.pipeline_state, state.info["carry"].replace(rng=rng))
         sim, carry = start or self.sample(k_sample, level)
-        if level is not None:
-            carry = dataclasses.replace(carry, memory={**carry.memory, LEVEL: level})
+        usual = {PHASE: jnp.zeros((), jnp.int32)} if PHASE in old[1].memory else {}
+        carry = dataclasses.replace(carry, memory={**usual, **carry.memory, **({} if level is None else {LEVEL: level})})
         sim, carry = jax.tree.map(lambda new, old: jnp.where(state.done > 0, new, old), (sim, carry), old)
         obs, carry = self.observe(sim, carry, k_obs)
         return state.replace(pipeline_state=sim, obs=obs, info={**state.info, "carry": carry})

@@ -90,10 +90,13 @@ class CurriculumCfg:
         weights: changes the weight of the reward of the same name (``mdp.curriculum``).
         levels: scales randomization, sensors, late observations and actions, the targets' noise, and pushes by each training
             environment's own successes, and rewards by ``curriculum.level_weight``. None: always full, as outside of training.
+        expert_starts: share of the episodes that begin, at first, where the first of the task's controllers has been in episodes
+            of its own; 0: none. It falls to nothing as the usual starts succeed (``curriculum.chances``).
     """
 
     weights: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     levels: Term | None = None
+    expert_starts: Share = 0.0
 
     def __post_init__(self):
         config.freeze(self)

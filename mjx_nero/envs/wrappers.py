@@ -3,19 +3,27 @@
 import mjx_nero.sim.quiet  # noqa: F401
 
 # isort: split
-import jax
-from brax.envs.base import Env, State, Wrapper
+import dataclasses
 
-from mjx_nero.types import Carry, Key, Sim
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from jaxtyping import Array, Float
+
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.mdp import curriculum
+from mjx_nero.types import PHASE, Bank, Carry, Key, Progress, Sim
 
 Start = tuple[Sim, Carry]
+Starts = tuple[Bank, Float[Array, " phases"]]  # and the chance of each phase
+PHASES = 8  # of an expert's way, equally long
 
 
 class AutoReset(Wrapper):
     """Starts a fresh episode in an environment that is done (``ManipulationEnv.step_and_reset``), by the task's curriculum."""
 
-    def reset(self, rng: Key) -> State:
-        return self.env.reset(rng, self.env.first_level)
+    def reset(self, rng: Key, starts: Starts | None = None) -> State:
+        return self.env.reset(rng, self.env.first_level, starts)
 
     def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
         return self.env.step_and_reset(state, action, start)
@@ -24,22 +32,22 @@ class AutoReset(Wrapper):
 class Vectorize(Wrapper):
     """A batch of environments: ``reset`` takes keys [n, ...], ``step`` states and actions [n, ...]."""
 
-    def reset(self, rng: Key) -> State:
-        return jax.vmap(self.env.reset)(rng)
+    def reset(self, rng: Key, starts: Starts | None = None) -> State:
+        return jax.vmap(self.env.reset, (0, None))(rng, starts)
 
     def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
         return jax.vmap(self.env.step)(state, action, start)
 
-    def following(self, state: State) -> Start:
+    def following(self, state: State, starts: Starts | None = None) -> Start:
         """The start of each environment's next episode: see ``ManipulationEnv.step_and_reset``."""
-        return jax.vmap(self.env.following)(state)
+        return jax.vmap(self.env.following, (0, None))(state, starts)
 
 
 class BraxEpisode(Wrapper):
     """The bookkeeping fields that Brax's PPO reads beside ``truncation``."""
 
-    def reset(self, rng: Key) -> State:
-        state = self.env.reset(rng)
+    def reset(self, rng: Key, starts: Starts | None = None) -> State:
+        state = self.env.reset(rng, starts)
         return state.replace(info={**state.info, "episode_metrics": {}, "episode_done": state.done})
 
     def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
@@ -47,6 +55,39 @@ class BraxEpisode(Wrapper):
         return state.replace(info={**state.info, "episode_done": state.done})
 
 
-def for_training(env: Env) -> Env:
-    """Vectorized, auto-resetting, with Brax's bookkeeping."""
-    return BraxEpisode(Vectorize(AutoReset(env)))
+class ExpertStarts(Wrapper):
+    """Begins some episodes where the task's expert has been, in turn with the usual starts (``curriculum.chances``).
+
+    ``reset`` takes the bank; without one all episodes start as usual. Those that a loop does not draw ahead do so, too.
+    """
+
+    def reset(self, rng: Key, bank: Bank | None = None) -> State:
+        n, share = len(rng), self.unwrapped.cfg.curriculum.expert_starts if bank else 0.0
+        rows = bank or jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), jax.eval_shape(self.unwrapped.blank))
+        progress = Progress(rows, jnp.full(n, share, jnp.float32), jnp.full(n, -1, jnp.int32), jnp.zeros(n))
+        state = self.env.reset(rng, _starts(progress))
+        metrics = {**state.metrics, "visited": jnp.zeros(n)}
+        return state.replace(info={**state.info, "starts": progress}, metrics=metrics)
+
+    def following(self, state: State) -> Start:
+        """The start of each environment's next episode."""
+        return self.env.following(state, _starts(state.info["starts"]))
+
+    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
+        progress, phase = state.info["starts"], state.info["carry"].memory[PHASE]
+        state = self.env.step(state, action, start)
+        done = state.done > 0
+        last, won = jnp.where(done, phase, progress.last), jnp.where(done, state.metrics["success"], progress.won)
+        metrics = {**state.metrics, "visited": state.done * (phase > 0)}
+        return state.replace(info={**state.info, "starts": dataclasses.replace(progress, last=last, won=won)}, metrics=metrics)
+
+
+def _starts(progress: Progress) -> Starts:
+    phases = min(PHASES, len(progress.last))
+    return progress.bank, curriculum.chances(progress.last, progress.won, progress.share[0], phases)
+
+
+def for_training(env: ManipulationEnv) -> Env:
+    """Vectorized, auto-resetting, with Brax's bookkeeping, and the expert's starts where the task asks for them."""
+    made = BraxEpisode(Vectorize(AutoReset(env)))
+    return ExpertStarts(made) if env.cfg.curriculum.expert_starts else made

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import jax
     from brax.envs.base import Env
 
-    from mjx_nero.types import Key
+    from mjx_nero.types import Bank, Key
 
 Params = Any  # what a policy acts by: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
@@ -43,8 +43,8 @@ class Learner(Protocol):
     divisor: int
     steps_per_iteration: int
 
-    def init(self, key: "Key") -> Any:
-        """A fresh ``State``."""
+    def init(self, key: "Key", bank: "Bank | None" = None) -> Any:
+        """A fresh ``State``; ``bank`` is for the environments' ``reset``, where the task asks for an expert's starts."""
         ...
 
     def place(self, state: Any) -> Any:

@@ -459,9 +459,13 @@ class Chain:
         self.home = np.concatenate([np.asarray(term.home, np.float32) for term in self.terms.values()])
         self.kinds = [type(term).__name__ for term in self.terms.values() if len(term.home)]
 
-    def init(self, key: Key, joint_pos: Float[Array, " nj"]) -> dict[str, Memory]:
-        """What the terms remember at the start, by their dotted names in the task; those that remember nothing are left out."""
-        act = self._act(jnp.asarray(self.home), joint_pos, joint_pos)
+    def init(self, key: Key, joint_pos: Float[Array, " nj"], action: Float[Array, " na"] | None = None) -> dict[str, Memory]:
+        """What the terms remember at the start, by their dotted names in the task; those that remember nothing are left out.
+
+        Args:
+            action: as it has been till then; None: home's.
+        """
+        act = self._act(jnp.asarray(self.home) if action is None else action, joint_pos, joint_pos)
         memory = {f"actions.{n}": term.init(jax.random.fold_in(key, i), act) for i, (n, term) in enumerate(self.terms.items())}
         return {name: value for name, value in memory.items() if jax.tree.leaves(value)}
 

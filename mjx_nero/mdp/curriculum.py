@@ -47,6 +47,31 @@ class BySuccess:
         return jnp.clip(level + jnp.where(success > 0, self.up, -self.down), 0.0, 1.0)
 
 
+_UNSOLVED = 0.05  # of every phase's weight: the most that a rate of success adds to it is a quarter
+
+
+def chances(last: Int[Array, " n"], won: Float[Array, " n"], share: Float[Array, ""], phases: int) -> Float[Array, " k"]:
+    """How likely the next episodes begin as usual, and in each of an expert's ``phases``.
+
+    Of the environments whose last episode began in phase k, p_k have succeeded (phase 0: the usual start). Then
+
+        chance_k = share * max(0, 1 - 2 p_0) * w_k / sum(w),  w_k = p_k (1 - p_k) + 0.05
+
+    So most begin where the policy succeeds now and then, which moves back from the end to the beginning of the task as it learns;
+    none do from when half of the usual starts succeed.
+
+    Args:
+        last: the phase in which each environment's last episode began; -1: none has ended.
+        won: 1 where that succeeded, else 0.
+        share: of all episodes, at most.
+    """
+    began = last[:, None] == jnp.arange(phases + 1)
+    rate = jnp.sum(began * won[:, None], axis=0) / jnp.maximum(jnp.sum(began, axis=0), 1)
+    weight = rate[1:] * (1 - rate[1:]) + _UNSOLVED
+    expert = share * jnp.maximum(0.0, 1 - 2 * rate[0]) * weight / jnp.sum(weight)
+    return jnp.concatenate([1 - jnp.sum(expert, keepdims=True), expert])
+
+
 def toward(level: Level, plain: Tree, drawn: Tree) -> Tree:
     """From what is plain to what was drawn, as far as the level; None: all the way. Integers are the drawn ones."""
 

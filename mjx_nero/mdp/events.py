@@ -4,10 +4,11 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Counts, NonNegative, Positive, Range
-from mjx_nero.types import Key, Start, UserError
+from mjx_nero.types import Bank, Key, Start, UserError
 
 
 def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Range, object: str = "cube") -> Start:
@@ -131,3 +132,20 @@ def joint_turned(key: Key, start: Start, *, joint: int, by: Range) -> Start:
     """Moves one joint, counted from 0, by a uniform offset [rad or m]; ranges are kept by the caller."""
     offset = jax.random.uniform(key, minval=by[0], maxval=by[1])
     return dataclasses.replace(start, joint_pos=start.joint_pos.at[joint].add(offset))
+
+
+def visited(key: Key, start: Start, *, bank: Bank, chances: Float[Array, " phases"]) -> Start:
+    """Begins where an expert has been, by chance; otherwise the start stays as it is.
+
+    Args:
+        bank: rows of states.
+        chances: of the usual start, and of each of the expert's phases (``curriculum.chances``).
+    """
+    phases, n = len(chances) - 1, len(bank.arrived)
+    which, at = jax.random.uniform(key, (2,))
+    phase = jnp.minimum(jnp.sum(which >= jnp.cumsum(chances)), phases)
+    row = jnp.maximum(phase - 1, 0) + phases * (at * (n // phases)).astype(jnp.int32)
+    found, arrived = jax.tree.map(lambda x: x[row], (bank.start, bank.arrived))
+    goal = {name: jnp.where(arrived, getattr(found, name), getattr(start, name)) for name in ("goal_pos_w", "goal_quat_w")}
+    found = dataclasses.replace(found, phase=phase, **goal)
+    return jax.tree.map(lambda there, usual: jnp.where(phase > 0, there, usual), found, start)

@@ -25,9 +25,9 @@ def learner(run):
     return _learners[key]
 
 
-def starter(learner):
+def starter(learner, bank):
     if id(learner) not in _starters:
-        _starters[id(learner)] = _start(learner)
+        _starters[id(learner)] = _start(learner, bank)
     return _starters[id(learner)]
 
 

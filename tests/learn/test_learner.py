@@ -38,10 +38,10 @@ class Search:
         self.env, self.cfg, self.num_envs, self.num_devices, self.divisor = env, cfg, cfg.num_envs, num_devices, 1
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
 
-    def init(self, key):
+    def init(self, key, bank=None):
         k_env, key = jax.random.split(key)
         action = jnp.zeros(self.env.action_size)
-        env_state = self.env.reset(jax.random.split(k_env, self.num_envs))
+        env_state = self.env.reset(jax.random.split(k_env, self.num_envs), bank)
         return SearchState(action, jnp.array(-jnp.inf), env_state, key, jnp.zeros((), jnp.int32))
 
     def place(self, state):

@@ -19,6 +19,7 @@ from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, device_memory
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import Learner, PpoCfg, _before, _bound_std, fit
+from mjx_nero.types import PHASE
 
 SMALL = PpoCfg(
     num_envs=8,
@@ -374,6 +375,29 @@ def resumes(run, state, template, path):
 
 def test_a_saved_run_goes_on_bit_for_bit(learner, run, fresh, tmp_path):
     resumes(lambda s: run(s, 1), fresh, jax.eval_shape(learner.init, KEY), tmp_path / "state.safetensors")
+
+
+@pytest.mark.slow
+def test_a_saved_run_with_an_experts_starts_goes_on_bit_for_bit(tmp_path):
+    """Its bank is in the checkpoint: episodes that begin after it begin in the same of its states."""
+    env = make("nero_lift", impl="jax", **{"curriculum.expert_starts": 0.5})
+    env.physics = Kinematic()
+    learner = Learner(wrappers.for_training(env), SMALL)
+    run = jax.jit(learner.run, static_argnums=1)
+    n, row = SMALL.num_envs, env.blank()
+    bank = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), row)
+    high = jnp.stack([jnp.full(n, 0.35), jnp.zeros(n), 0.1 + 0.01 * jnp.arange(n)], axis=1)
+    bank = bank.replace(start=bank.start.replace(object_pos_w={"cube": high}))
+    state = jax.jit(learner.init)(KEY, bank)
+    info = state.env_state.info
+    soon = info["carry"].replace(step=jnp.full(n, 245, jnp.int32))
+    state = state.replace(env_state=state.env_state.replace(info={**info, "carry": soon}))
+    half, _ = run(state, 1)  # all episodes have ended once
+    visited = np.asarray(half.env_state.info["carry"].memory[PHASE]) > 0
+    assert 0 < visited.sum() < n
+    np.testing.assert_array_equal(half.env_state.pipeline_state.qpos[:, 11] > 0.09, visited)
+    np.testing.assert_array_equal(half.env_state.info["starts"].bank.start.object_pos_w["cube"], high)
+    resumes(lambda s: run(s, 1), state, jax.eval_shape(learner.init, KEY), tmp_path / "state.safetensors")
 
 
 # --- with physics

@@ -27,7 +27,7 @@ MISTAKES = [
     (["--seeds", "-1"], "--seeds must be at least 1, got '-1'"),
     (["--env", "nero_lft"], "unknown env 'nero_lft' (did you mean 'nero_lift'?)"),
     (["--env", "reach"], "reach is for any robot: pass one (--robot"),
-    (["--what", "control"], "nero_lift has no controller, only policies"),
+    (["--env", "nero_push", "--what", "control"], "nero_push has no controller, only policies"),
     (["--what", "step,ppo", "--num-envs", "8,12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
     (["--what", "learning", "--num-envs", "12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
     (["--what", "ppo", "--num-envs", "8", "--num-devices", "99"], "num_devices is 99, but JAX finds"),
@@ -191,7 +191,7 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     runs = Runs([[0.0, 0.5, 0.95, 1.0, 1.0], [0.2, 1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.2, 0.9, 0.94]])
     asked = []
     monkeypatch.setattr(compiled, "make_learner", lambda run: asked.append(run) or runs)
-    monkeypatch.setattr(compiled, "starter", lambda runs: lambda seed: runs.init(jax.random.PRNGKey(seed)))
+    monkeypatch.setattr(compiled, "starter", lambda runs, bank: lambda seed: runs.init(jax.random.PRNGKey(seed)))
     monkeypatch.setattr(compiled, "compile", Runs.compiled)
     argv = ["--what", "learning", "--num-envs", 8, "--impl", "native", "--seeds", 3, "--num-timesteps", 70, "--eval-every", 29]
     fields = ["--ppo.max_learning_rate", "5e-4", "--env.episode_length_s", "2"]

@@ -2,8 +2,10 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 from mjx_nero.config.bounds import Range
+from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
@@ -16,8 +18,11 @@ from mjx_nero.mdp.terms import (
     Term,
     privileged,
 )
+from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
+
+CLOSING = 0.3  # [s] the script's fingers take to close, at least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +49,16 @@ class LiftSetup:
     def held(self) -> dict[str, float]:
         """... and held, if it is this near to the grasp point [m]."""
         return {**self.lifted, "grasp_radius": self.grasp_radius}
+
+    def controllers(self, robot: RobotCfg) -> dict[str, dict[str, Any]]:
+        """The script that picks the cube up."""
+        edge = self.scene.objects["cube"].size[0]
+        fields = {
+            "lowest": grasp.lowest(robot.pad),
+            "beyond": grasp.beyond(robot, edge),
+            "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+        }
+        return {"pick_up": {**fields, **regions.ik(robot, "ik.")}}
 
 
 def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
@@ -145,6 +160,7 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
         curriculum=CurriculumCfg(),
+        controllers=setup.controllers(robot),
         training=CALM,
     )
 

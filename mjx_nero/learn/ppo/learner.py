@@ -46,7 +46,7 @@ from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
 from mjx_nero.learn.ppo.cfg import differing, fit
 from mjx_nero.learn.ppo.networks import from_meta, init_params, make_act, make_networks, shapes
-from mjx_nero.types import Key
+from mjx_nero.types import Bank, Key
 
 Metrics = dict[str, Float[Array, ""]]
 Tree = TypeVar("Tree")
@@ -128,11 +128,11 @@ class Learner:
         self._optimizer = optax.flatten(optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam))
         self._make_policy = networks.make_inference_fn(self.networks)
 
-    def init(self, key: Key) -> TrainState:
+    def init(self, key: Key, bank: Bank | None = None) -> TrainState:
         """Fresh networks and environments, the latter spread over their episodes so that they don't all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.networks, self.sizes, k_net)
-        env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs))
+        env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs), bank)
         carry = env_state.info["carry"]
         phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
         env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})

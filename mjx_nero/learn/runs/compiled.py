@@ -15,6 +15,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import device_memory, learner
 from mjx_nero.learn.learner import Learner, Metrics
 from mjx_nero.learn.play import rollout
+from mjx_nero.learn.runs import starts
 from mjx_nero.learn.runs.cfg import RunCfg
 
 
@@ -75,10 +76,22 @@ def make_learner(run: RunCfg) -> Learner:
     return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
 
 
-def starter(learner: Learner) -> Callable[[int], Any]:
-    """Makes a new run's state of a seed, by one program."""
+def fresh(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
+    """Makes a new run's state of a seed, by one program, with the bank of that seed."""
     init = jax.jit(learner.init)
-    return lambda seed: learner.place(init(jax.random.PRNGKey(seed)))
+
+    def start(seed: int) -> Any:
+        found = bank(seed)
+        given = () if found is None else (found,)  # not every learner has a use for it
+        return init(jax.random.PRNGKey(seed), *given)
+
+    return start
+
+
+def starter(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
+    """``fresh``, and the state where ``learner.run`` takes it."""
+    start = fresh(learner, bank)
+    return lambda seed: learner.place(start(seed))
 
 
 def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any]) -> Compiled:
@@ -97,8 +110,8 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         starting = side_by_side.submit(start)
         shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
         program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
-        state = starting.result()
         compiling = side_by_side.submit(program.compile, env.physics.compiler_options)
+        state = starting.result()
         evaluate = Evaluator(run, learner)
         waiting.append(side_by_side.submit(evaluate.compiler(state)))
         advance = compiling.result()

@@ -208,7 +208,7 @@ class Loop:
             "overflow_count": self.tally.overflow_count,
         }
         episodes = max(sums.get("episodes", 0.0), 1e-9)
-        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "dropped", "final_distance", LEVEL) if n in sums}
+        row |= {f"train/{n}": sums[n] / episodes for n in ("success", "dropped", "final_distance", "visited", LEVEL) if n in sums}
         terms = learner.env.unwrapped.cfg.metrics
         row |= {f"train/{name}": value for name, value in figures.of_sums(terms, sums, episodes)}
         row |= {name: value / per * length for name, value in sums.items() if name.startswith("reward/")}

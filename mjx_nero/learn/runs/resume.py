@@ -14,7 +14,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
 from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.policy import checkpoint_policy
-from mjx_nero.learn.runs import checkpoints, compiled
+from mjx_nero.learn.runs import checkpoints, compiled, starts
 from mjx_nero.learn.runs import trust as trust_of
 from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
 from mjx_nero.learn.runs.folder import CONFIG
@@ -218,22 +218,24 @@ def _flag(value: Any) -> str:
     return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
-def state(source: Source | None, learner: Learner, seed: int) -> Any:
+def state(source: Source | None, learner: Learner, seed: int, bank: starts.Make = starts.none) -> Any:
     """A fresh state, or that of a checkpoint; of a policy file, its networks alone.
+
+    Args:
+        bank: of a fresh one, what its environments start from.
 
     Raises:
         UserError: another version's, damaged, or its networks hold numbers that are not finite.
     """
     if source is None:
-        return compiled.starter(learner)(seed)
-    key = jax.random.PRNGKey(seed)
-    like = jax.eval_shape(learner.init, key)
+        return compiled.starter(learner, bank)(seed)
+    like = jax.eval_shape(learner.init, jax.random.PRNGKey(seed))
     if not source.is_checkpoint:
         networks = checkpoint_policy(source.path).params  # before compiling takes its time
         if (found := _shapes(networks)) != (wanted := _shapes(learner.policy(like))):
             name = min(found.items() ^ wanted.items())[0]
             raise UserError(f"{source.path} does not fit: {name} is {found.get(name)}, expected {wanted.get(name)}")
-        return learner.place(learner.with_policy(jax.jit(learner.init)(key), networks))
+        return learner.place(learner.with_policy(compiled.fresh(learner, bank)(seed), networks))
     try:
         held = checkpoint.load(source.path, like)
         checkpoint.check_finite(learner.policy(held), source.path)

@@ -15,7 +15,7 @@ from mjx_nero.config.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson
-from mjx_nero.learn.runs import compiled, signals, training
+from mjx_nero.learn.runs import compiled, signals, starts, training
 from mjx_nero.learn.runs import folder as run_folder
 from mjx_nero.learn.runs.cfg import RunCfg, fit_machine
 from mjx_nero.learn.runs.loop import Diverged, Tally
@@ -63,7 +63,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
                 raise UserError(f"{home} already holds a run: pass other --seeds or another --out, or --restore {home} alone")
         if note:
             say(note)
-        start = compiled.starter(learner)
+        start = compiled.starter(learner, starts.maker(learner, say))
         made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):

@@ -17,7 +17,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, header, machines, policy
 from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
-from mjx_nero.learn.runs import compiled, resume, signals, track, trust
+from mjx_nero.learn.runs import compiled, resume, signals, starts, track, trust
 from mjx_nero.learn.runs import folder as run_folder
 from mjx_nero.learn.runs.cfg import RunCfg, fit_machine, learner_cfg, resolve
 from mjx_nero.learn.runs.checkpoints import Checkpoints, NotWritten, saved
@@ -69,7 +69,8 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             say(note)
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} goes on with {changes}")
-        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed), folder)
+        bank = starts.maker(learner, say)
+        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank), folder)
         return carry_out(run, made, tally, meta, folder, command)
 
 

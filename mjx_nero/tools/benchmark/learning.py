@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import jax
 
-from mjx_nero.learn.runs import compiled
+from mjx_nero.learn.runs import compiled, starts, training
 from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.tools.benchmark.program import Row
 
@@ -18,7 +18,8 @@ def measure_learning(run: RunCfg, seeds: int, target: float) -> Iterator[Row]:
     """A row a seed, then one about all.
 
     Each seed trains until an evaluation's success reaches ``target``, or its env steps are used up. Seconds are wall time of
-    training and evaluations, without compilation. All seeds are judged by the same episodes.
+    training, evaluations and whatever a training begins with (an expert's states), without compilation. All seeds are judged by
+    the same episodes.
 
     Args:
         run: of ``run_cfg.fit_machine``; ``eval_every`` 0 evaluates 24 times a whole run.
@@ -28,7 +29,7 @@ def measure_learning(run: RunCfg, seeds: int, target: float) -> Iterator[Row]:
     between = run.eval_every or run.num_timesteps // _EVALUATIONS
     chunk = max(1, between // learner.steps_per_iteration)
     begun = time.perf_counter()
-    fresh = compiled.starter(learner)
+    fresh = compiled.starter(learner, starts.maker(learner, training.speaker()))
     made = compiled.compile(run, learner, chunk, lambda: fresh(0))
     calls = math.ceil(run.num_timesteps / made.steps)
     state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call
@@ -37,9 +38,9 @@ def measure_learning(run: RunCfg, seeds: int, target: float) -> Iterator[Row]:
 
     rows = []
     for seed in range(seeds):
+        begun = time.perf_counter()
         state = jax.block_until_ready(fresh(seed))
         evaluating, nans, overflows, success, done = 0.0, 0.0, 0.0, 0.0, 0
-        begun = time.perf_counter()
         while done < calls and success < target:
             state, metrics = jax.block_until_ready(made.advance(state))
             done += 1
