@@ -219,7 +219,7 @@ def test_a_hand_leaves_what_is_held_above_its_grasp_point(hand):
     stack = env_cfg("stack", robot=low)
     leave, clearance = (
         stack.controllers["pick_place"]["end_effector_initial_height"],
-        stack.success.condition.params["clearance"],
+        stack.success.condition.params["place"].clearance,
     )
     edge = 2 * rest
     assert leave - (rest + edge) > clearance + 0.005  # over the upper cube's middle
