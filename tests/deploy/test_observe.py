@@ -73,7 +73,7 @@ def test_what_an_arm_cannot_give_is_refused():
 def test_every_shipped_policy_of_one_object_can_be_observed():
     for env_name in ("nero_lift", "nero_push", "cobotta_lift", "so100_lift", "piper_lift", "so101_reach"):
         env = mjx_nero.make(env_name, impl="native")
-        for term in env.cfg.observations["state"].values():
+        for term in env.cfg.observations["state"].terms.values():
             assert term.name in TERMS, (env_name, term.name)
 
 

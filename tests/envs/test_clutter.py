@@ -187,7 +187,10 @@ def near(term: str) -> dict:
     ("changes", "message"),
     [
         (near("bal"), "^rewards.near.params.object is 'bal', and the scene's objects are: box, .*, pill, target$"),
-        ({"targets": ("box", "ball")}, "^targets names ball: not one of box, bar, cylinder, sphere, capsule, pill$"),
+        (
+            {"command": dataclasses.replace(CFG.command, targets=("box", "ball"))},
+            "^command.targets names ball: not one of box, bar, cylinder, sphere, capsule, pill$",
+        ),
         (
             {"metrics": {"grasped": MetricTerm(metrics.Grasped, params={**HELD, "minimal_height": (0.02, 0.03)})}},
             "^metrics.grasped.params.minimal_height is one height, or one for each of 6 targets$",
