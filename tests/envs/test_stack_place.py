@@ -35,7 +35,7 @@ def test_every_arm_stacks_cubes_of_its_own_size(robot):
     assert max(np.ptp(x), np.ptp(y)) > apart
     fields = dict(cfg.controllers["pick_place"])
     assert fields["tower"] == ("blue", "red") and fields["rise"] == edge
-    above = cfg.robot.pick[2][0] + edge + cfg.success.condition.params["clearance"]
+    above = cfg.robot.pick[2][0] + edge + cfg.success.condition.params["place"].clearance
     assert fields["end_effector_initial_height"] > above  # or the hand never counts as away
     assert cfg.robot.gravity_compensation
 
@@ -97,7 +97,7 @@ def test_fingers_that_press_turn_back_before_their_speed_is_limited(name):
 def test_a_cube_that_leans_on_its_edge_is_not_held(name):
     cfg = env_cfg(name)
     edge = cfg.scene.objects["red"].size[0]
-    assert cfg.rewards["holding_object"].params["minimal_height"] > edge / math.sqrt(2)
+    assert cfg.rewards["holding_object"].params["place"].minimal_height > edge / math.sqrt(2)
     assert cfg.metrics["grasped"].params["minimal_height"] == pytest.approx(0.75 * edge)
     assert cfg.rewards["approaching"].params["flat"] == edge / 2  # as far as it counts as over its place
 
@@ -108,8 +108,9 @@ def test_a_box_that_is_only_tipped_over_an_edge_is_not_held(robot):
     long, _, high = cfg.scene.objects["box"].size
     angles = np.radians(np.arange(91))  # until it stands on its end
     highest = max(np.sin(angles) * long / 2 + np.cos(angles) * high / 2)
-    for term in (cfg.rewards["holding_object"], cfg.rewards["approaching"], cfg.metrics["grasped"]):
-        assert highest < term.params["minimal_height"] < highest + 0.004
+    heights = [cfg.rewards[name].params["place"].minimal_height for name in ("holding_object", "approaching")]
+    for height in (*heights, cfg.metrics["grasped"].params["minimal_height"]):
+        assert highest < height < highest + 0.004
     assert cfg.rewards["approaching"].params["flat"] == 0.02  # as far as it counts as over its place
 
 
