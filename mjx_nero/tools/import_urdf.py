@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> None:
     )
     _print(report)
     if args.self_test:
-        _test(report)
+        _test(report, args.tries)
     # A bare name might be one of the package's robots.
     out = shlex.quote(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
     console.line(console.screen(), f"next: {cli.called_as('inspect')} {out}; {cli.called_as('train')} --env reach --robot {out}")
@@ -94,18 +94,19 @@ def _parser() -> cli.Parser:
         "--scale", type=cli.positive_float, metavar="FACTOR", help="of all lengths but the meshes': 0.001 for millimetres"
     )
     parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="of the meshes, besides their own")
+    parser.add_argument("--tries", type=cli.at_most(1000), metavar="N", help="tries of the self-test (default: 8)")
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="do not try the robot in simulation")
     parser.add_argument("--strict", action="store_true", help="a warning is an error")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
     return parser
 
 
-def _test(report: Report) -> None:
+def _test(report: Report, tries: int | None) -> None:
     """Tries the robot in simulation. What comes of it stands in its report; a failure undoes nothing."""
     from mjx_nero.tools import self_test  # with JAX, which reading a URDF does without
 
     cli.setup_jax()
-    found = self_test.run(robot_file.read(report.folder))
+    found = self_test.run(robot_file.read(report.folder), tries or self_test.TRIES)
     folder.record(report.folder, "self_test", found.json())
     console.line(console.screen(), found.line, "green" if found.passed else "yellow")
 

@@ -1,12 +1,12 @@
-"""The table of public robots: each of a list imported and tried with the script. See --help."""
+"""The table of public robots: each of a list imported, its self-test included. See --help."""
 
 import pathlib
 import shlex
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,10 @@ from mjx_nero.config import values
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
-EPISODES = 16
+TRIES = 16
 ENOUGH = 14  # of them succeed
-_LONGEST = 300  # seconds for an import or its episodes
-_COLUMNS = ("robot", "repository, commit", "file", "flags", "gripper", "opening", "`pick_place`", "seconds to import", "remarks")
+_LONGEST = 300  # seconds for an import and its self-test
+_COLUMNS = ("robot", "repository, commit", "file", "flags", "gripper", "opening", "grasped", "placed", "remarks")
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,14 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
         prog=cli.called_as("public-robots"),
-        description="Imports the robots of a list, lets the script pick and place with each, and makes the table of it.",
+        description="Imports the robots of a list, each with its self-test, and makes the table of it.",
     )
     parser.add_argument("list", type=cli.path(".yaml"), help="repositories with their commits, and robots")
     parser.add_argument("--folder", type=cli.path(), required=True, help="where the repositories lie, as OWNER+NAME")
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="the figures; what it holds already is kept")
     parser.add_argument("--markdown", type=cli.path(".md"), help="write the table of all that the JSON file holds")
     parser.add_argument("--robots", help="list (default: all that the JSON file lacks); none: only the table")
+    parser.add_argument("--jobs", type=cli.at_most(100), default=1, help="robots at once (default: %(default)s)")
     args, _ = parser.parse(argv)
     commits, robots = read(args.list)
     files.check_writable(args.json)
@@ -54,10 +55,11 @@ def main(argv: Sequence[str]) -> None:
         names = []
     else:
         names = cli.choices(args.robots, "robot", robots) if args.robots else [n for n in robots if n not in held]
-    for name in names:
-        held[name] = trial(robots[name], args.folder)
-        files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
-        print(f"{name}: {_result(held[name])}", file=sys.stderr)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for name, row in zip(names, pool.map(lambda name: trial(robots[name], args.folder), names), strict=True):
+            held[name] = row
+            files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
+            print(f"{name}: {row.get('reason') or _said(row)}", file=sys.stderr)
     if args.markdown:
         with files.whole(args.markdown) as part:
             part.write_text(markdown(commits, robots, held))
@@ -99,22 +101,13 @@ def figures(path: pathlib.Path) -> dict[str, Any]:
 
 
 def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
-    """A robot imported and tried, or the line that says why not."""
+    """Imports a robot and reads its self-test, or the line that says why that failed."""
     source = folder / robot.repository.replace("/", "+") / robot.file
     packages = [word for package in robot.packages for word in ("--package", _below(folder, package))]
     with tempfile.TemporaryDirectory() as scratch:
-        out, result = pathlib.Path(scratch, "robot"), pathlib.Path(scratch, "result.json")
-        begun = time.monotonic()
-        failed = _failure("import-urdf", source, "--out", out, *packages, *shlex.split(robot.flags))
-        if failed:
-            return {"failed": "import", "reason": failed.replace(f"{folder}/", "")}
-        row: dict[str, Any] = {"seconds": round(time.monotonic() - begun, 1), **_imported(out, folder)}
-        play = ("--controller", "expert", "--backend", "mujoco", "--episodes", EPISODES, "--json", result)
-        failed = _failure("eval", "--env", "pick_place", "--robot", out, *play)
-        if failed:
-            return row | {"failed": "episodes", "reason": failed}
-        played = figures(result)
-        return row | {name: played[name] for name in ("success_rate", "grasp_rate", "dropped_rate", "episodes")}
+        out = pathlib.Path(scratch, "robot")
+        failed = _failure("import-urdf", source, "--out", out, "--tries", TRIES, *packages, *shlex.split(robot.flags))
+        return {"failed": "import", "reason": failed.replace(f"{folder}/", "")} if failed else _imported(out, folder)
 
 
 def _below(folder: pathlib.Path, package: str) -> str:
@@ -135,41 +128,39 @@ def _failure(command: str, *words: object) -> str:
 
 
 def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
-    """Collects what an import says of the gripper, and its warnings."""
+    """Collects what an import says of the gripper, its warnings and its self-test."""
     robot, report = files.read_yaml(out / "robot.yaml"), figures(out / "report.json")
     return {
         "gripper": list(robot["gripper"] or ()),
         "opening": robot["opening"],
-        "warnings": [text.replace(f"{folder}/", "") for text in (*report["warnings"], *_self_test(report))],
+        "warnings": [text.replace(f"{folder}/", "") for text in report["warnings"]],
+        "self_test": {name: report["self_test"][name] for name in ("script", "tries", "good", "placed", "passed", "line")},
     }
-
-
-def _self_test(report: Mapping[str, Any]) -> list[str]:
-    """The line of an import's self-test that did not pass."""
-    found = report.get("self_test") or {"passed": True}
-    return [] if found["passed"] else [found["line"]]
 
 
 def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Mapping[str, dict[str, Any]]) -> str:
     """The table as Markdown, a row a robot that was tried."""
-    good = sum(_success(row) >= ENOUGH for row in held.values())
+    tested = [row["self_test"] for row in held.values() if "failed" not in row]
+    good, placed = (sum(row["script"] == "pick_place" and row[name] >= ENOUGH for row in tested) for name in ("good", "placed"))
     lines = [_COLUMNS, tuple("---" for _ in _COLUMNS)]
     for name, robot in robots.items():
         if row := held.get(name):
             where = f"{robot.repository} {commits[robot.repository]}"
             flags = " ".join([robot.flags, *(f"--package {package}" for package in robot.packages)]).strip()
             opening = f"{1000 * row['opening']:.0f} mm" if row.get("opening") else ""
-            said = row.get("reason") or "; ".join(row["warnings"])
-            result = "" if "failed" in row else _result(row)
-            cells = name, where, robot.file, flags and f"`{flags}`", ", ".join(row.get("gripper", [])), opening, result
-            lines.append((*cells, str(row.get("seconds", "")), said.replace("|", "\\|")))
+            said = row.get("reason") or "; ".join([*row["warnings"], *([] if row["self_test"]["passed"] else [_said(row)])])
+            cells = name, where, robot.file, flags and f"`{flags}`", ", ".join(row.get("gripper", [])), opening
+            lines.append((*cells, _share(row, "good"), _share(row, "placed"), said.replace("|", "\\|")))
     table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return f"{good} of {len(held)} robots succeed in at least {ENOUGH} of {EPISODES} episodes.\n\n{table}"
+    counts = f"{len(tested)} of {len(held)} robots are imported. {good} grasp the cube in at least {ENOUGH} of {TRIES} tries"
+    return f"{counts}, {placed} put it where it belongs as often.\n\n{table}"
 
 
-def _success(row: Mapping[str, Any]) -> int:
-    return round(row.get("success_rate", 0) * row.get("episodes", 0))
+def _said(row: Mapping[str, Any]) -> str:
+    return str(row["self_test"]["line"])
 
 
-def _result(row: Mapping[str, Any]) -> str:
-    return f"{row['failed']}: {row['reason']}" if "failed" in row else f"{_success(row)} of {row['episodes']}"
+def _share(row: Mapping[str, Any], what: str) -> str:
+    """How many tries of the script came to something; empty if there were none."""
+    found = row.get("self_test", {"script": ""})
+    return f"{found[what]} of {found['tries']}" if found["script"] == "pick_place" else ""

@@ -60,17 +60,20 @@ def test_a_robot_that_fails_stands_in_the_table_with_its_reason(tmp_path):
     assert "no joint that moves" in rows["Box"]["reason"] and rows["Other"]["reason"] == "there is no file a+b/x.urdf"
     text = table.read_text()
     assert (
-        text.startswith("0 of 2 robots succeed") and "| Box | a/b abc1234 | box.urdf |" in text and rows["Box"]["reason"] in text
+        text.startswith("0 of 2 robots are imported. 0 grasp")
+        and "| Box | a/b abc1234 | box.urdf |" in text
+        and rows["Box"]["reason"] in text
     )
 
 
 def test_the_table_counts_robots_that_mostly_succeed():
     robots = {"A": public_robots.Public("a/b", "a.urdf", "--arg x:=1", ("c+d/e",)), "B": public_robots.Public("a/b", "b.urdf")}
-    row = {"episodes": 16, "seconds": 9.5, "gripper": ["jaw"], "opening": 0.08, "warnings": ["B: a|b"]}
-    held = {"A": row | {"success_rate": 14 / 16}, "B": row | {"success_rate": 13 / 16}}
+    row = {"gripper": ["jaw"], "opening": 0.08, "warnings": ["B: a|b"]}
+    tried = {"script": "pick_place", "tries": 16, "good": 14, "placed": 13, "passed": False, "line": "self-test: lost"}
+    held = {"A": row | {"self_test": tried}, "B": row | {"self_test": tried | {"script": "reach", "good": 16}}}
     text = public_robots.markdown({"a/b": "abc1234"}, robots, held)
     assert (
-        text.startswith("1 of 2 robots")
-        and "`--arg x:=1 --package c+d/e` | jaw | 80 mm | 14 of 16 | 9.5" in text
-        and "a\\|b" in text
+        text.startswith("2 of 2 robots are imported. 1 grasp the cube in at least 14 of 16 tries, 0 put it")
+        and "`--arg x:=1 --package c+d/e` | jaw | 80 mm | 14 of 16 | 13 of 16 | B: a\\|b; self-test: lost |" in text
+        and "| b.urdf |  | jaw | 80 mm |  |  |" in text
     )

@@ -49,11 +49,11 @@ SEEN = {
 }
 
 
-def run(robot: RobotCfg) -> Result:
+def run(robot: RobotCfg, tries: int = TRIES) -> Result:
     """Tests a robot for some seconds, in MuJoCo's C library. JAX computes on the CPU, for which programs compile sooner."""
     begun = time.monotonic()
     with jax.default_device(jax.devices("cpu")[0]):
-        tried = _tried(robot)
+        tried = _tried(robot, tries)
     return Result(
         gripper=_gripper(robot),
         home=_home(robot),
@@ -95,7 +95,7 @@ def _home(robot: RobotCfg) -> str:
     return f"at home {', '.join(found[:2])}{more}: look at home" if found else ""
 
 
-def _tried(robot: RobotCfg) -> dict[str, Any]:
+def _tried(robot: RobotCfg, tries: int) -> dict[str, Any]:
     """What of a result is about the tries."""
     none = {"script": "", "tries": 0, "good": 0, "placed": 0, "failures": {}}
     if len(robot.arm.joints) > MOST_JOINTS:
@@ -103,11 +103,11 @@ def _tried(robot: RobotCfg) -> dict[str, Any]:
     reason = ""
     if robot.gripper.joints:
         try:
-            return _grasps(registry.env_cfg("pick_place", robot=robot))
+            return _grasps(registry.env_cfg("pick_place", robot=robot), tries)
         except UserError as error:
             reason = str(error)
     try:
-        return _reaches(registry.env_cfg("follow_target", robot=robot), reason)
+        return _reaches(registry.env_cfg("follow_target", robot=robot), tries, reason)
     except UserError as error:
         return {**none, "reason": reason or str(error)}
 
@@ -137,27 +137,27 @@ class _Goer:
         return ""
 
 
-def _reaches(cfg: EnvCfg, reason: str) -> dict[str, Any]:
+def _reaches(cfg: EnvCfg, tries: int, reason: str) -> dict[str, Any]:
     """Tries of an arm that does not grasp: to points of its workspace."""
     robot, dt = cfg.robot, cfg.sim.dt * cfg.sim.decimation
     box = robot.workspace or robot.pick
     assert box is not None  # follow_target asks for it
-    goals, goer = _drawn(box), _Goer(robot, dt)
+    goals, goer = _drawn(box, tries), _Goer(robot, dt)
 
     def watch(memory: Any, view: View) -> dict[str, Array]:
         return {"away": jnp.linalg.norm(view.ee_pos_w - view.goal_pos_w)}
 
     away = play(cfg, goer, round(goer.seconds / dt), {}, goals, watch)["away"][-1]
     good = int((away < REACHED).sum())
-    if good < TRIES and not reason:
+    if good < tries and not reason:
         reason = f"it stays up to {1e3 * np.nanmax(away):.0f} mm from the others: look at workspace and at the gains"
-    return {"script": "reach", "tries": TRIES, "good": good, "placed": 0, "failures": {}, "reason": reason}
+    return {"script": "reach", "tries": tries, "good": good, "placed": 0, "failures": {}, "reason": reason}
 
 
-def _grasps(cfg: EnvCfg) -> dict[str, Any]:
+def _grasps(cfg: EnvCfg, tries: int) -> dict[str, Any]:
     """Tries of a hand: the cube from where the task puts it to where it belongs."""
     dt, lies, goal = cfg.sim.dt * cfg.sim.decimation, cfg.events["reset_object_position"].params, cfg.command.params
-    places, goals = _drawn([lies[k] for k in "xy"]), _drawn([goal[k] for k in "xyz"], seed=1)
+    places, goals = _drawn([lies[k] for k in "xy"], tries), _drawn([goal[k] for k in "xyz"], tries, seed=1)
     script = control.make("pick_place", cfg.robot, dt, cfg.controllers["pick_place"])
     assert isinstance(script, PickPlace)
     n, closed = len(cfg.robot.arm.joints), jnp.asarray(script.gripper.closed)
@@ -181,14 +181,14 @@ def _grasps(cfg: EnvCfg) -> dict[str, Any]:
         failures.setdefault(phase, []).append(text)
     most = max(failures.values(), key=len, default=[""])
     counts = {phase: len(texts) for phase, texts in failures.items()}
-    done = {"tries": TRIES, "good": int(held.sum()), "placed": int(placed.sum())}
+    done = {"tries": tries, "good": int(held.sum()), "placed": int(placed.sum())}
     return {"script": "pick_place", **done, "failures": counts, "reason": most[0]}
 
 
-def _drawn(box: Sequence[Range], seed: int = 0) -> np.ndarray:
-    """Random points [TRIES, len(box)] of a box, always the same."""
+def _drawn(box: Sequence[Range], tries: int, seed: int = 0) -> np.ndarray:
+    """Random points [tries, len(box)] of a box, always the same."""
     low, high = np.array(box).T
-    return low + (high - low) * np.random.default_rng(seed).random((TRIES, len(box)))
+    return low + (high - low) * np.random.default_rng(seed).random((tries, len(box)))
 
 
 def _failure(seen: dict[str, np.ndarray], ends: np.ndarray, grasped: bool) -> tuple[str, str]:
