@@ -2,7 +2,6 @@
 
 import arms
 import numpy as np
-import pytest
 
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.drivers import feetech, so_arm
@@ -73,11 +72,3 @@ def success(lift, episodes, faults, seed=0):
 def test_episodes_succeed(lift):
     share, ended = success(lift, 2, Faults(late=0.04))
     assert share == 1.0 and not ended
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("faults", "least"), [(Faults(), 0.95), (Faults(stiffness=0.8, late=0.04), 0.85)])
-def test_a_hundred_episodes_succeed(lift, faults, least):
-    """With drives of the model's, and with drives 20% softer and 40 ms late."""
-    share, ended = success(lift, 100, faults)
-    assert share >= least, (share, ended)
