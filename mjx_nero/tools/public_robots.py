@@ -1,6 +1,7 @@
 """The table of public robots: each of a list imported, its self-test included. See --help."""
 
 import pathlib
+import re
 import shlex
 import subprocess
 import sys
@@ -150,7 +151,7 @@ def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Map
             opening = f"{1000 * row['opening']:.0f} mm" if row.get("opening") else ""
             said = row.get("reason") or "; ".join([*row["warnings"], *([] if row["self_test"]["passed"] else [_said(row)])])
             cells = name, where, robot.file, flags and f"`{flags}`", ", ".join(row.get("gripper", [])), opening
-            lines.append((*cells, _share(row, "good"), _share(row, "placed"), said.replace("|", "\\|")))
+            lines.append((*cells, _share(row, "good"), _share(row, "placed"), re.sub(r"[|<]", r"\\\g<0>", said)))
     table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     counts = f"{len(tested)} of {len(held)} robots are imported. {good} grasp the cube in at least {ENOUGH} of {TRIES} tries"
     return f"{counts}, {placed} put it where it belongs as often.\n\n{table}"
