@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import functools
 import itertools
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -227,8 +228,8 @@ def _postures(model: mujoco.MjModel, robot: RobotCfg) -> Iterator[np.ndarray]:
     limits = [model.joint(name).range if model.joint(name).limited[0] else (-np.pi, np.pi) for name in robot.arm.joints]
     low, high = np.array(limits).T
     # Kronecker's sequence of square roots of primes: evenly spread, and the same everywhere.
-    primes = [p for p in range(2, 100) if all(p % q for q in range(2, p))]
-    steps = np.sqrt(primes[: len(low)])
+    primes = (p for p in itertools.count(2) if all(p % q for q in range(2, p)))
+    steps = np.sqrt(list(itertools.islice(primes, len(low))))
     coupled = linkage.couplings(model)
     for k in range(_SAMPLES + 1):
         qpos, home = model.qpos0.copy(), np.array(robot.home)
