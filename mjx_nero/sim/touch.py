@@ -10,7 +10,6 @@ import copy
 import dataclasses
 import functools
 import itertools
-import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
