@@ -21,7 +21,7 @@ def test_commands_have_help_of_their_own(call, command):
     [
         ([], "name a command: train, eval"),
         (["inspct", "nero"], "unknown command 'inspct' (did you mean 'inspect'?)"),
-        (["inspect"], "the following arguments are required: name"),
+        (["inspect"], "name a robot, an environment or the folder of an imported robot"),
         (["inspect", "nero", "--rendr", "x"], "unknown argument '--rendr'"),
         (["import-urdf", "a.urdf"], "the following arguments are required: --out"),
     ],

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.sim import kinematics
+from mjx_nero.sim import kinematics, linkage
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.scene import robot_model
 
@@ -95,13 +95,21 @@ SLIDE, OFFSET, A, B = ORDER = ("slide", "offset", "a", "b")
 
 
 def mujocos(model: mujoco.MjModel, joints, frames, q):
-    """Positions, orientations and Jacobians of sites or bodies with ``joints`` at ``q``, the others at ``qpos0``."""
+    """Positions, orientations and Jacobians of sites or bodies with ``joints`` at ``q``, what follows them where it belongs, and
+    the others at ``qpos0``."""
     data, pos, quat, jac = mujoco.MjData(model), [], [], []
     for joint, value in zip(joints, q, strict=True):
         data.joint(joint).qpos = value
+    moves = np.zeros((model.nv, len(joints)))  # of each degree of freedom, a unit of each listed joint
+    moves[[model.joint(j).dofadr[0] for j in joints], np.arange(len(joints))] = 1
+    dof = {int(address): int(d) for address, d in zip(model.jnt_qposadr, model.jnt_dofadr, strict=True)}
+    for each in linkage.couplings(model):  # leaders come before their followers
+        if moves[dof[each.leader]].any() and not moves[dof[each.follower]].any():
+            slope = np.polynomial.Polynomial(each.coefficients).deriv()(data.qpos[each.leader] - each.reference)
+            data.qpos[each.follower] = each.position(data.qpos)
+            moves[dof[each.follower]] = slope * moves[dof[each.leader]]
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    dofs = [model.joint(j).dofadr[0] for j in joints]
     for frame in frames:
         linear, angular, turn = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros(4)
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame)
@@ -114,7 +122,7 @@ def mujocos(model: mujoco.MjModel, joints, frames, q):
         mujoco.mju_mat2Quat(turn, at.xmat)
         pos.append(at.xpos.copy())
         quat.append(turn)
-        jac.append(np.concatenate([linear, angular])[:, dofs])
+        jac.append(np.concatenate([linear, angular]) @ moves)
     return np.array(pos), np.array(quat), np.array(jac)
 
 
