@@ -95,20 +95,20 @@ def test_home_that_touches(robot):
 
 
 def test_robot_without_opening_says_what_to_give(robot):
-    tried = checks._tried(dataclasses.replace(robot, opening=0.0))
+    tried = checks._tried(dataclasses.replace(robot, opening=0.0), checks.TRIES)
     assert tried["script"] == "reach" and tried["good"] == 8 and "opens is unknown: give opening" in tried["reason"]
 
 
 def test_arm_of_too_many_joints_is_not_tried(robot):
     long = dataclasses.replace(robot.arm, joints=tuple(f"j{i}" for i in range(checks.MOST_JOINTS + 1)))
-    tried = checks._tried(dataclasses.replace(robot, arm=long))
+    tried = checks._tried(dataclasses.replace(robot, arm=long), checks.TRIES)
     assert tried["tries"] == 0 and "no try" in tried["reason"]
 
 
 def test_tries_that_fail(robot):
     """Whose robot.yaml puts the lowest height to grasp at 6 cm above the right one: it closes on nothing."""
     x, y, (low, high) = robot.pick
-    tried = checks._tried(dataclasses.replace(robot, pick=(x, y, (low + 0.06, high + 0.06))))
+    tried = checks._tried(dataclasses.replace(robot, pick=(x, y, (low + 0.06, high + 0.06))), checks.TRIES)
     assert tried["good"] == 0 and tried["failures"] == {"close": checks.TRIES} and tried["reason"] == checks.SEEN["close"]
 
 
