@@ -39,7 +39,7 @@ def test_who_can_act():
         return list(agents.known(mjx_nero.make(env_name, impl="native"), env_name, []))
 
     assert names("nero_reach") == ["policy nero_reach", "ik", "rmpflow", "joint sliders", "zero", "random"]
-    assert names("nero_lift") == ["policy nero_lift", "joint sliders", "zero", "random"]
+    assert names("nero_lift") == ["policy nero_lift", "pick_up", "joint sliders", "zero", "random"]
     assert names("cobotta_follow_target") == ["rmpflow", "ik", "joint sliders", "zero", "random"]
 
 
