@@ -174,7 +174,10 @@ def test_a_training_writes_what_the_view_follows(call, tmp_path):
     ("argv", "message"),
     [
         (["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?)"),
-        (["--agent", "rmpflow"], "nobody called 'rmpflow' can act in nero_lift: choose one of policy nero_lift, pick_up, joint sliders"),
+        (
+            ["--agent", "rmpflow"],
+            "nobody called 'rmpflow' can act in nero_lift: choose one of policy nero_lift, pick_up, joint sliders",
+        ),
         (["--run", "."], ". is not the folder of a training"),
         (["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
     ],
