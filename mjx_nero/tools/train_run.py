@@ -25,6 +25,8 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         dotted: fields by prefix.
         flags: those that the user gave.
     """
+    cli.setup_jax()
+    machines.join()  # before a task's config, whose making computes
     sizes = {k: v for k, v in (("num_envs", args.num_envs), ("num_timesteps", args.num_timesteps)) if v}
     learner.find(args.learner)
     track.check(args.track)
@@ -40,8 +42,6 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         **cli.fields(args, RunCfg),
     )
     run = going_on(run, flags, dotted, args.trust)
-    cli.setup_jax()
-    machines.join()
     if "num_devices" not in flags and machines.several():
         run = dataclasses.replace(run, num_devices=machines.default_devices())
     if args.seeds:
