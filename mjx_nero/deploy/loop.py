@@ -12,6 +12,7 @@ from mjx_nero.deploy.arm import Clock, Feedback
 from mjx_nero.deploy.executor import Lag
 from mjx_nero.deploy.guard import Guarded
 from mjx_nero.deploy.observe import Observer
+from mjx_nero.deploy.places import Lost
 from mjx_nero.deploy.policy import Policy
 from mjx_nero.deploy.safety import Fault
 
@@ -141,7 +142,7 @@ def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing)
     try:
         target = brain(feedback, inferring)
     except ValueError as error:
-        arm.hold(Fault("object" if type(error) is not ValueError else "nan", str(error)))
+        arm.hold(Fault("object" if isinstance(error, Lost) else "nan", str(error)))
         target = feedback.position
     inferred = clock.now()
     command = arm.command(target, (inferring, inferred, *brain.action))

@@ -8,14 +8,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
-from jaxtyping import Array, Float
 
-from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.env import ManipulationEnv, Starts
 from mjx_nero.mdp import curriculum
 from mjx_nero.types import PHASE, Bank, Carry, Key, Progress, Sim
 
 Start = tuple[Sim, Carry]
-Starts = tuple[Bank, Float[Array, " phases"]]  # and the chance of each phase
 PHASES = 8  # of an expert's way, equally long
 
 

@@ -48,6 +48,5 @@ def pose_model(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> 
     """Puts the driven joints and the drives' targets at ``pose``, coupled joints where their leaders have them."""
     mujoco.mj_resetData(model, data)
     data.qpos[model.jnt_qposadr[driven(model)[0]]], data.ctrl[:] = pose, pose
-    for coupling in linkage.couplings(model):
-        data.qpos[coupling.follower] = coupling.position(data.qpos)
+    linkage.close(linkage.couplings(model), data.qpos)
     mujoco.mj_forward(model, data)

@@ -157,8 +157,7 @@ class _Hand:
         """Places all shapes in ``data``."""
         for joint, at in zip(self._robot.joints, self.positions(share), strict=True):
             self.data.joint(joint).qpos = at
-        for coupling in self._couplings:
-            self.data.qpos[coupling.follower] = coupling.position(self.data.qpos)
+        linkage.close(self._couplings, self.data.qpos)
         mujoco.mj_kinematics(self.model, self.data)
 
     def ends(self) -> tuple[float, float]:

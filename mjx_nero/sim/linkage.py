@@ -1,7 +1,7 @@
 """Joints that equality constraints of the model couple."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import mujoco
 import numpy as np
@@ -41,6 +41,12 @@ def couplings(model: mujoco.MjModel) -> list[Coupling]:
         ordered += ready or found  # of a ring, as they come
         found = [c for c in found if c not in ordered]
     return ordered
+
+
+def close(coupled: Iterable[Coupling], qpos: Float[np.ndarray, " nq"]) -> None:
+    """Moves followers to where their leaders want them, in place. ``coupled``: leaders before their followers."""
+    for coupling in coupled:
+        qpos[coupling.follower] = coupling.position(qpos)
 
 
 def _couplings(model: mujoco.MjModel) -> Iterator[Coupling]:

@@ -235,6 +235,5 @@ def _postures(model: mujoco.MjModel, robot: RobotCfg) -> Iterator[np.ndarray]:
         if k:
             home[: len(low)] = low + (high - low) * ((k * steps) % 1)
         qpos[ids] = home
-        for coupling in coupled:
-            qpos[coupling.follower] = coupling.position(qpos)
+        linkage.close(coupled, qpos)
         yield qpos

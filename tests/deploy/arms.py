@@ -1,6 +1,7 @@
 """Arms for the tests of the runtime: what a policy says of a robot, a clock that stands still, an arm without physics."""
 
 import json
+import threading
 
 import numpy as np
 
@@ -26,6 +27,31 @@ class Clock:
 
     def sleep_until(self, time):
         self.time = max(self.time, time)
+
+
+class Bench:
+    """An emulated ``arm`` behind its ``guard``, and a thread that serves its ``port`` meanwhile."""
+
+    def serve(self):
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self.port.serve, args=(self._over.is_set,), daemon=True)
+        self._thread.start()
+
+    def stop(self):
+        self._over.set()
+        self._thread.join()
+
+    def start(self):
+        self.arm.connect()
+        self.arm.engage()
+        return self.guard.start()
+
+    def play(self, targets):
+        for target in targets:
+            due = self.clock.now() + 0.02
+            self.guard.read()
+            self.guard.command(target)
+            self.clock.sleep_until(due)
 
 
 class Ideal:

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import threading
 
 import arms
 import numpy as np
@@ -62,7 +61,7 @@ def test_what_is_written_is_ram():
     assert all(40 <= feetech.REGISTERS[name][0] < 80 for name in feetech.WRITABLE)
 
 
-class Bench:
+class Bench(arms.Bench):
     """An emulated arm, its driver, and who serves the port meanwhile."""
 
     def __init__(self, folder, told, lift, kind="so101"):
@@ -77,25 +76,11 @@ class Bench:
         self.port = emulated.Port(self.servos)
         self.arm = so_arm.of(kind, told, clock, self.port.name, str(self.calibration))
         self.guard = Guard(self.arm, setup.safety_of(told), clock)
-        self.told, self.clock, self._over = told, clock, threading.Event()
-        self._thread = threading.Thread(target=self.port.serve, args=(self._over.is_set,), daemon=True)
-        self._thread.start()
-
-    def start(self):
-        self.arm.connect()
-        self.arm.engage()
-        return self.guard.start()
-
-    def play(self, targets):
-        for target in targets:
-            due = self.clock.now() + 0.02
-            self.guard.read()
-            self.guard.command(target)
-            self.clock.sleep_until(due)
+        self.told, self.clock = told, clock
+        self.serve()
 
     def close(self):
-        self._over.set()
-        self._thread.join()
+        self.stop()
         with contextlib.suppress(AttributeError):
             self.arm._bus.close()
         self.port.close()

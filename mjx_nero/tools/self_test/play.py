@@ -77,8 +77,7 @@ def _start(model: mujoco.MjModel, cfg: EnvCfg, places: Mapping[str, Float[np.nda
     data = mujoco.MjData(model)
     for joint, position in zip(cfg.robot.joints, cfg.robot.home, strict=True):
         data.joint(joint).qpos = position
-    for coupling in linkage.couplings(model):
-        data.qpos[coupling.follower] = coupling.position(data.qpos)
+    linkage.close(linkage.couplings(model), data.qpos)
     for name, place in places.items():
         data.joint(name).qpos[:2] = place
     data.ctrl[:] = cfg.robot.home
