@@ -60,7 +60,7 @@ def _parser() -> cli.Parser:
     add = parser.add_argument
     add("policy", type=cli.path(".onnx"), help="file that export wrote")
     add("--arm", choices=drivers.KINDS, required=True, help="which arm")
-    add("--port", help="serial port of an SO-ARM; of a Piper INTERFACE:CHANNEL as python-can has them, as in socketcan:can0")
+    add("--port", help="of an SO-ARM a serial port, of a Piper or Nero INTERFACE:CHANNEL of python-can, as in socketcan:can0")
     add("--calibration", type=cli.path(".json"), help="LeRobot's calibration file of the SO-ARM")
     add("--emulate", action="store_true", help="in place of the arm, a program that speaks its protocol, with MuJoCo behind it")
     add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")

@@ -17,20 +17,23 @@ def metadata(name, dt=0.02):
 
 
 class Clock:
-    """Time passes where somebody waits."""
+    """Time passes where somebody waits; every 5 ms of it all in ``ticks`` happens."""
 
     def __init__(self):
-        self.time = 100.0
+        self.time, self.ticks = 100.0, []
 
     def now(self):
         return self.time
 
     def sleep_until(self, time):
-        self.time = max(self.time, time)
+        while self.time < time:
+            self.time = min(self.time + 0.005, time)
+            for tick in self.ticks:
+                tick()
 
 
 class Bench:
-    """An emulated ``arm`` behind its ``guard``, and a thread that serves its ``port`` meanwhile."""
+    """An emulated ``arm`` behind its ``guard``, in time that passes where the test waits; answers need a thread meanwhile."""
 
     def serve(self):
         self._over = threading.Event()

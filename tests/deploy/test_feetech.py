@@ -12,7 +12,7 @@ from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.drivers import feetech, so_arm
 from mjx_nero.deploy.emulators import feetech as emulated
 from mjx_nero.deploy.emulators.plant import Plant
-from mjx_nero.deploy.guard import Guard, WallClock
+from mjx_nero.deploy.guard import Guard
 from mjx_nero.errors import UserError
 
 
@@ -62,17 +62,17 @@ def test_what_is_written_is_ram():
 
 
 class Bench(arms.Bench):
-    """An emulated arm, its driver, and who serves the port meanwhile."""
+    """An emulated arm, its driver, and who answers at the port meanwhile, at once and however long that takes."""
 
     def __init__(self, folder, told, lift, kind="so101"):
         entries = emulated.calibration(told, kind)
         self.calibration = folder / "calibration.json"
         self.calibration.write_text(json.dumps(entries))
-        clock = WallClock()
+        clock = arms.Clock()
         joints = told["joints"]["names"]
         self.plant = Plant(lift / "scene.mjb", joints, np.array(told["joints"]["home"]), clock)
         self.servos = emulated.servos_of(told, kind, entries, self.plant)
-        self.servos.faults.turnaround = 1e-4
+        self.servos.faults.turnaround = 0.0
         self.port = emulated.Port(self.servos)
         self.arm = so_arm.of(kind, told, clock, self.port.name, str(self.calibration))
         self.guard = Guard(self.arm, setup.safety_of(told), clock)
@@ -87,7 +87,8 @@ class Bench(arms.Bench):
 
 
 @pytest.fixture
-def bench(tmp_path, told, lift):
+def bench(tmp_path, told, lift, monkeypatch):
+    monkeypatch.setattr(so_arm, "_WAIT", 0.5)  # whoever answers may have to wait for a processor
     made = Bench(tmp_path, told, lift)
     yield made
     assert made.servos.eeprom_writes == 0 and made.servos.torque_cuts == 0
@@ -148,6 +149,7 @@ def test_faults_of_the_bus_end_in_hold_within_a_cycle(bench, fault):
     home = np.array(bench.told["joints"]["home"])
     bench.play([home + np.array([0.01 * k, 0, 0, 0, 0, 0]) for k in range(15)])
     assert bench.guard.fault is None
+    bench.arm._bus._port.timeout = 0.02
     if fault == "unplugged":
         bench.arm._bus._port.close()
     else:
@@ -184,7 +186,7 @@ def test_frozen_registers_end_in_hold(bench):
 
 def test_one_damaged_answer_is_asked_for_again(bench):
     bench.start()
-    reply, count = bench.servos._reply, iter(range(100))
+    reply, count, bench.arm._bus._port.timeout = bench.servos._reply, iter(range(100)), 0.1
 
     def once(servo, data=b""):
         out = reply(servo, data)
@@ -198,10 +200,11 @@ def test_one_damaged_answer_is_asked_for_again(bench):
 def test_a_late_answer_is_not_taken_for_the_next_one(bench):
     """An answer that comes after its time was over belongs to nobody."""
     bench.start()
-    bench.servos.faults.turnaround = 0.04  # of one servo; the driver waits for 0.03
+    bench.arm._bus._port.timeout = 0.03
+    bench.servos.faults.turnaround = 0.04  # of one servo
     with pytest.raises(ArmError, match="servo 1 does not answer"):
         bench.arm._bus.read(1, "homing_offset")
-    bench.servos.faults.turnaround = 1e-4
+    bench.servos.faults.turnaround, bench.arm._bus._port.timeout = 0.0, 0.5
     assert bench.arm._bus.read(1, "max_position") == bench.arm._servos[0].range_max
 
 
@@ -220,7 +223,8 @@ def test_another_arm_than_the_files_is_refused(bench, register, value, message):
         bench.start()
 
 
-def test_an_arm_without_power_is_refused(bench):
+def test_an_arm_without_power_is_refused(bench, monkeypatch):
+    monkeypatch.setattr(so_arm, "_WAIT", 0.02)
     bench.servos.faults.cut = True
     with pytest.raises(UserError, match="shoulder_pan: servo 1 does not answer: is the arm powered"):
         bench.start()

@@ -7,6 +7,7 @@ import pathlib
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -22,8 +23,10 @@ from mjx_nero.errors import UserError
 SWING = """
 import json, sys, time
 import numpy as np
+from mjx_nero.deploy.guard import urgent
 from mjx_nero.deploy.remote import Remote
 from mjx_nero.deploy.server import Spec
+urgent()  # as the command does
 remote = Remote(Spec(**json.loads(sys.argv[1])))
 remote.ready()
 at = remote.start(actions=0).position
@@ -74,11 +77,29 @@ def swinging(spec):
     wait_for(lambda: gone(arm))
 
 
+@pytest.fixture
+def late():
+    """By how much this machine wakes sleepers late while a test runs, at worst [s]: what a busy one adds to any deadline."""
+    worst, over = [0.0], threading.Event()
+
+    def sleeper():
+        while not over.is_set():
+            begun = time.monotonic()
+            time.sleep(0.005)
+            worst[0] = max(worst[0], time.monotonic() - begun - 0.005)
+
+    thread = threading.Thread(target=sleeper, daemon=True)
+    thread.start()
+    yield lambda: worst[0]
+    over.set()
+    thread.join()
+
+
 def targets(table):
     return [float(row["target.shoulder_pan"]) for row in table if row["target.shoulder_pan"]]
 
 
-def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec):
+def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec, late):
     process, arm = swinging
     time.sleep(0.6)
     process.kill()
@@ -86,13 +107,13 @@ def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec):
     table = rows(spec)
     held = [row for row in table if row["held"]]
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
-    assert held[0]["held"] == "silence" and float(held[0]["time"]) - last < 0.1
+    assert held[0]["held"] == "silence" and float(held[0]["time"]) - last < 0.1 + late()
     steps = np.abs(np.diff(targets(table)))
     # What the drives are told leads by their lag, some milliradians.
     assert steps.max() <= 1.5 * 0.02 + 1e-4 and steps[-1] < 1e-4 and len(held) <= 5
 
 
-def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swinging, spec):
+def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swinging, spec, late):
     process, arm = swinging
     time.sleep(0.6)
     process.send_signal(signal.SIGSTOP)
@@ -100,7 +121,7 @@ def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swi
     table = rows(spec)
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
     first = next(float(row["time"]) for row in table if row["held"])
-    assert first - last < 0.13  # 0.08, and what a busy machine adds
+    assert first - last < 0.1 + late()
     assert not gone(arm) and targets(table)[-1] == pytest.approx(targets(table)[-2], abs=1e-4)
     process.send_signal(signal.SIGCONT)  # nothing resumes
     assert process.stdout.readline() == "fault silence\n"

@@ -1,6 +1,7 @@
 """The layer between policy and driver: nothing that goes out is beyond a limit, and every fault ends in holding."""
 
 import dataclasses
+import functools
 
 import arms
 import numpy as np
@@ -10,7 +11,7 @@ from mjx_nero.deploy import setup
 from mjx_nero.deploy.arm import Feedback
 from mjx_nero.deploy.fence import FenceCfg
 from mjx_nero.deploy.guard import Guard
-from mjx_nero.deploy.safety import Fault, SafetyCfg
+from mjx_nero.deploy.safety import Fault, Limits, Safety, SafetyCfg
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 
@@ -81,7 +82,7 @@ def fuzz(told, count, seed):
     before = safety.position.copy(), safety.velocity.copy()
     for target in wild(safety.limits, rng, count):
         commands.append(safety.step(target))
-        if len(commands) == 1000:
+        if len(commands) == 500:
             found = violations(safety, before, commands)
             worst = {name: max(worst[name], found[name]) for name in found}
             before, commands = (commands[-1].position, commands[-1].velocity), []
@@ -90,9 +91,9 @@ def fuzz(told, count, seed):
 
 @pytest.mark.parametrize("seed", [0])
 def test_wild_targets_never_get_beyond_a_limit(told, seed):
-    safety, worst = fuzz(told, 3000, seed)
+    safety, worst = fuzz(told, 1500, seed)
     assert safety.fault is None and max(worst.values()) < 1e-6, worst
-    assert safety.counts["fence"] > 50 and safety.counts["joints"] > 500  # there was something to stop
+    assert safety.counts["fence"] > 25 and safety.counts["joints"] > 250  # there was something to stop
 
 
 def test_what_is_allowed_passes_unchanged(told):
@@ -141,7 +142,7 @@ def test_links_do_not_meet():
     told = arms.metadata("cobotta_pro_900")
     safety = begun(told, fence=FenceCfg(table=-3.0, box=((-3, 3), (-3, 3), (-3, 3))))
     reasons = set()
-    for target in wild(safety.limits, np.random.default_rng(0), 3000):
+    for target in wild(safety.limits, np.random.default_rng(0), 1500):
         safety.step(target)
         reasons.add(safety.blocked_by)
     assert any(" and " in reason for reason in reasons), reasons
@@ -164,9 +165,16 @@ def test_an_arm_below_the_table_may_only_rise(so101):
     np.testing.assert_allclose(q, safety.limits.home, atol=1e-3)
 
 
+@functools.cache
+def fence_of(robot):
+    """It takes a while to make, and never changes."""
+    return setup.safety_of(arms.metadata(robot))._fence
+
+
 def guarded(told, **cfg):
     clock = arms.Clock()
-    safety = setup.safety_of(told, SafetyCfg(**cfg))
+    cfg = SafetyCfg(**cfg)
+    safety = Safety(Limits.of(told, cfg), fence_of(told["robot"]), cfg)
     arm = arms.Ideal(safety.limits.names, safety.limits.home, clock)
     guard = Guard(arm, safety, clock)
     guard.start()
@@ -223,7 +231,7 @@ def test_a_hundred_faults_of_each_kind_end_in_hold_within_a_cycle(so101, kind):
         guard, arm, clock = guarded(so101, **cfg)
         limits = guard.safety.limits
         goal = rng.uniform(limits.lower, limits.upper)
-        play(guard, arm, clock, goal, int(rng.integers(1, 40)))
+        play(guard, arm, clock, goal, int(rng.integers(1, 16)))
         assert guard.fault is None
         before, count = (guard.safety.position.copy(), guard.safety.velocity.copy()), len(arm.told)
         if kind in BENT:
@@ -237,10 +245,10 @@ def test_a_hundred_faults_of_each_kind_end_in_hold_within_a_cycle(so101, kind):
         play(guard, arm, clock, target, 1)
         assert guard.fault.kind == {"target": "nan"}.get(kind, kind)
         arm.bend, arm.broken = (lambda feedback: feedback), ""  # all is well again, and nothing resumes
-        play(guard, arm, clock, goal, 40)
+        play(guard, arm, clock, goal, 12)
         path = arm.told[count:]
         assert violations_of(guard.safety, before, path) < 1e-6
-        assert (np.abs(np.diff(np.array(path[-30:]), axis=0)) < 1e-12).all()  # it holds
+        assert (np.abs(np.diff(np.array(path[-6:]), axis=0)) < 1e-12).all()  # it holds
         brake = before[1] ** 2 / (2 * limits.acceleration) + np.abs(before[1]) * limits.dt
         assert (np.abs(path[-1] - before[0]) <= brake + 1e-6).all()  # where it could stop
 

@@ -7,10 +7,10 @@ from mjx_nero.deploy.arm import Arm, Clock
 from mjx_nero.deploy.executor import Lag
 from mjx_nero.errors import UserError
 
-KINDS = ("sim", "so101", "so100", "piper")
+KINDS = ("sim", "so101", "so100", "piper", "nero")
 
 
-_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper"}
+_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper", "nero": "nero"}
 
 
 def check(kind: str, metadata: Mapping[str, Any]) -> None:
@@ -30,7 +30,7 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
 
     Args:
         options: of the driver, as plain values: ``model`` and ``tracker`` of the simulated arm, ``port`` and ``calibration`` of
-            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper.
+            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper and the Nero.
 
     Raises:
         UserError: there is no such arm, a package or file is missing, or it is another robot than the policy's.
@@ -45,6 +45,6 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
         from mjx_nero.deploy.drivers import so_arm
 
         return so_arm.of(kind, metadata, clock, **options)
-    from mjx_nero.deploy.drivers import piper
+    from mjx_nero.deploy.drivers import agilex
 
-    return piper.of(metadata, clock, **options)
+    return agilex.of(kind, metadata, clock, **options)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from mjx_nero.deploy import children
 from mjx_nero.errors import UserError
 
-_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "piper"}
+_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "agilex"}
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """A scene in MuJoCo's C library that keeps up with a clock: what stands behind the simulated arm and the emulators."""
 
 import collections
+import copy
 import dataclasses
 import pathlib
 from collections.abc import Sequence
@@ -55,7 +56,9 @@ class Plant:
         base: Sequence[float] = (0.0, 0.0, 0.0),
         tracker: Sender | None = None,
     ):
-        self.model = model if isinstance(model, mujoco.MjModel) else mujoco.MjModel.from_binary_path(str(model))
+        if not isinstance(model, mujoco.MjModel):
+            model = mujoco.MjModel.from_binary_path(str(model))
+        self.model = copy.copy(model)  # the drives' gains change
         self.data, self._clock, self._base, self._tracker = mujoco.MjData(self.model), clock, np.asarray(base, float), tracker
         m, ids = self.model, [self.model.joint(name).id for name in joints]
         self._qpos, self._dof = m.jnt_qposadr[ids], m.jnt_dofadr[ids]

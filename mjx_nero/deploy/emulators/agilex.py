@@ -1,6 +1,6 @@
-"""A Piper in software, behind a serial CAN adapter (SLCAN) in a pseudo-terminal: its frames, 200 times a second.
+"""A Piper or Nero in software, behind a serial CAN adapter (SLCAN) in a pseudo-terminal: its frames, 200 times a second.
 
-    python -m mjx_nero.deploy.emulators.piper '{"model": "scene.mjb", ...}'
+    python -m mjx_nero.deploy.emulators.agilex '{"model": "scene.mjb", ...}'
 
 prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted: ``torque_cuts``.
 """
@@ -16,11 +16,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_nero.deploy.drivers import piper
+from mjx_nero.deploy.drivers import agilex
 from mjx_nero.deploy.emulators.plant import Plant
 
-_PERIOD = 0.005  # [s] between feedbacks
-_FINGERS = 2
+PERIOD = 0.005  # [s] between feedbacks
 
 
 @dataclasses.dataclass
@@ -45,8 +44,8 @@ class BusFaults:
 class Arm:
     """What the arm makes of frames, and the frames that it sends by itself."""
 
-    def __init__(self, plant: Plant):
-        self.plant, self.faults, self.torque_cuts = plant, BusFaults(), 0
+    def __init__(self, plant: Plant, model: agilex.Model):
+        self.plant, self.faults, self.torque_cuts, self._model = plant, BusFaults(), 0, model
         self._goal = plant.position()
         plant.powered[:] = False
         plant.stiffen()
@@ -55,15 +54,16 @@ class Arm:
         """A frame from the runtime."""
         if self.faults.cut:
             return
-        if frame in piper.TARGETS and len(data) == 8:
-            k = 2 * piper.TARGETS.index(frame)
-            self._goal[k : k + 2] = np.array(struct.unpack(">ii", data)) * piper.MILLIDEGREE
-        elif frame == piper.GRIPPER and len(data) == 8:
-            half = struct.unpack(">i", data[:4])[0] * piper.MICROMETRE / 2
-            self._goal[6:] = half, -half
+        n = self._model.count
+        if frame in self._model.targets and len(data) == 8:
+            k = 2 * self._model.targets.index(frame)
+            self._goal[k : min(k + 2, n)] = agilex.unpack([data], min(2, n - k))
+        elif frame == agilex.GRIPPER and len(data) == 8:
+            half = struct.unpack(">i", data[:4])[0] * agilex.MICROMETRE / 2
+            self._goal[n:] = half, -half
             self._aim()
-        elif frame == piper.ENABLE and len(data) >= 2:
-            on = data[1] == piper.ON
+        elif frame == agilex.ENABLE and len(data) >= 2 and data[0] == self._model.everyone:
+            on = data[1] == agilex.ON
             self.torque_cuts += bool(self.plant.powered.any()) and not on
             self.plant.powered[:] = on
             self._aim()
@@ -79,17 +79,44 @@ class Arm:
         self.plant.advance()
         if self.faults.cut:
             return []
-        q, v = self.plant.position(), self.plant.velocity()
-        counts = [int(x) for x in np.rint(q[:6] / piper.MILLIDEGREE)]
-        out = [(piper.STATUS, bytes([1, self.faults.status, 1, 0, 0, 0, 0, 0]))]
-        out += [(frame, struct.pack(">ii", *counts[2 * k : 2 * k + 2])) for k, frame in enumerate(piper.JOINTS)]
-        out.append((piper.GRIPPED, struct.pack(">ihBB", round((q[6] - q[7]) / piper.MICROMETRE), 0, 0x40, 0)))
-        for k in range(6):
+        q, v, model, n = self.plant.position(), self.plant.velocity(), self._model, self._model.count
+        out = [(agilex.STATUS, bytes([1, self.faults.status, 1, 0, 0, 0, 0, 0]))]
+        out += zip(model.joints, agilex.pack(q[:n]), strict=True)
+        out.append((agilex.GRIPPED, struct.pack(">ihBB", round((q[n] - q[n + 1]) / agilex.MICROMETRE), 0, 0x40, 0)))
+        for k in range(n):
             speed = int(np.clip(round(1000 * v[k]), -32768, 32767))
-            out.append((piper.FAST[k], struct.pack(">hHi", speed, 500, 0)))
-            state = self.faults.bits.get(k + 1, 0) | (piper.ENABLED if self.plant.powered[k] else 0)
-            out.append((piper.SLOW[k], struct.pack(">HhbBH", 240, self.faults.heat, self.faults.heat, state, 0)))
+            out.append((model.fast[k], struct.pack(">hHi", speed, 500, 0)))
+            state = self.faults.bits.get(k + 1, 0) | (agilex.ENABLED if self.plant.powered[k] else 0)
+            out.append((model.slow[k], struct.pack(">HhbBH", 240, self.faults.heat, self.faults.heat, state, 0)))
         return [(frame, data) for frame, data in out if frame not in self.faults.mute]
+
+
+class CanPort:
+    """The arm on a bus of python-can's, such as ``virtual:NAME`` within one process; its owner calls ``take`` and ``say``.
+
+    Attributes:
+        name: as ``--port`` takes it.
+    """
+
+    def __init__(self, arm: Arm, name: str):
+        import can
+
+        self.arm, self.name, (interface, _, channel) = arm, name, name.partition(":")
+        self._message, self._bus = can.Message, can.Bus(interface=interface, channel=channel)
+
+    def take(self) -> None:
+        """What has come."""
+        while message := self._bus.recv(0.0):
+            self.arm.take(message.arbitration_id, bytes(message.data))
+
+    def say(self) -> None:
+        """One round of feedback."""
+        for frame, data in self.arm.frames():
+            self._bus.send(self._message(arbitration_id=frame, data=data, is_extended_id=False))
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._bus.shutdown()
 
 
 class Port:
@@ -115,10 +142,19 @@ class Port:
             if other in ready and not os.read(other or 0, 1000):
                 return
             if self._master in ready:
-                self._take(os.read(self._master, 4096))
+                self.take()
             if time.monotonic() >= due:
-                due = max(due + _PERIOD, time.monotonic())
-                self._say(self.arm.frames())
+                due = max(due + PERIOD, time.monotonic())
+                self.say()
+
+    def take(self) -> None:
+        """What has come."""
+        with contextlib.suppress(BlockingIOError):
+            self._take(os.read(self._master, 4096))
+
+    def say(self) -> None:
+        """One round of feedback."""
+        self._say(self.arm.frames())
 
     def _take(self, data: bytes) -> None:
         *lines, self._bytes = (self._bytes + data).split(b"\r")
@@ -149,7 +185,7 @@ def main() -> None:
     """The process."""
     from mjx_nero.deploy.emulators import process
 
-    process(lambda plant, told: Port(Arm(plant)))
+    process(lambda plant, told: Port(Arm(plant, agilex.MODELS[told["kind"]])))
 
 
 if __name__ == "__main__":
