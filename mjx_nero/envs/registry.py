@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 _ARMS = [importlib.import_module(f"{arms.__name__}.{found.name}") for found in pkgutil.iter_modules(arms.__path__)]
 _ROBOTS: dict[str, RobotCfg] = {arm.ROBOT.name: arm.ROBOT for arm in _ARMS}
 _ENVS: Envs = {name: entry for arm in _ARMS for name, entry in arm.ENVS.items()}
-_ENVS |= fitted.ENVS  # for any robot that says where it can work
+_ENVS |= fitted.ENVS  # for any robot that states its workspace
 
 
 def register_robot(robot: RobotCfg) -> None:
-    """Adds a robot by its own name.
+    """Adds a robot under its own name.
 
     Raises:
         UserError: there is one of this name.
