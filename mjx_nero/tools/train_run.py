@@ -31,7 +31,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
     learner.find(args.learner)
     track.check(args.track)
     if args.seeds and (args.restore or args.resume):
-        raise UserError("--seeds starts new runs: go on with one of them by --restore RUN/seed_N alone")
+        raise UserError("--seeds starts new runs: to resume one of them, pass only --restore RUN/seed_N")
     run = training.resolve(
         args.env,
         args.preset,
