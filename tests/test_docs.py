@@ -40,7 +40,6 @@ NO_BEGINNING = set(
     " out over since so than that their them then they through till to toward towards under until up upon when where which"
     " while who whose why with within without what how none not yet".split()
 )
-SPOKEN = ("envs", "mdp")  # rooms
 
 
 def commands(text: str) -> list[list[str]]:
@@ -56,7 +55,7 @@ def commands(text: str) -> list[list[str]]:
 def test_docstrings_begin_with_what_a_thing_is_or_does():
     """Not with a preposition, a pronoun or a question word: see CONTRIBUTING."""
     found = []
-    for path in sorted(file for room in SPOKEN for file in (ROOT / "mjx_nero" / room).rglob("*.py")):
+    for path in sorted(file for file in (ROOT / "mjx_nero").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             text = ast.get_docstring(node) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) else None
             if text and text.split()[0].strip(".,:;").lower() in NO_BEGINNING:

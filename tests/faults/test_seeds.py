@@ -59,7 +59,7 @@ def test_a_signal_ends_them_all_and_says_which_are_left(train, at_row, tmp_path)
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--seeds", "0-7", "--restore", "run"], "--seeds starts new runs: to resume one of them, pass only --restore RUN/seed_N"),
+        (["--seeds", "0-7", "--restore", "run"], "--seeds starts new runs: to resume one, pass only --restore RUN/seed_N"),
         (["--seeds", "0-7", "--out", "run", "--resume", "auto"], "--seeds starts new runs"),
         (["--seeds", "3-1"], "--seeds takes seeds as in 0-7 or 0,3,5, got '3-1'"),
         (["--seeds", "1,,2"], "--seeds takes seeds as in 0-7 or 0,3,5"),

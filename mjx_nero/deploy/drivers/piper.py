@@ -124,7 +124,7 @@ class Piper:
         self._engaged = True
 
     def read_position(self) -> tuple[float, np.ndarray]:
-        """When the oldest part of it came [s], and where the joints are [rad or m]."""
+        """Returns when its oldest part arrived [s], and where the joints are [rad or m]."""
         frames = [self._frames[frame] for frame in (*JOINTS, GRIPPED)]
         arm = np.concatenate([struct.unpack(">ii", data) for _, data in frames[:3]]) * MILLIDEGREE
         half = struct.unpack(">i", frames[3][1][:4])[0] * MICROMETRE / 2
@@ -140,7 +140,7 @@ class Piper:
         return Feedback(when, position, np.array([*speeds, 0.0, 0.0]), None, np.array([*heat, 0.0, 0.0], float))
 
     def _check(self) -> None:
-        """What the arm says of itself.
+        """Checks what the arm reports about itself.
 
         Raises:
             ArmError: something is wrong.

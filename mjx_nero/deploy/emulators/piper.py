@@ -25,7 +25,7 @@ _FINGERS = 2
 
 @dataclasses.dataclass
 class BusFaults:
-    """What can go wrong, to be set while it runs.
+    """Faults of the arm, which can be set while it runs.
 
     Attributes:
         cut: nothing is heard, nothing arrives.
@@ -43,7 +43,7 @@ class BusFaults:
 
 
 class Arm:
-    """What the arm makes of frames, and the frames that it sends by itself."""
+    """Answers frames as the arm does, and sends frames by itself."""
 
     def __init__(self, plant: Plant):
         self.plant, self.faults, self.torque_cuts = plant, BusFaults(), 0

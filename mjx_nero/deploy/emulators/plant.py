@@ -17,7 +17,7 @@ _LONGEST = 0.5  # [s] that are caught up at once; a program that stood still lon
 
 @dataclasses.dataclass
 class Faults:
-    """What can go wrong, to be set while it runs.
+    """Faults of the plant, which can be set while it runs.
 
     Attributes:
         stalled: joints that stand still, by number.
@@ -133,11 +133,11 @@ class Plant:
         return self.data.qpos[self.objects[name] :][:3] - self._base
 
     def position(self) -> np.ndarray:
-        """Of the joints, now [rad or m]."""
+        """Present positions of the joints [rad or m]."""
         return self.data.qpos[self._qpos].copy()
 
     def velocity(self) -> np.ndarray:
-        """Of the joints, now [rad/s or m/s]."""
+        """Present velocities of the joints [rad/s or m/s]."""
         return self.data.qvel[self._dof].copy()
 
     def load(self) -> np.ndarray:

@@ -84,7 +84,7 @@ class Episodes:
 
     @property
     def scenery(self) -> Scenery:
-        """What a picture shows besides ``qpos`` [steps, k, ...]."""
+        """Everything that a picture shows besides ``qpos`` [steps, k, ...]."""
         return self.record.scenery
 
     def episode(self, index: int) -> Record:
