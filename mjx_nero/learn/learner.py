@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mjx_nero import config
-from mjx_nero.errors import UserError
+from mjx_nero.config.registry import Registry
 
 if TYPE_CHECKING:
     import jax
@@ -108,23 +108,13 @@ class Kind:
 
 
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
-_KINDS: dict[str, Kind | str] = {"ppo": "mjx_nero.learn.ppo"}
-
-
-def register(name: str, kind: Kind) -> None:
-    """Adds a learner: ``--learner NAME`` trains with it, ``--NAME.field`` sets its config.
-
-    Raises:
-        UserError: there is one of that name.
-    """
-    if name in _KINDS:
-        raise UserError(f"there is a learner {name!r} already: register it under another name")
-    _KINDS[name] = kind
+# ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
+KINDS: Registry[Kind | str] = Registry("learner", {"ppo": "mjx_nero.learn.ppo"})
 
 
 def names() -> tuple[str, ...]:
     """Names of all learners."""
-    return tuple(_KINDS)
+    return tuple(KINDS)
 
 
 def find(name: str) -> Kind:
@@ -133,9 +123,7 @@ def find(name: str) -> Kind:
     Raises:
         UserError: there is no such learner.
     """
-    kind = _KINDS.get(name)
-    if kind is None:
-        raise UserError(f"unknown learner {name!r}{config.hint(name, _KINDS)}: choose one of {', '.join(_KINDS)}")
+    kind = KINDS.find(name)
     return importlib.import_module(f"{kind}.learner").KIND if isinstance(kind, str) else kind
 
 
@@ -145,8 +133,8 @@ def cfg_for(name: str, preset: str, fields: Mapping[str, Any]) -> Any:
     Args:
         fields: the task's wishes by dotted name (``EnvCfg.training``); fields that this learner lacks are ignored.
     """
-    kind = _KINDS.get(name)
-    presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else find(name).presets
+    kind = KINDS.find(name)
+    presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else kind.presets
     cfg = presets.get(preset, presets["default"])
     known = config.flatten(cfg)
     return config.override(cfg, {field: value for field, value in fields.items() if field in known})

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError
+from mjx_nero.config.registry import Registry
 from mjx_nero.learn import checkpoint, learner
 from mjx_nero.learn.learner import Kind
 from mjx_nero.learn.runs import resume
@@ -79,9 +80,9 @@ class Learner:
 @pytest.fixture
 def three(monkeypatch):
     """``Learner`` by the name ``three``."""
-    monkeypatch.setattr(learner, "_KINDS", dict(learner._KINDS))
+    monkeypatch.setattr(learner, "KINDS", Registry("learner", learner.KINDS))
     template = {"w": jax.ShapeDtypeStruct((3,), np.float32)}
-    learner.register("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, lambda params, obs: params)))
+    learner.KINDS.add("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, lambda params, obs: params)))
 
 
 @pytest.mark.parametrize("kind", ["checkpoint", "policy"])

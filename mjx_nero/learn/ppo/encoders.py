@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import jax
 from flax import linen
 
-from mjx_nero.config import values
-from mjx_nero.errors import UserError
+from mjx_nero.config.registry import Registry
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.types import Key
 
@@ -62,21 +61,14 @@ class Mlp(linen.Module):
 
 Make = Callable[[tuple[int, ...], NetworkCfg], Encoder]  # (shape of the term, config of the networks) -> encoder
 
-_ENCODERS: dict[str, Make] = {
-    FLAT: lambda shape, cfg: Flat(len(shape)),
-    "mlp": lambda shape, cfg: Mlp(len(shape), tuple(cfg.encoder_layers), cfg.activation),
-}
-
-
-def register(name: str, make: Make) -> None:
-    """Adds an encoder, which ``NetworkCfg.encoders`` may then name.
-
-    Raises:
-        UserError: there is one of that name.
-    """
-    if name in _ENCODERS:
-        raise UserError(f"there is an encoder {name!r} already: register it under another name")
-    _ENCODERS[name] = make
+# ``NetworkCfg.encoders`` names them.
+ENCODERS: Registry[Make] = Registry(
+    "encoder",
+    {
+        FLAT: lambda shape, cfg: Flat(len(shape)),
+        "mlp": lambda shape, cfg: Mlp(len(shape), tuple(cfg.encoder_layers), cfg.activation),
+    },
+)
 
 
 def make(name: str, shape: tuple[int, ...], cfg: NetworkCfg) -> Encoder:
@@ -85,6 +77,4 @@ def make(name: str, shape: tuple[int, ...], cfg: NetworkCfg) -> Encoder:
     Raises:
         UserError: there is no such encoder.
     """
-    if name not in _ENCODERS:
-        raise UserError(values.unknown("encoder", name, _ENCODERS))
-    return _ENCODERS[name](shape, cfg)
+    return ENCODERS.find(name)(shape, cfg)
