@@ -26,7 +26,7 @@ from mjx_nero.urdf.tree import poses as body_poses
 from mjx_nero.urdf.units import METRES, Units, check_lengths
 
 
-# Long, because it lists the stages of an import in order.
+# Long: it lists the stages of an import, in order.
 def import_urdf(
     path: pathlib.Path | str,
     out: pathlib.Path | str,

@@ -118,7 +118,7 @@ class Plant:
         self._tell()
 
     def _set_drives(self) -> None:
-        """Their stiffness and power now."""
+        """Sets the drives' present stiffness and power."""
         m, share = self.model, np.where(self.powered, self.faults.stiffness, 0.0)
         m.actuator_gainprm[self._act, 0], m.actuator_biasprm[self._act, 1] = self._gain * share, self._bias[:, 1] * share
         m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], -self.gears)

@@ -147,7 +147,7 @@ def four(robot: RobotCfg) -> EnvCfg:
     return _clutter(fitted(robot, ("box", "cylinder", "sphere", "capsule")))
 
 
-# Long, because a task is one list and reads as one.
+# Long: a task is one list, to read as one.
 def _clutter(setup: ClutterSetup) -> EnvCfg:
     """Lift's rewards for the commanded object. The others may be touched, but must stay on the table."""
     scene, names, commanded = setup.scene, tuple(setup.scene.objects), {"object": TARGET}

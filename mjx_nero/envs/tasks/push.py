@@ -25,7 +25,7 @@ def _box(robot: RobotCfg) -> ObjectCfg:
     return ObjectCfg(size=(x, y, z), mass=float(f"{grasp.DENSITY * x * y * z:.3g}"))
 
 
-# Long, because a task is one list and reads as one.
+# Long: a task is one list, to read as one.
 def default(robot: RobotCfg) -> EnvCfg:
     """Success: the box is within 2 cm and 15 degrees of the goal, flat on the table."""
     x, y, _ = regions.box(robot, "pick", "where on the table it can point down")
