@@ -107,7 +107,7 @@ def clock(seconds: float) -> str:
 
 
 def time_left(steps: int, steps_per_s: float, minutes: float, wall: float) -> float:
-    """Until the steps are made or the minutes are over, whichever comes first [s].
+    """Seconds until the steps are made or the minutes are over, whichever comes first.
 
     Args:
         steps: still to make.

@@ -20,7 +20,7 @@ class UserError(ValueError):
 
 
 def missing(error: ModuleNotFoundError) -> str:
-    """What to do where a package is not installed; one line."""
+    """Writes one line that says what to do about a missing package."""
     package = (error.name or str(error)).partition(".")[0]
     return (
         f"{sys.executable} does not have the package {package!r}: activate the environment that mjx_nero was installed into "

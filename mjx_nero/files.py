@@ -254,7 +254,7 @@ YamlLoader.yaml_constructors = {
 
 
 def check_writable(path: pathlib.Path) -> None:
-    """Before long work: a file that is to be written at its end.
+    """Checks, before long work, that a file can be written at its end.
 
     Raises:
         UserError: it is a folder, or its folder does not exist or is not writable.
@@ -271,7 +271,7 @@ class _FolderRemoved(UserError):
 
 @contextlib.contextmanager
 def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Where to write a file that then appears whole or not at all, even if the power fails. Makes its folder.
+    """Yields a path to write to; the file then appears whole or not at all, even if the power fails. Makes its folder.
 
     Raises:
         UserError: it cannot be written.

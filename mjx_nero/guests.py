@@ -34,12 +34,12 @@ def register(
         UserError: a name is taken.
     """
     for robot in robots:
-        registry.register_robot(robot)
+        registry.ROBOTS.add(robot.name, robot)
     for name, env in (envs or {}).items():
-        registry.register_env(name, *env)
+        registry.add_env(name, *env)
     for name, controller in (controllers or {}).items():
-        control.register(name, *controller)
+        control.CONTROLLERS.add(name, controller)
     for name, backend in (physics_backends or {}).items():
-        physics.register(name, backend)
+        physics.BACKENDS.add(name, backend)
     for name, kind in (learners or {}).items():
-        learner.register(name, kind)
+        learner.KINDS.add(name, kind)

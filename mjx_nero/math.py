@@ -104,7 +104,7 @@ def solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n
 def box_distance(
     point: Float[Array, "3"], pos: Float[Array, "3"], quat: Float[Array, "4"], size: Float[Array, "3"]
 ) -> Float[Array, ""]:
-    """From a point to the surface of a box, negative within [m].
+    """Distance from a point to the surface of a box, negative inside [m].
 
     Args:
         pos, quat: where the box's centre is, and how it is turned (wxyz).

@@ -78,13 +78,13 @@ class Bank:
 
 @struct.dataclass
 class Progress:
-    """What ``envs.wrappers.ExpertStarts`` knows. Of a batch, all is [n, ...], to be spread over devices and saved as the
-    environments are."""
+    """The state of ``envs.wrappers.ExpertStarts``. In a batch every field is [n, ...], spread over devices and saved like the
+    environments."""
 
-    bank: Bank  # an environment has a row of it
-    share: Float[Array, ""]  # of all episodes at most; 0: there is no bank
-    last: Int[Array, ""]  # in which phase the environment's last episode began; -1: none has ended
-    won: Float[Array, ""]  # 1 where that succeeded, else 0
+    bank: Bank  # one row per environment
+    share: Float[Array, ""]  # greatest share of expert starts; 0: there is no bank
+    last: Int[Array, ""]  # phase in which the environment's last episode began; -1: none has ended
+    won: Float[Array, ""]  # 1 if that episode succeeded, else 0
 
 
 @struct.dataclass
@@ -124,13 +124,13 @@ class Scenery:
     objects: dict[str, Appearance] = struct.field(default_factory=dict)  # by name, those that differ from the model
 
     def __getitem__(self, at: Any) -> "Scenery":
-        """That of some steps or environments."""
+        """Selects steps or environments."""
         return jax.tree.map(lambda x: x[at], self)
 
 
 @struct.dataclass
 class View:
-    """What a term may read: one environment, after the step, all poses consistent with ``qpos``.
+    """Everything that a term may read of one environment after the step. All poses are consistent with ``qpos``.
 
     ``_w`` is the world frame, ``_b`` the robot's root frame (where it is mounted, before the mounting turn).
     Quaternions are wxyz.

@@ -160,8 +160,8 @@ def test_help_takes_its_texts_from_where_the_fields_are():
     about = config.describe(env_cfg("nero_lift"))
     assert about["robot.arm.stiffness"] == "[N m/rad] or [N/m]"  # under Attributes
     assert about["sim.dt"] == "physics step [s]"  # behind the field
-    assert about["rewards.reaching_object.weight"] == "times the function, per second of simulated time"  # of a term
-    assert about["rewards.goal_tracking.params.std"].startswith("of 1 - tanh(distance to the commanded point / std)")
+    assert about["rewards.reaching_object.weight"] == "multiplies the function, per second of simulated time"  # of a term
+    assert about["rewards.goal_tracking.params.std"].startswith("of 1 - tanh(d / std) while held")
     lines = cli.fields_help({"env": env_cfg("nero_lift")}).splitlines()
     assert lines[lines.index("  --env.sim.dt 0.01") + 1] == "        physics step [s]"
 

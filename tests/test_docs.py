@@ -1,5 +1,6 @@
 """What the documents say: links lead somewhere, commands exist and leave a clone clean, nothing is large; the site is whole."""
 
+import ast
 import fnmatch
 import pathlib
 import re
@@ -34,6 +35,12 @@ RUN = {
     "adding_an_arm.md": "tests/test_docs.py",
 }
 
+NO_BEGINNING = set(
+    "about above after as at because before behind below beneath between beyond by for from if in into it its nothing now of on"
+    " out over since so than that their them then they through till to toward towards under until up upon when where which"
+    " while who whose why with within without what how none not yet".split()
+)
+
 
 def commands(text: str) -> list[list[str]]:
     """The words of every command of the package, in blocks of code and within a line; what a container is to do, too."""
@@ -43,6 +50,17 @@ def commands(text: str) -> list[list[str]]:
     lines = [re.sub(r"^podman run .* mjx-nero\S* ", "python -m mjx_nero ", line) for line in lines]
     found = [shlex.split(line, comments=True) for line in lines if line.startswith("python ")]
     return [words for words in found if words[1] in ("train.py", "eval.py") or words[2:3] == ["mjx_nero"] and words[3:]]
+
+
+def test_docstrings_begin_with_what_a_thing_is_or_does():
+    """Not with a preposition, a pronoun or a question word: see CONTRIBUTING."""
+    found = []
+    for path in sorted(file for file in (ROOT / "mjx_nero").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            text = ast.get_docstring(node) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) else None
+            if text and text.split()[0].strip(".,:;").lower() in NO_BEGINNING:
+                found.append(f"{path.relative_to(ROOT)}: {text.splitlines()[0]}")
+    assert not found
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

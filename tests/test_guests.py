@@ -94,7 +94,7 @@ def test_fields_of_a_guest_are_overridden_by_dotted_name(drag):
     ("text", "message"),
     [
         ("1 / 0\n", r"^cannot load .*guest.py: ZeroDivisionError: division by zero \(.*guest.py:1\)$"),
-        ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is an environment 'nero_lift'"),
+        ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is an env 'nero_lift'"),
         ("import mjx_nero\nmjx_nero.register(envs={'new': (None, {})})\n", "the environment 'new' has no preset"),
         ("import mjx_nero\nmjx_nero.register(controllers={'ik': (None, None)})\n", "there is a controller 'ik' already"),
         ("import mjx_nero\nmjx_nero.register(physics_backends={'jax': None})\n", "there is a physics 'jax' already"),
@@ -123,7 +123,7 @@ def test_a_module_beside_the_user_and_an_entry_point_are_loaded(call, tmp_path, 
         name, value = "theirs", "their_package.tasks"
 
         def load(self):
-            registry.register_env("env_of_a_package", *registry._ENVS["nero_reach"])
+            registry.add_env("env_of_a_package", *registry.ENVS["nero_reach"])
 
     monkeypatch.setattr(cli.metadata, "entry_points", lambda group: [Entry()] if group == "mjx_nero" else [])
     code, out, err = call("mjx_nero", "list-envs")

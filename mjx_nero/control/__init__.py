@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero import config
+from mjx_nero.config.registry import Registry
 from mjx_nero.control.controller import Controller
 from mjx_nero.control.detour import CarryPast, CarryPastCfg, Detour, DetourCfg
 from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
@@ -11,28 +12,19 @@ from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.types import UserError
 
 # name -> (class, its config); the class takes (robot, dt, config)
-CONTROLLERS: dict[str, tuple[Any, Any]] = {
-    "ik": (IkFollower, IkCfg()),
-    "rmpflow": (RmpFollower, RmpCfg()),
-    "pick_place": (PickPlace, PickPlaceCfg()),
-    "detour": (Detour, DetourCfg()),
-    "carry": (CarryPast, CarryPastCfg()),
-    "pick_up": (PickUp, PickUpCfg()),
-}
-
-
-def register(name: str, kind: Any, cfg: Any) -> None:
-    """Adds a controller: its class, which takes (robot, dt, config), and its config.
-
-    Raises:
-        UserError: a controller has this name already.
-    """
-    if name in CONTROLLERS:
-        raise UserError(f"there is a controller {name!r} already: choose another name")
-    CONTROLLERS[name] = (kind, cfg)
+CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
+    "controller",
+    {
+        "ik": (IkFollower, IkCfg()),
+        "rmpflow": (RmpFollower, RmpCfg()),
+        "pick_place": (PickPlace, PickPlaceCfg()),
+        "detour": (Detour, DetourCfg()),
+        "carry": (CarryPast, CarryPastCfg()),
+        "pick_up": (PickUp, PickUpCfg()),
+    },
+)
 
 
 def make(name: str, robot: RobotCfg, dt: float, overrides: Mapping[str, Any] | None = None) -> Controller:
@@ -46,7 +38,5 @@ def make(name: str, robot: RobotCfg, dt: float, overrides: Mapping[str, Any] | N
     Raises:
         UserError: unknown name or field, or a value that the controller refuses.
     """
-    if name not in CONTROLLERS:
-        raise UserError(f"unknown controller {name!r}: choose one of {', '.join(CONTROLLERS)}")
-    kind, default = CONTROLLERS[name]
+    kind, default = CONTROLLERS.find(name)
     return kind(robot, dt, config.override(default, overrides or {}))

@@ -1,7 +1,5 @@
-"""Over what stands in the way, by RMPflow: a target that runs up, across and down, while the whole arm keeps clear of the boxes.
-
-RMPflow has no plan: straight towards a goal behind a wall it would stay before the wall. The way over it is the plan.
-"""
+"""Detour: carries the grasp point over obstacles by RMPflow. The target runs up, across and down, while the whole arm keeps clear
+of the boxes."""
 
 import dataclasses
 

@@ -53,7 +53,7 @@ class IkCfg:
 
 @struct.dataclass
 class Solution:
-    """What was found for one pose. Where ``success`` is False, ``q`` is the closest that was found, still within the limits."""
+    """The result for one pose. If ``success`` is False, ``q`` is the closest configuration found, still within the limits."""
 
     q: Float[Array, "*b nj"]  # [rad or m]
     success: Bool[Array, "*b"]  # both tolerances met
@@ -200,7 +200,7 @@ class InverseKinematics:
     def _step(
         self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]
     ) -> tuple[Solution, Float[Array, " nj"]]:
-        """How far ``q`` is from the target, and the configuration after one step."""
+        """Returns the distance of ``q`` from the target, and the configuration after one step."""
         at, turn, jacobian = (x[0] for x in self.chain.jacobians(q))
         linear, angular = _residual(at, turn, pos, quat)
         counts = jnp.array([1.0, 1.0, 0.0 if self.cfg.free_turn else 1.0])
@@ -230,5 +230,5 @@ class InverseKinematics:
 def _residual(
     at: Float[Array, "3"], turn: Float[Array, "4"], pos: Float[Array, "3"], quat: Float[Array, "4"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """From a pose to its target: the way [m] and the rotation vector [rad], in the world."""
+    """Error from a pose to its target, in the world frame: distance vector [m] and rotation vector [rad]."""
     return pos - at, math.quat_log(math.quat_mul(quat, math.quat_conj(turn)))

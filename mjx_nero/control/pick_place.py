@@ -64,7 +64,7 @@ Pose = Float[Array, "4"]  # position [m], and turn about the vertical [rad]
 
 @struct.dataclass
 class PickPlaceMemory:
-    """Between two steps of ``PickPlace``."""
+    """The state of ``PickPlace`` between two steps."""
 
     move: Int[Array, ""]  # which object, from 0
     phase: Int[Array, ""]  # 0 to 9; 10: done
@@ -118,7 +118,7 @@ class PickPlace:
         self._moves = len(cfg.tower) - 1
 
     def init(self, view: View) -> PickPlaceMemory:
-        """At the start of phase 0 of the first object."""
+        """Starts phase 0 of the first object."""
         zero, start = jnp.zeros((), jnp.int32), jnp.append(view.ee_pos_w, 0.0)
         return PickPlaceMemory(
             move=zero,
@@ -232,7 +232,7 @@ def _turned(vec, angle: Float[Array, ""]) -> Float[Array, "3"]:
 
 
 def _arc(a: Float[Array, "2"], b: Float[Array, "2"], s, center: Float[Array, "2"]) -> Float[Array, "2"]:
-    """From ``a`` to ``b`` at a constant rate of angle and radius about ``center``, the short way round."""
+    """Interpolates from ``a`` to ``b`` at a constant rate of angle and radius about ``center``, the short way round."""
     a, b = a - center, b - center
     start = jnp.arctan2(a[1], a[0])
     turn = jnp.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)

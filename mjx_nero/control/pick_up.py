@@ -30,7 +30,7 @@ _SLOW = 0.2  # [rad/s]
 
 @dataclasses.dataclass(frozen=True)
 class PickUpCfg:
-    """How to grasp, and how fast; lengths in m.
+    """Settings of the grasp and its speed; lengths in m.
 
     Attributes:
         object: what to pick up.
@@ -58,7 +58,7 @@ class PickUpCfg:
 
 @struct.dataclass
 class PickUpMemory:
-    """Between two steps of ``PickUp``."""
+    """The state of ``PickUp`` between two steps."""
 
     phase: Int[Array, ""]
     count: Int[Array, ""]  # steps made in this phase
@@ -109,7 +109,7 @@ class PickUp:
         self._choices = np.array(angles, np.float32)
 
     def init(self, view: View) -> PickUpMemory:
-        """At the start of the first phase."""
+        """Starts the first phase."""
         q, zero = view.joint_pos[: self._n], jnp.zeros((), jnp.int32)
         angles = self._angles(view)
         quats = jax.vmap(self._hand)(angles)
@@ -155,7 +155,7 @@ class PickUp:
         return memory, jnp.concatenate([q + self._lead * qd, fingers])
 
     def _ended(self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""]) -> Bool[Array, ""]:
-        """Whether the phase is: what was to be done is done, or there has been time enough.
+        """True if the phase is done, or has had enough time.
 
         Args:
             error: of the grasp point [m].
@@ -183,7 +183,7 @@ class PickUp:
         return memory.q + qd * self.dt, qd
 
     def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
-        """With a new plan for an object that has been lost: the hand turned as little as may be, without a search."""
+        """Plans again for a lost object, turning the hand as little as possible, without a search."""
         angles = self._angles(view)
         off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
         yaw = memory.yaw + off[jnp.argmin(jnp.abs(off))]
@@ -204,13 +204,13 @@ class PickUp:
         return jnp.where(round, 0.0, jnp.arctan2(axis[1], axis[0])) + jnp.asarray(self._choices)[index]
 
     def _pick(self, view: View, yaw: Float[Array, ""]) -> Float[Array, "3"]:
-        """Where the grasp point has to be."""
+        """Computes where the grasp point must be."""
         seen = view.objects[self.cfg.object].pos_w
         height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
-        """From the open fingers to the nearest of the other objects' centres [m]; more than the hand is wide counts no more."""
+        """Distance from the open fingers to the nearest of the other objects' centres [m], at most the hand's width."""
         middle = view.objects[self.cfg.object].pos_w[:2]
         tips = self._reach * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=1)  # the fingers open along the hand's y
         others = jnp.stack([other.pos_w for other in view.objects.values()])[:, :2] - middle

@@ -1,4 +1,4 @@
-"""What an arm is to the runtime: radians, metres, seconds, and no way to cut its torque."""
+"""The arm as the runtime sees it: radians, metres, seconds, and no way to cut its torque."""
 
 import dataclasses
 from typing import Protocol
@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Feedback:
-    """What an arm's encoders and drives tell; arrays along the arm's joints.
+    """Readings of an arm's encoders and drives, as arrays along the arm's joints.
 
     Attributes:
         time: when it was read, on the runtime's clock [s].

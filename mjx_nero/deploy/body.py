@@ -23,7 +23,7 @@ def matrix(quat: Vector) -> np.ndarray:
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of quaternions (wxyz): the turn ``b`` first, then ``a``."""
+    """Multiplies quaternions (wxyz): the turn ``b`` first, then ``a``."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return np.array(
@@ -156,7 +156,7 @@ class Body:
         return len(moved)
 
     def link(self, names: Sequence[str]) -> np.ndarray:
-        """How many of some joints move each shape: its place in their chain."""
+        """Counts how many of the named joints move each shape: its place in their chain."""
         wanted = {self._columns[name] for name in names}
         out = []
         for node in self._owner:
@@ -180,7 +180,7 @@ class Body:
         return out
 
     def _all(self, q: np.ndarray) -> np.ndarray:
-        """With the joints that follow others, counted from where they displace nothing."""
+        """Adds the joints that follow others, counted from where they displace nothing."""
         if self._couplings:
             q = np.concatenate([q, np.zeros((len(q), len(self._columns) - q.shape[1]))], axis=1)
             for c in self._couplings:

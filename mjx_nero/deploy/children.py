@@ -6,11 +6,11 @@ import sys
 
 
 def command(module: str, *argv: str) -> list[str]:
-    """What starts a module of this package."""
+    """Returns the command that starts a module of this package."""
     return [sys.executable, "-m", module, *argv]
 
 
 def environment() -> dict[str, str]:
-    """In which it finds the package that this process has."""
+    """Returns an environment in which a child finds the package that this process has."""
     root = str(pathlib.Path(__file__).resolve().parents[2])
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))}

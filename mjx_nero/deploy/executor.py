@@ -54,7 +54,7 @@ def names(found: Any, name: str) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """What an executor knows of the robot's joints, arrays along ``names`` [rad or m].
+    """The robot's joints as an executor knows them, as arrays along ``names`` [rad or m].
 
     Attributes:
         speed: of targets, at most [rad/s or m/s].
@@ -70,7 +70,7 @@ class Joints:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> "Joints":
-        """From the metadata of an exported policy.
+        """Reads the metadata of an exported policy.
 
         Raises:
             ValueError: they say something else than an exported policy's; one line.
@@ -126,14 +126,14 @@ class _Stateless:
         self.what |= {name: numbers(what, name, above=0.0) for name in self.above_zero}
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
-        """Nothing to forget."""
+        """Does nothing: the part has no memory."""
 
     def home(self) -> np.ndarray:
         """The entries that keep the robot at home."""
         return np.zeros(self.size)
 
     def bounded(self, values: np.ndarray) -> np.ndarray:
-        """Within the ranges of the term's joints."""
+        """Clips to the ranges of the term's joints."""
         return np.clip(values, self.joints.lower[self.ids], self.joints.upper[self.ids])
 
 
@@ -167,7 +167,7 @@ class JointVelocity(_Stateless):
         self.follow = 1 - np.exp(-joints.dt / what["time"])
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
-        """At the joints, at rest."""
+        """Puts the set-points at the joints, at rest."""
         self.point, self.rate = position[self.ids], np.zeros(self.size)
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
@@ -202,7 +202,7 @@ class Continuous(_Stateless):
     size, reads = 1, ("close", "open")
 
     def home(self) -> np.ndarray:
-        """As far open as it is at home."""
+        """The entry for the gripper's opening at home."""
         close, open = (np.resize(self.what[end], len(self.ids)) for end in ("close", "open"))
         way = open - close
         return np.array([2 * ((self.joints.home[self.ids] - close) @ way) / (way @ way or 1.0) - 1])
@@ -237,7 +237,7 @@ class LowPass(_Stateless):
     above_zero = ("dt", "time")
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
-        """It has been home's."""
+        """Starts from the home action."""
         self.value = home_action
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
@@ -246,7 +246,7 @@ class LowPass(_Stateless):
 
 
 class Nothing(_Stateless):
-    """What training reckoned with, and the real world brings by itself."""
+    """Does nothing, for terms that the real world adds by itself, such as delays and noise."""
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
         """Leaves all as it is."""
@@ -266,7 +266,7 @@ PARTS: dict[str, Callable[[Joints, Mapping[str, Any]], Any]] = {
 
 
 class Executor:
-    """From actions to targets; begins where the joints are.
+    """Turns actions into targets, starting from where the joints are.
 
     Args:
         joints: of the robot.
@@ -327,7 +327,7 @@ class Executor:
 
 
 class Lag:
-    """What the drives of training make of targets: joints that follow like a first-order filter of damping over stiffness.
+    """Models the drives of training: joints follow targets like a first-order filter with time constant damping / stiffness.
 
     Its output is where the joints are meant to be, which arms with stiff drives are told and which limits are for. Drives like
     those of training are told ``position + lead * velocity``, which is the target again.
@@ -346,12 +346,12 @@ class Lag:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> "Lag":
-        """Of an exported policy's drives."""
+        """Builds the lag of an exported policy's drives."""
         joints = metadata["joints"]
         return cls(np.array(joints["damping"], float) / np.array(joints["stiffness"], float), float(metadata["control_dt"]))
 
     def __call__(self, target: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Where the joints get to in a step towards a target, from where they are meant to be [rad or m]."""
+        """Returns where the joints get in one step towards a target, from where they are meant to be [rad or m]."""
         return position + self._share * (target - position)
 
 

@@ -1,4 +1,5 @@
-"""Where an arm may be: above the table, within a box, and clear of itself. Clearances of all links, for some postures at once."""
+"""A fence around an arm: above the table, within a box, and clear of itself. It computes clearances of all links, for several
+postures at once."""
 
 import dataclasses
 
@@ -13,7 +14,7 @@ _SAMPLES, _ALWAYS = 300, 0.9  # postures looked at; links that touch in so many 
 
 @dataclasses.dataclass(frozen=True)
 class FenceCfg:
-    """Where the links may be.
+    """Bounds for the links.
 
     Attributes:
         table: height of the table's top, in the world [m].

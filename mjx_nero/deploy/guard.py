@@ -37,7 +37,7 @@ def urgent() -> None:
 
 
 class Guarded(Protocol):
-    """What the loop sees of an arm, be it in this process or in one of its own.
+    """An arm as the loop sees it, in this process or in one of its own.
 
     Attributes:
         fault: why it holds; None: it does not.

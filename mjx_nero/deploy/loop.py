@@ -42,7 +42,7 @@ class Brain(Policy):
         self._targets = collections.deque([self._meant] * past, maxlen=past)
 
     def __call__(self, feedback: Feedback, now: float) -> np.ndarray:
-        """Where the joints are to be next [rad or m].
+        """Computes where the joints must be next [rad or m].
 
         Raises:
             ValueError: an object is not seen, or an observation or the action is not finite.
@@ -56,13 +56,13 @@ class Brain(Policy):
         return self._lag(self._executor(self.action, feedback.position), self._meant)
 
     def sent(self, position: np.ndarray) -> None:
-        """What the safety layer made of it: from there the joints go on."""
+        """Takes the safety layer's command, from which the joints continue."""
         self._meant = position
 
 
 @dataclasses.dataclass
 class Timing:
-    """What cycles took [s], each; ``missed``: the cycles that were late, and by how much."""
+    """Durations of cycles [s]; ``missed``: the cycles that were late, and by how much."""
 
     jitter: list[float] = dataclasses.field(default_factory=list)
     read: list[float] = dataclasses.field(default_factory=list)
@@ -82,7 +82,7 @@ class Timing:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """How a run ended. ``fault``: why the arm holds; the end of its time is one, too."""
+    """The end of a run. ``fault``: why the arm holds; the end of its time counts as one."""
 
     fault: Fault
     timing: Timing

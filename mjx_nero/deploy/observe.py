@@ -14,7 +14,7 @@ from mjx_nero.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What terms read at one step.
+    """The quantities that terms read at one step.
 
     Attributes:
         position, velocity, home, targets: of the joints [rad or m].
@@ -119,7 +119,7 @@ class Observer:
         self.goal, self.goal_quat = _goal(metadata["command"], goal)
 
     def __call__(self, feedback: Feedback, targets: np.ndarray, action: np.ndarray, now: float) -> dict[str, np.ndarray]:
-        """By the names of the policy's terms.
+        """Computes the observations, by the names of the policy's terms.
 
         Args:
             targets: in force, along the joints [rad or m].

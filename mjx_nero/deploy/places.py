@@ -1,11 +1,4 @@
-"""Where objects are, as something outside says: a constant, a file, or datagrams and lines of a tracker.
-
-One message is one JSON object, of at most 4,096 bytes, in the robot's root frame (that of the base link, unturned):
-
-    {"object": "cube", "position": [0.35, 0.02, 0.015], "quaternion": [1, 0, 0, 0]}
-
-``object`` may be left out where there is one, ``quaternion`` (wxyz) where nobody needs it. A file holds one message, or a list.
-"""
+"""Places of objects, as something outside reports them: a constant, a file, or datagrams and lines of a tracker."""
 
 import contextlib
 import dataclasses
@@ -40,7 +33,7 @@ class Places(Protocol):
     """A source of places."""
 
     def find(self, name: str, now: float) -> Place:
-        """Where an object is.
+        """Finds where an object is.
 
         Args:
             now: [s].
@@ -115,7 +108,7 @@ class Known:
         return place
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Does nothing: there is nothing to let go."""
 
 
 class FromFile(Known):
@@ -172,7 +165,7 @@ class FromSocket(Known):
         return super().find(name, now)
 
     def _news(self) -> list[bytes]:
-        """What has come since, the oldest first."""
+        """Returns the texts that have arrived since, oldest first."""
         found: list[bytes] = []
         for _ in range(1000):  # of a sender that never stops, so much a step
             try:

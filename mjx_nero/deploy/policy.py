@@ -66,7 +66,7 @@ class Policy:
         return self._past[name]
 
     def executor(self, position: np.ndarray) -> Executor:
-        """What turns the policy's actions into targets, from where the joints are [rad or m]."""
+        """Makes an executor of the policy's actions that starts from where the joints are [rad or m]."""
         return Executor.of(self.metadata, position)
 
 
@@ -85,7 +85,7 @@ def _read(stored: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _check(metadata: Mapping[str, Any], taken: Any, given: Any) -> None:
-    """Whether the metadata describe the network's ``taken`` inputs and ``given`` outputs.
+    """Checks that the metadata describe the network's ``taken`` inputs and ``given`` outputs.
 
     Raises:
         ValueError: they do not; one line.

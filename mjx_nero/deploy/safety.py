@@ -57,7 +57,7 @@ class SafetyCfg:
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Of the joints; arrays along ``names`` [rad or m].
+    """Limits of the joints, as arrays along ``names`` [rad or m].
 
     Attributes:
         arm: which of them are the arm's, the others being the gripper's, which is there to press and to be blocked.
@@ -74,7 +74,7 @@ class Limits:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any], cfg: SafetyCfg) -> "Limits":
-        """From the metadata of an exported policy."""
+        """Reads the metadata of an exported policy."""
         own = metadata["joints"]
         home, lower, upper, speed = (np.array(own[name], float) for name in ("home", "lower", "upper", "speed"))
         speed = speed * cfg.share
@@ -82,7 +82,7 @@ class Limits:
         return cls(tuple(own["names"]), arm, home, lower, upper, speed, speed / cfg.spin_up, float(metadata["control_dt"]))
 
     def within(self, lower: np.ndarray, upper: np.ndarray) -> "Limits":
-        """With ranges that an arm has narrowed.
+        """Narrows the ranges to those of an arm.
 
         Raises:
             UserError: home is outside.
@@ -98,7 +98,7 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """Why an arm holds.
+    """The reason why an arm holds.
 
     Attributes:
         kind: ``nan``, ``stale``, ``bus``, ``range``, ``jump``, ``stall``, ``load``, ``temperature``, ``object``, ``deadline``,
@@ -111,7 +111,7 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Where the joints are to be [rad or m], the velocity there [rad/s or m/s], and which limits acted."""
+    """A command: where the joints must be [rad or m], the velocity there [rad/s or m/s], and which limits acted."""
 
     position: np.ndarray
     velocity: np.ndarray
@@ -179,7 +179,7 @@ class Safety:
         return self.fault
 
     def hold(self, fault: Fault) -> None:
-        """From now on the arm brakes and holds. The first fault stays."""
+        """Makes the arm brake and hold from now on. The first fault stays."""
         self.fault = self.fault or fault
 
     def lost(self, fault: Fault) -> None:
@@ -198,7 +198,7 @@ class Safety:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command does not move on."""
+        """True if the last command stands still."""
         return not np.any(self.velocity)
 
     def _move(self, target: np.ndarray) -> Command:
@@ -258,7 +258,7 @@ class Safety:
         return Command(self.position.copy(), self.velocity.copy(), acted)
 
     def _fault(self, feedback: Feedback, now: float) -> Fault | None:
-        """What is wrong with a feedback, if anything."""
+        """Says what is wrong with a feedback, if anything."""
         limits, cfg, at = self.limits, self.cfg, np.asarray(feedback.position, float)
         speeds = np.asarray(feedback.velocity, float)
         if at.shape != limits.home.shape or not (np.all(np.isfinite(at)) and np.all(np.isfinite(speeds))):
@@ -289,18 +289,18 @@ class Safety:
         return None
 
     def _name(self, values: np.ndarray) -> str:
-        """Of the worst joint; among the arm's where those are what matters."""
+        """Names the worst joint; only among the arm's if those matter."""
         return self.limits.names[int(np.argmax(values))]
 
 
 class _Since:
-    """For how long something has been so, for each of some joints."""
+    """Tracks for how long a condition has held, for each of several joints."""
 
     def __init__(self, count: int):
         self._begun = np.full(count, np.nan)
 
     def lasts(self, so: np.ndarray, now: float, seconds: float) -> bool:
-        """Whether it has been so for some time, for any of them."""
+        """True if it has held for ``seconds``, for any of them."""
         self._begun = np.where(so, np.where(np.isnan(self._begun), now, self._begun), np.nan)
         return bool(np.any(now - self._begun >= seconds))
 

@@ -31,7 +31,7 @@ PACKET = 1 << 17  # bytes of a message, at most
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """What the arm's process has to know; plain values alone.
+    """Everything that the arm's process must know, as plain values.
 
     Attributes:
         kind, options: of the driver, see ``drivers.make``.
@@ -70,7 +70,7 @@ class Server:
         self.guard, self.running, self.heard = Guard(self._arm, safety, self.clock), False, 0.0
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """To one request: the fault, and what was asked for."""
+        """Answers one request with the fault and the requested value."""
         does: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
             "start": self._start,
             "read": lambda _: plain(self.guard.read()),
@@ -105,7 +105,7 @@ class Server:
         return {}
 
     def watch(self) -> float:
-        """What the time asks for; how long nothing else will [s]."""
+        """Does what is due; returns how long nothing else will be [s]."""
         if not self.running:
             return 1.0
         now, guard = self.clock.now(), self.guard

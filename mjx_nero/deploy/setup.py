@@ -1,4 +1,4 @@
-"""From the metadata of an exported policy to the safety layer of its arm."""
+"""Builds the safety layer of an arm from the metadata of an exported policy."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ NEEDED = ("joints", "gripper", "body", "command", "objects")
 
 
 def check(metadata: Mapping[str, Any]) -> None:
-    """Whether a file says all that an arm needs.
+    """Checks that a file says all that an arm needs.
 
     Raises:
         UserError: an older version exported it.

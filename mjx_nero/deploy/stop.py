@@ -1,4 +1,4 @@
-"""How a person stops an arm: Ctrl-C, SIGTERM, a key, or a file that nobody touches any more."""
+"""Ways in which a person stops an arm: Ctrl-C, SIGTERM, a key, or a file that nobody touches any more."""
 
 import contextlib
 import os

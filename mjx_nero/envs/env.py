@@ -1,6 +1,6 @@
-"""The manipulation environment: single, pure ``reset`` and ``step``, compatible with ``brax.envs.base.Env``.
+"""The manipulation environment: pure ``reset`` and ``step`` of one environment, compatible with ``brax.envs.base.Env``.
 
-One class, longer than others, because both are made of the same parts, and what one writes the other reads.
+It is one long class because ``reset`` and ``step`` share all their parts, and one reads what the other writes.
 """
 
 import dataclasses
@@ -31,16 +31,16 @@ from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
 from mjx_nero.types import LEVEL, PHASE, TARGET, Appearance, Bank, Carry, Key, Scenery, Sim, Start, UserError, View
 
-_MAX_SPEED = 1e3  # [rad/s, m/s]: beyond it the physics has diverged, though it may still be finite
+_MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
-# Folded into an episode's key: what draws apart changes no other draw.
+# Folded into an episode's key, so that one part's draws leave all others unchanged.
 _FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING, _VISITED = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E, 0x715173D
 
-Starts = tuple[Bank, Float[Array, " phases"]]  # states that an expert has visited, and how likely each of its phases is
+Starts = tuple[Bank, Float[Array, " phases"]]  # visited states, and the probabilities of their phases
 
 
 def _precise(method: Callable) -> Callable:
-    """Computes with full float32 products, whatever the program has set: TF32 in the physics costs success."""
+    """Forces full float32 products, whatever the program has set: TF32 in the physics costs success."""
 
     @functools.wraps(method)
     def precise(*args, **kwargs):
@@ -53,21 +53,21 @@ def _precise(method: Callable) -> Callable:
 class ManipulationEnv(Env):
     """A robot, a table, objects and a commanded point, with the MDP of an ``EnvCfg``.
 
-    ``reset`` and ``step`` work on one environment and are pure: ``jax.vmap`` them for thousands, ``jax.jit`` them for speed.
-    ``state.pipeline_state`` is the physics state (``types.Sim``), ``state.obs`` a dict of groups, ``state.info['carry']`` the
-    rest of the episode's memory. ``info['truncation']`` is 1 where ``done`` is a time-out.
+    ``reset`` and ``step`` are pure and work on one environment: use ``jax.vmap`` for thousands, and ``jax.jit`` for speed.
+    ``state.pipeline_state`` is the physics state (``types.Sim``), ``state.obs`` is a dict of observation groups, and
+    ``state.info['carry']`` holds the rest of the episode's memory. ``info['truncation']`` is 1 where ``done`` is a time-out.
 
     Args:
         cfg: the task.
         impl: ``auto``, ``warp``, ``jax`` or ``native``.
-        num_envs: how many are meant to be stepped together.
+        num_envs: number of copies that will be stepped together.
 
     Attributes:
-        actions: the task's action terms, one after another: they describe and invert themselves, too.
+        actions: the task's action terms, as a chain that can also describe and invert itself.
         home_action: the action that keeps the robot at home [na].
 
     Raises:
-        UserError: ``impl`` is unknown or not possible on this machine, or the task is not possible.
+        UserError: ``impl`` is unknown or unavailable on this machine, or the task is impossible.
     """
 
     def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
@@ -95,7 +95,7 @@ class ManipulationEnv(Env):
         self._resample_steps = round(cfg.command.resample_s / self.dt)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A pickle or a copy holds the arguments, and what comes out of it is made anew."""
+        """Pickles and copies hold only the arguments, and rebuild the environment."""
         return type(self), (self.cfg, self.impl, self.num_envs)
 
     def _drives(self) -> dict[str, Drives]:
@@ -110,45 +110,45 @@ class ManipulationEnv(Env):
 
     @functools.cached_property
     def physics(self) -> Physics:
-        """The backend; made when first stepped."""
-        with jax.ensure_compile_time_eval():  # the first step may well be under a trace
+        """The physics backend, created at the first step."""
+        with jax.ensure_compile_time_eval():  # the first step may run under a trace
             drawn = self._randomization.names + (obstacles.FIELDS if self.cfg.obstacles else ())
             return make_physics(self.physics_model, self.cfg.sim, self.impl, tuple(dict.fromkeys(drawn)))
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
-        """The whole scene with visual shapes, lights and cameras, compiled for MuJoCo (to render or to inspect)."""
+        """The whole scene compiled for MuJoCo, with visual shapes, lights and cameras, for rendering and inspection."""
         return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
 
     @property
     def action_size(self) -> int:
-        """How many numbers the action terms read."""
+        """Number of entries of an action."""
         return len(self.home_action)
 
     @functools.cached_property
     def state_shape(self) -> State:
-        """What ``reset`` returns, with shapes in place of arrays."""
+        """The result of ``reset``, with shapes in place of arrays."""
         return jax.eval_shape(self.reset, jax.random.PRNGKey(0))
 
     @functools.cached_property
     def observation_size(self) -> dict[str, Any]:
-        """Shape of each observation group; of a group whose terms stay apart, of each by name."""
+        """The shape of each observation group; a dict of shapes for a group whose terms stay apart."""
         obs = self.state_shape.obs
         return jax.tree.map(lambda value: value.shape, {name: obs[name] for name in self.cfg.observations})
 
     @property
     def backend(self) -> str:
-        """Name of the physics backend, as Brax asks for it."""
+        """The physics backend's name, in Brax's words."""
         return {"native": "mujoco", "jax": "mjx-jax", "warp": "mjx-warp"}.get(self.impl, self.impl)
 
     @_precise
     def reset(self, rng: Key, level: float | Float[Array, ""] | None = None, starts: Starts | None = None) -> State:
-        """A fresh episode: joints at home, objects and command sampled anew.
+        """Starts a new episode: joints at home, objects and command drawn anew.
 
         Args:
-            rng: random key of this environment.
-            level: what share of all that differs from episode to episode it has; None: all of it.
-            starts: what an expert has visited, to begin there by chance (``events.visited``).
+            rng: the environment's random key.
+            level: share of all episode-to-episode differences to apply; None: all.
+            starts: states that an expert has visited, and how likely to start there (``events.visited``).
         """
         k_sample, k_obs = jax.random.split(rng)
         sim, carry = self.sample(k_sample, None if level is None else jnp.asarray(level, jnp.float32), starts)
@@ -162,7 +162,7 @@ class ManipulationEnv(Env):
 
     @_precise
     def sample(self, rng: Key, level: Float[Array, ""] | None = None, starts: Starts | None = None) -> tuple[Sim, Carry]:
-        """The start of an episode, before it is observed. ``level`` and ``starts``: see ``reset``."""
+        """Draws the start of an episode, before any observation. ``level`` and ``starts``: see ``reset``."""
         k_fields, k_memory, k_visited = (jax.random.fold_in(rng, apart) for apart in (_FIELDS, _MEMORY, _VISITED))
         rng, k_command, *k_events = jax.random.split(rng, 2 + len(self.cfg.events))
         command, command_quat = self._sample_command(k_command)
@@ -192,17 +192,17 @@ class ManipulationEnv(Env):
             command_quat=start.goal_quat_w,
             memory={**({TARGET: start.target} if self.cfg.command.targets else {}), **({} if level is None else {LEVEL: level})},
         )
-        if starts:  # as if the last action had been the one that asks for these targets
+        if starts:  # as if the previous action had asked for these targets
             last = self.actions.invert(sim.ctrl, qpos[self._viewer.qpos_ids])
             memory = {**carry.memory, PHASE: start.phase}
             carry = dataclasses.replace(carry, action=jnp.where(start.phase > 0, last, carry.action), memory=memory)
-        if self.cfg.obstacles:  # between what is already there: the start and the goal
+        if self.cfg.obstacles:  # drawn last, between the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
             sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
         return sim, dataclasses.replace(carry, memory=self._memory(k_memory, sim, carry))
 
     def blank(self) -> Bank:
-        """One row of a bank: joints at home, objects as the scene has them, no goal."""
+        """Returns one row of a bank: joints at home, objects as in the scene, no goal."""
         poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
         start = Start(
             joint_pos=jnp.asarray(self.cfg.robot.home),
@@ -213,7 +213,8 @@ class ManipulationEnv(Env):
         return Bank(start, jnp.zeros((), bool))
 
     def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
-        """Joints within their ranges, linkages closed, objects in their places; of another size, as far above the table."""
+        """Builds qpos: joints within their ranges, linkages closed, objects in place, rescaled ones still resting on the
+        table."""
         joints = jnp.clip(start.joint_pos, *self._range)
         qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints)
         for coupling in self._coupled:
@@ -248,26 +249,26 @@ class ManipulationEnv(Env):
 
     @_precise
     def view(self, state: State) -> View:
-        """What the terms and the controllers read of a state."""
+        """Returns what terms and controllers read of a state."""
         carry = state.info["carry"]
         return self._viewer(state.pipeline_state, carry, carry.action)
 
     @_precise
     def named_observations(self, state: State) -> dict[str, dict[str, Array]]:
-        """Each term of each observation group by its name, as it is now, without noise or delay; of a batch, too."""
+        """Evaluates each term of each observation group by name, without noise or delay. Also works on a batch."""
         if jnp.ndim(state.done):
             return jax.vmap(self.named_observations)(state)
         view, recall = self.view(state), terms.Recall(state.info["carry"].memory)
         return {name: terms.by_name(group.terms, view, recall, name) for name, group in self.cfg.observations.items()}
 
     def scenery(self, state: State) -> Scenery:
-        """What a picture of a state shows beside the joints' positions."""
+        """Collects what a picture of the state shows besides the joint positions."""
         sim, carry = state.pipeline_state, state.info["carry"]
         goal, _ = self._viewer.goal(carry)
         return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._appearances(sim, carry))
 
     def _appearances(self, sim: Sim, carry: Carry) -> dict[str, Appearance]:
-        """Drawn sizes and colours; of the command's targets the commanded one in the goal's green."""
+        """Collects drawn sizes and colours of objects; the commanded one of the targets gets the goal's green."""
         fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
         if not targets and not {"geom_size", "geom_rgba"} & set(fields):
             return {}
@@ -283,7 +284,7 @@ class ManipulationEnv(Env):
 
     @_precise
     def observe(self, sim: Sim, carry: Carry, key: Key) -> tuple[dict[str, Any], Carry]:
-        """The observation groups, and what remains in memory of them; ``key`` draws their noise."""
+        """Computes the observation groups and their new memory; ``key`` draws their noise."""
         cfg, recall = self.cfg, terms.Recall(carry.memory)
         view = sensed = self._viewer(sim, carry, carry.action)
         for name, term in cfg.sensors.items():
@@ -295,14 +296,14 @@ class ManipulationEnv(Env):
 
     @_precise
     def step(self, state: State, action: Float[Array, " na"]) -> State:
-        """One control step.
+        """Makes one control step.
 
         Args:
-            state: from ``reset`` or ``step``.
-            action: [action_size], unbounded.
+            state: result of ``reset`` or ``step``.
+            action: action entries [action_size], unbounded.
 
         Raises:
-            UserError: the action has another size.
+            UserError: the action has the wrong size.
         """
         state, ctrl = self.act(state, action)
         sim, overflow = self.physics.step(state.pipeline_state, ctrl)
@@ -310,20 +311,20 @@ class ManipulationEnv(Env):
 
     @_precise
     def following(self, state: State, starts: Starts | None = None) -> tuple[Sim, Carry]:
-        """The start of the episode that comes after the one of ``state``, before it is observed. ``starts``: see ``reset``."""
+        """Draws the start of the episode after the present one, before any observation. ``starts``: see ``reset``."""
         carry = state.info["carry"]
         return self.sample(jax.random.fold_in(carry.rng, _FOLLOWING), carry.memory.get(LEVEL), starts)
 
     @_precise
     def step_and_reset(self, state: State, action: Float[Array, " na"], start: tuple[Sim, Carry] | None = None) -> State:
-        """``step``, and where that ends the episode the start of a new one, with fresh draws.
+        """Makes a step and, if that ends the episode, starts a new one with fresh draws.
 
-        Reward, done and metrics are the ended episode's; physics, observation and carry the new one's. To cache the first
-        state instead would replay one object and goal position per environment for ever.
+        Reward, done and metrics belong to the ended episode; physics, observation and carry to the new one. Caching the first
+        state instead would replay one object and one goal position per environment forever.
 
         Args:
-            start: of the new episode, from ``following``; None: drawn now. Few episodes end in a step, but all of a batch draw
-                a start for it: a loop that draws them once in some steps, fewer than an episode has, is faster.
+            start: start of the new episode, from ``following``; None: drawn now. Few episodes end in one step, yet the whole
+                batch draws starts. A loop that draws them once every few steps is faster.
         """
         state, ctrl = self.act(state, action)
         sim, overflow = self.physics.step(state.pipeline_state, ctrl)
@@ -339,7 +340,7 @@ class ManipulationEnv(Env):
 
     @property
     def first_level(self) -> float | None:
-        """Of the first episodes in training: see ``CurriculumCfg.levels``."""
+        """Level of the first training episodes: see ``CurriculumCfg.levels``."""
         levels = self.cfg.curriculum.levels
         return None if levels is None else levels.made.start
 
@@ -350,10 +351,10 @@ class ManipulationEnv(Env):
         return levels.made.step(level, state.metrics["success"])
 
     def act(self, state: State, action: Float[Array, " na"]) -> tuple[State, Float[Array, " nu"]]:
-        """The drives' position targets for ``action`` [rad or m], and the state with what the action terms then remember.
+        """Computes the drives' position targets for ``action`` [rad or m], and the state with the action terms' new memory.
 
         Raises:
-            UserError: the action has another size.
+            UserError: the action has the wrong size.
         """
         if jnp.shape(action) != (self.action_size,):
             shape = f"an action is {self.action_size} numbers, got an array of shape {jnp.shape(action)}"
@@ -365,7 +366,7 @@ class ManipulationEnv(Env):
         return state.replace(pipeline_state=sim, info={**state.info, "carry": carry.replace(memory=memory)}), ctrl
 
     def _push(self, sim: Sim, carry: Carry, memory: dict[str, Any]) -> tuple[Sim, dict[str, Any]]:
-        """Objects with what the pushes add to their velocities."""
+        """Adds the pushes to the objects' velocities."""
         if not self.cfg.pushes:
             return sim, memory
         recall, view, qvel = terms.Recall(memory), self._viewer(sim, carry, carry.action), sim.qvel
@@ -375,12 +376,12 @@ class ManipulationEnv(Env):
         return dataclasses.replace(sim, qvel=qvel), recall.memory
 
     def targets(self, state: State, action: Float[Array, " na"]) -> Float[Array, " nu"]:
-        """The drives' position targets for ``action`` alone. Raises as ``act``."""
+        """Computes only the drives' position targets for ``action``. Raises the errors of ``act``."""
         return self.act(state, action)[1]
 
     @_precise
     def finish(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
-        """The second half of ``step``: what follows from the physics state ``sim``."""
+        """Makes the second half of ``step``, given the new physics state ``sim``."""
         state = self.advance(state, action, sim, overflow)
         rng, k_obs = jax.random.split(state.info["carry"].rng)
         obs, carry = self.observe(state.pipeline_state, state.info["carry"], k_obs)
@@ -388,7 +389,7 @@ class ManipulationEnv(Env):
 
     @_precise
     def advance(self, state: State, action: Float[Array, " na"], sim: Sim, overflow: Float[Array, ""]) -> State:
-        """Rewards, terminations, metrics and carry for the physics state ``sim``; the observation is left as it was."""
+        """Computes rewards, terminations, metrics and carry for the physics state ``sim``; leaves the observation as it was."""
         cfg, carry = self.cfg, state.info["carry"]
         sim, action, bad = self._guard(state, self._clip(action), sim)
         step, count, recall = carry.step + 1, state.info["count"] + 1, terms.Recall(carry.memory)
@@ -418,22 +419,22 @@ class ManipulationEnv(Env):
         )
 
     def _guard(self, state: State, action: Float[Array, " na"], sim: Sim) -> tuple[Sim, Float[Array, " na"], Bool[Array, ""]]:
-        """A diverged environment stays at its last good state and ends; nothing of the bad one gets any further."""
+        """Keeps a diverged environment at its last good state and marks it, so that nothing of the bad state spreads."""
         bad = ~(jnp.all(jnp.abs(sim.qpos) < jnp.inf) & jnp.all(jnp.abs(sim.qvel) < _MAX_SPEED) & jnp.all(jnp.isfinite(action)))
         sim = jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.pipeline_state, sim)
         return sim, jnp.where(bad, state.info["carry"].action, action), bad
 
     def _metrics(self, view: View, recall: terms.Recall, ends: dict, done: Array, bad: Array) -> dict[str, Float[Array, ""]]:
-        """The task's metrics; ``ends`` are further results of an episode."""
+        """Computes the task's metrics; ``ends`` are further results of an episode."""
         distance = recall("success.distance", self.cfg.success.distance, view)
         values = {"distance": distance, "final_distance": distance, **ends}
         values |= {name: recall(f"metrics.{name}", term, view) for name, term in self.cfg.metrics.items()}
-        # Episode results appear at the last step and are 0 before it: a sum over the episode gives them.
+        # Episode results are 0 before the last step, so a sum over the episode gives them.
         at_end = {"final_distance", *ends, *(name for name, term in self.cfg.metrics.items() if term.at_end)}
         return {name: jnp.where(bad, 0.0, value * done if name in at_end else value) for name, value in values.items()}
 
     def _resample(self, carry: Carry) -> Carry:
-        """Samples the command anew where it is time."""
+        """Draws a new command when it is due."""
         if self._resample_steps >= self.episode_length:
             return carry
         rng, k_command = jax.random.split(carry.rng)

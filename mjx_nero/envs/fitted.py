@@ -1,4 +1,4 @@
-"""Tasks for any robot: where things lie, where they have to go and how large they are follow from what the robot can do."""
+"""Tasks for any robot: positions, goals and sizes follow from what the robot can do."""
 
 import dataclasses
 import functools
@@ -26,12 +26,12 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
-OPEN = 2.0  # times a cube's edge
-SLOW = 0.3  # [s] to close on it
+OPEN = 2.0  # opening in units of the cube's edge
+SLOW = 0.3  # [s] closing times above this are slow
 
 
 def lift_setup(robot: RobotCfg) -> lift.LiftSetup:
-    """The cube anywhere in ``pick``, the goal anywhere in ``hold``."""
+    """The cube starts anywhere in ``pick``, and its goal is anywhere in ``hold``."""
     there = regions.of(robot)
     return lift.LiftSetup(
         scene=regions.scene(robot, "sphere"), cube=there.cube, goal=there.hold, grasp_radius=regions.near(there)
@@ -39,7 +39,7 @@ def lift_setup(robot: RobotCfg) -> lift.LiftSetup:
 
 
 def pick_place_setup(robot: RobotCfg) -> pick_place.PickPlaceSetup:
-    """The cube anywhere in the right half of ``pick``, its place in the left one; an edge apart."""
+    """The cube starts in the right half of ``pick``, and its place is in the left half, with a gap of one edge."""
     there, edge = regions.of(robot), grasp.cube_for(robot).size[0]
 
     def split(side: Range) -> tuple[Range, Range]:
@@ -58,7 +58,7 @@ def pick_place_setup(robot: RobotCfg) -> pick_place.PickPlaceSetup:
 
 
 def follow_target_setup(robot: RobotCfg) -> follow_target.FollowTargetSetup:
-    """The target on circles within ``pick``; of a robot that cannot grasp, within ``workspace``."""
+    """The target circles within ``pick``, or within ``workspace`` if the robot cannot grasp."""
     box = np.array(robot.pick or regions.box(robot, "workspace", "where it can work"))
     half = np.ptp(box, axis=1) / 2
     (x, y, z), radius = (round(float(v), 4) for v in box.mean(1)), round(float(half[1:].min() / 2), 4)
@@ -81,14 +81,16 @@ def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
 
 
 def _ready(robot: RobotCfg) -> RobotCfg:
-    """With slow fingers open no further than a cube asks for: a jaw that turns by 85 degrees before it meets one hardly ever does
-    so by chance, and all that is learnt begins with that."""
+    """Opens slow fingers no further than a cube needs.
+
+    A jaw that turns by 85 degrees before it meets a cube hardly ever closes on one by chance, and learning starts with that.
+    """
     edge = grasp.cube_for(robot).size[0]
     return grasp.opened(robot, OPEN * edge) if grasp.closing_time(robot, edge) > SLOW else robot
 
 
 def _pick_place(robot: RobotCfg) -> EnvCfg:
-    """By inverse kinematics: RMPflow needs files a robot. Fingers that close slowly get the time that they need."""
+    """Uses inverse kinematics, since RMPflow needs files for the robot. Slow fingers get extra time to close."""
     robot = _even(_ready(robot))
     setup = pick_place_setup(robot)
     late = max(0.0, round(grasp.closing_time(robot, grasp.cube_for(robot).size[0]) - SLOW, 2))
@@ -98,8 +100,11 @@ def _pick_place(robot: RobotCfg) -> EnvCfg:
 
 
 def _even(robot: RobotCfg) -> RobotCfg:
-    """Fingers with drives of their own close no further than their full effort takes: drives that press against one another far
-    beyond their limits let what they hold drift to either side, and springs keep it in the middle."""
+    """Limits how far separately driven fingers close to what their full effort takes.
+
+    Drives that push against each other far beyond their limits let an object drift sideways; within them, they centre it like
+    springs.
+    """
     fingers, held = robot.gripper, grasp.opened(robot, grasp.cube_for(robot).size[0]).gripper.open
     if len(fingers.joints) < 2:
         return robot
@@ -119,8 +124,8 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
     return {name: functools.partial(fit, factory=factory) for name, factory in factories.items()}
 
 
-# Tasks that take all they need from the robot: ``nero_place`` and ``place --robot nero`` are one task. Of the others an arm may
-# have numbers of its own, as ``nero_lift`` has those of its recipe.
+# These tasks take all they need from the robot, so ``nero_place`` and ``place --robot nero`` are the same task. For the other
+# tasks an arm may bring its own numbers, as ``nero_lift`` brings those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
     "push": push.presets(),

@@ -1,4 +1,5 @@
-"""Drives that ``python -m mjx_nero identify`` found of a real arm, in a task: gains, ranges to draw from, and a delay."""
+"""Applies the drives that ``python -m mjx_nero identify`` measured on a real arm to a task: gains, ranges to draw from, and a
+delay."""
 
 import dataclasses
 import math
@@ -35,7 +36,7 @@ class Numbers:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """What was found of a joint's drive (see ``identify.plant.Drives``)."""
+    """The measured parameters of a joint's drive (see ``identify.plant.Drives``)."""
 
     stiffness: Positives
     damping: Positives
@@ -46,7 +47,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """The content of such a file; joints by name."""
+    """The content of an identification file; joints by name."""
 
     robot: str
     delay: Numbers
@@ -54,10 +55,10 @@ class Identified:
 
 
 def read(path: pathlib.Path) -> Identified:
-    """Reads a file of ``identify``; a stranger may have made it.
+    """Reads an identification file, which may come from a stranger.
 
     Raises:
-        UserError: there is none, or it holds something else.
+        UserError: the file is missing or malformed.
     """
     found = values.read(Identified, files.read_yaml(path), "")
     for name, number in {"delay": found.delay, **_numbers(found)}.items():
@@ -75,11 +76,13 @@ def _numbers(found: Identified) -> dict[str, Any]:
 
 
 def applied(cfg: EnvCfg) -> EnvCfg:
-    """The task with the drives of the file that it names: centres as the robot's gains, 95% intervals as ranges to draw from
-    before all other randomization, and the delay in whole control steps. Encoder offsets are for the real arm to subtract.
+    """Returns the task with the drives of its identification file.
+
+    Centres become the robot's gains. 95% intervals become ranges, drawn before all other randomization. The delay is rounded to
+    whole control steps. Encoder offsets are not applied: the real arm subtracts them.
 
     Raises:
-        UserError: as ``read``; or it is another robot's.
+        UserError: the file is missing, malformed or for another robot.
     """
     if not cfg.identified:
         return cfg
@@ -102,9 +105,9 @@ def applied(cfg: EnvCfg) -> EnvCfg:
 
 
 def _late(cfg: EnvCfg, delay: Numbers) -> dict[str, Term]:
-    """The actions with the delay's whole control steps, within what a task draws anyway or wider."""
+    """Adds the delay to the actions, in whole control steps, widening the task's own delay where needed."""
     dt, terms = cfg.sim.dt * cfg.sim.decimation, dict(cfg.actions)
-    # To the nearest step, or both where the interval lies between two.
+    # Round to the nearest step, or take both neighbours where the interval lies between them.
     steps = max(0, math.floor(delay.low / dt + 0.25)), max(0, math.ceil(delay.high / dt - 0.25))
     if steps[1] > LATEST:
         raise UserError(

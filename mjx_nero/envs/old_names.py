@@ -1,6 +1,6 @@
-"""Names of a task's fields in version 0.5.0: its runs, its command lines and scripts for it still mean what they meant.
+"""Translates the field names of version 0.5.0, so that its runs, command lines and scripts keep their meaning.
 
-This is the one place that knows them. A field's new name is all that messages and help texts show.
+Only this module knows the old names. Messages and help texts show the new ones.
 """
 
 import dataclasses
@@ -11,20 +11,20 @@ from mjx_nero.config import values
 from mjx_nero.mdp.terms import ObservationGroup
 
 _MOVED = {"motion": "command.motion", "targets": "command.targets", "widening": "curriculum.levels"}
-_LISTS = ("apart", "sensed")  # of groups' names: fields of the groups now
+_LISTS = ("apart", "sensed")  # lists of group names, now fields of the groups
 _GROUP = {field.name for field in dataclasses.fields(ObservationGroup)}
 
 
 def current(fields: Mapping[str, Any], groups: Collection[str], weights: Collection[str]) -> dict[str, Any]:
-    """The fields by the names that they have now.
+    """Returns the fields under their present names.
 
     Args:
-        fields: by dotted name, old or new.
+        fields: values by dotted name, old or new.
         groups: names of the task's observation groups.
-        weights: names of the rewards whose weights its curriculum changes.
+        weights: names of the rewards whose weights the curriculum changes.
 
     Raises:
-        UserError: ``apart`` or ``sensed`` is no list of names.
+        UserError: ``apart`` or ``sensed`` is not a list of names.
     """
     return {name: value for old, given in fields.items() for name, value in _renamed(old, given, groups, weights)}
 

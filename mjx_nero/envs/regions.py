@@ -1,4 +1,4 @@
-"""Where a robot can pick things up, and where it can hold them: what tasks for any robot are made from."""
+"""Regions where a robot can pick things up and hold them. Tasks for any robot are built from them."""
 
 import dataclasses
 
@@ -12,18 +12,18 @@ from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.types import UserError
 
-HELD = 0.03  # [m] from where the cube is in a good grasp it may be so far off and still count as held
-TURNS = 5  # joints of an arm that can turn its hand at will while that points down
-TRAVEL = 0.1  # [m] a carried cube is this high above the table, if the hand can still point down there
-UPRIGHT = 0.005  # [m/rad] a hand that leans is as upright as its arm allows, but where it has to be
-LEFT = 0.06  # [m] the grasp point travels at least this far over the middle of a cube on the table, which it has left then
+HELD = 0.03  # [m] how far a cube may be off its place in a good grasp and still count as held
+TURNS = 5  # least joints of an arm that can turn its hand freely while the hand points down
+TRAVEL = 0.1  # [m] height of a carried cube above the table, if the hand can still point down there
+UPRIGHT = 0.005  # [m/rad] weight that keeps a leaning hand as upright as its position allows
+LEFT = 0.06  # [m] least height of a leaving grasp point above the middle of a cube on the table
 
 
 def box(robot: RobotCfg, name: str, what: str) -> Box:
-    """One of the robot's boxes [m], robot root frame.
+    """Returns one of the robot's boxes [m], in its root frame.
 
     Raises:
-        UserError: it is unknown.
+        UserError: the robot does not state it.
     """
     found: Box | None = getattr(robot, name)
     if found is None:
@@ -34,14 +34,14 @@ def box(robot: RobotCfg, name: str, what: str) -> Box:
 
 @dataclasses.dataclass(frozen=True)
 class Regions:
-    """Where a robot can grasp a cube, and where it can hold it.
+    """The regions where a robot can grasp a cube and where it can hold it.
 
     Attributes:
-        cube: ``x`` and ``y`` of the cube on the table, in the world [m].
-        place: the same in the robot's frame.
-        hold: as in ``RobotCfg``.
-        travel: height of the grasp point over the table while it carries a cube across, in the robot's frame [m].
-        offset: of the grasp point from the cube's centre in a grasp, in the world [m].
+        cube: ``x`` and ``y`` of the cube on the table, in the world frame [m].
+        place: the same region in the robot's root frame [m].
+        hold: ``RobotCfg.hold``.
+        travel: height at which the grasp point carries a cube across the table, in the robot's root frame [m].
+        offset: grasp point minus the cube's centre in a grasp, in the world frame [m].
     """
 
     cube: tuple[Range, Range]
@@ -52,10 +52,10 @@ class Regions:
 
 
 def of(robot: RobotCfg) -> Regions:
-    """What follows from its ``pick``, ``hold`` and ``grip``.
+    """Derives the regions from the robot's ``pick``, ``hold`` and ``grip``.
 
     Raises:
-        UserError: it has no gripper, or one of these is unknown.
+        UserError: the robot has no gripper, or does not state one of these.
     """
     rest = grasp.cube_for(robot).rest_height
     pick = box(robot, "pick", "where on the table it can grasp")
@@ -74,36 +74,38 @@ def of(robot: RobotCfg) -> Regions:
 
 
 def turns(robot: RobotCfg) -> bool:
-    """Whether the arm can turn its hand at will while that points down."""
+    """True if the arm can turn its hand freely while the hand points down."""
     return robot.turns and len(robot.arm.joints) >= TURNS
 
 
 def ik(robot: RobotCfg, prefix: str = "") -> dict[str, bool | float]:
-    """What inverse kinematics has to know of an arm of few joints, and of a hand that cannot point straight down."""
+    """Returns settings of inverse kinematics for an arm with few joints, or a hand that cannot point straight down."""
     few = {} if turns(robot) else {"free_turn": True}
     leaning = {"orientation_weight": UPRIGHT} if robot.lean else {}
     return {f"{prefix}{name}": value for name, value in {**few, **leaning}.items()}
 
 
 def span(low: float, high: float) -> Range:
-    """A range in whole tenths of a millimetre, without negative zeros."""
+    """Rounds a range to tenths of a millimetre, without negative zeros."""
     return round(float(low), 4) + 0.0, round(float(high), 4) + 0.0
 
 
 def scene(robot: RobotCfg, goal: str) -> SceneCfg:
-    """The cube that the robot can lift on a table where it works; ``goal`` is the marker's shape."""
+    """Builds a scene with a table in the robot's workspace and the cube it can lift; ``goal`` is the marker's shape."""
     cube = grasp.cube_for(robot)
     return scenes.around(robot, SceneCfg(objects={"cube": cube}, goal=goal, goal_edge=cube.size[0]))
 
 
 def near(there: Regions) -> float:
-    """How far the cube may be from the grasp point and still count as held [m]."""
+    """Greatest distance of a held cube from the grasp point [m]."""
     return round(max(0.04, float(np.linalg.norm(there.offset)) + HELD), 4)
 
 
 def turn_to(robot: RobotCfg, x: float, y: float) -> float:
-    """By how much the first joint has to turn, from home, for the arm to point at a place of the robot's frame [rad]; 0 where it
-    does not turn the arm about the vertical."""
+    """Turn of the first joint from home that points the arm at ``x, y`` of the robot's root frame [rad].
+
+    0 if that joint does not turn the arm about the vertical.
+    """
     model = scenes.robot_model(robot)
     data, first = mujoco.MjData(model), model.joint(robot.arm.joints[0])
     data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = robot.home

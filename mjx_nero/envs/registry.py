@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjx_nero import config
 from mjx_nero.config import values
+from mjx_nero.config.registry import Registry, pick
 from mjx_nero.envs import arms, fitted
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.sim import contacts, robot_file
@@ -19,55 +20,40 @@ if TYPE_CHECKING:
     from mjx_nero.envs.env import ManipulationEnv
 
 _ARMS = [importlib.import_module(f"{arms.__name__}.{found.name}") for found in pkgutil.iter_modules(arms.__path__)]
-_ROBOTS: dict[str, RobotCfg] = {arm.ROBOT.name: arm.ROBOT for arm in _ARMS}
-_ENVS: Envs = {name: entry for arm in _ARMS for name, entry in arm.ENVS.items()}
-_ENVS |= fitted.ENVS  # for any robot that says where it can work
+_OWN: Envs = {name: entry for arm in _ARMS for name, entry in arm.ENVS.items()}
+ROBOTS = Registry("robot", {arm.ROBOT.name: arm.ROBOT for arm in _ARMS})
+ENVS = Registry("env", {**_OWN, **fitted.ENVS})  # with those for any robot that states its workspace
 
 
-def register_robot(robot: RobotCfg) -> None:
-    """Adds a robot by its own name.
-
-    Raises:
-        UserError: there is one of this name.
-    """
-    _add(_ROBOTS, robot.name, robot, "robot")
-
-
-def register_env(name: str, robot: RobotCfg | None, presets: Presets) -> None:
+def add_env(name: str, robot: RobotCfg | None, presets: Presets) -> None:
     """Adds an environment: its robot (None: for any) and its presets, the default first.
 
     Raises:
-        UserError: there is one of this name, or it has no preset.
+        UserError: the name is taken, or there is no preset.
     """
     if not presets:
         raise UserError(f"the environment {name!r} has no preset: give at least one")
-    _add(_ENVS, name, (robot, presets), "environment")
-
-
-def _add(table: dict, name: str, thing: Any, what: str) -> None:
-    if name in table:
-        raise UserError(f"there is a{'n' * (what[0] in 'aeiou')} {what} {name!r} already: choose another name")
-    table[name] = thing
+    ENVS.add(name, (robot, presets))
 
 
 def list_envs() -> tuple[str, ...]:
     """Names that ``make`` takes."""
-    return tuple(_ENVS)
+    return tuple(ENVS)
 
 
 def list_presets(env: str) -> tuple[str, ...]:
     """Presets of an environment, the default first."""
-    return tuple(_pick(_ENVS, env, "env")[1])
+    return tuple(ENVS.find(env)[1])
 
 
 def list_robots() -> tuple[str, ...]:
     """Names of the package's own robots."""
-    return tuple(_ROBOTS)
+    return tuple(ROBOTS)
 
 
 def robot_of(env: str) -> RobotCfg | None:
     """An environment's own robot; None if it is for any."""
-    return _pick(_ENVS, env, "env")[0]
+    return ENVS.find(env)[0]
 
 
 def robot(name: str | pathlib.Path) -> RobotCfg:
@@ -91,14 +77,14 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
     Raises:
         UserError: unknown name, preset, robot or field, or a value of the wrong type.
     """
-    own, presets = _pick(_ENVS, env, "env")
+    own, presets = ENVS.find(env)
     preset = values.read(str, preset, "preset")
     chosen = own if robot is None else robot if isinstance(robot, RobotCfg) else _find_robot(robot)
     if preset in list_robots() and preset not in presets:
         raise UserError(f"{preset!r} is a robot, not a preset of {env}: pass it as --robot")
-    factory = _pick(presets, preset, f"preset of {env}")
+    factory = pick(presets, preset, f"preset of {env}")
     if chosen is None:
-        raise UserError(f"{env} is for any robot: pass one (--robot, a folder that import-urdf made, or {', '.join(_ROBOTS)})")
+        raise UserError(f"{env} is for any robot: pass one (--robot, a folder that import-urdf made, or {', '.join(ROBOTS)})")
     cfg = factory(chosen)
     cfg = dataclasses.replace(cfg, sim=cfg.sim.finer(cfg.robot.max_step))
     if chosen.folder:  # imported: nobody has counted the contacts that its work makes
@@ -135,18 +121,12 @@ def make(
 def _find_robot(name: str | pathlib.Path) -> RobotCfg:
     if not isinstance(name, str | pathlib.Path):
         raise UserError(f"robot takes a config, a name or a folder, got {values.short(name)}")
-    if str(name) in _ROBOTS:
-        return _ROBOTS[str(name)]
+    if str(name) in ROBOTS:
+        return ROBOTS[str(name)]
     with contextlib.suppress(OSError):  # no file system has so long a name
         if pathlib.Path(name).is_dir():
             return robot_file.read(pathlib.Path(name))
-    near = config.hint(str(name), _ROBOTS)
+    near = config.hint(str(name), ROBOTS)
     raise UserError(
-        f"no robot {values.short(str(name))}{near}: choose one of {', '.join(_ROBOTS)}, or give the folder of an imported one"
+        f"no robot {values.short(str(name))}{near}: choose one of {', '.join(ROBOTS)}, or give the folder of an imported one"
     )
-
-
-def _pick(table: Any, name: str, what: str) -> Any:
-    if values.read(str, name, what) not in table:
-        raise UserError(f"unknown {what} {values.short(name)}{config.hint(name, table)}: choose one of {', '.join(table)}")
-    return table[name]

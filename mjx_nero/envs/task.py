@@ -1,4 +1,4 @@
-"""What a task is: an ``EnvCfg`` and its parts, all data. ``env`` runs it."""
+"""An ``EnvCfg`` is a task: it and its parts are plain data, which ``env`` runs."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -16,9 +16,10 @@ from mjx_nero.types import TARGET, UserError
 
 
 def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
-    """One action an arm joint (``home + scale * action`` [rad]), then one for the gripper (negative closes), if it has one.
+    """Lists action terms: one entry per arm joint (``home + scale * entry`` [rad]), and one for the gripper, if any (negative
+    closes).
 
-    Without it the gripper stays at home.
+    Without ``gripper``, the gripper stays at home.
     """
     return {
         "arm": Term(actions.JointPosition, params={"scale": scale}),
@@ -28,10 +29,10 @@ def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
 
 
 def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: NonNegative = 0.0) -> dict[str, Term]:
-    """One action an arm joint (its velocity, at +-1 the drive's), then one for the gripper, if it has one.
+    """Lists action terms: one entry per arm joint (its velocity; +-1 is the drive's limit), and one for the gripper, if any.
 
-    An episode's actions come late by as many control steps as it draws from ``late``, as those of a real arm do. ``hysteresis``
-    is the gripper's (``mdp.actions.BinaryGripper``).
+    Actions come late by a number of control steps that each episode draws from ``late``, as on a real arm. ``hysteresis`` is the
+    gripper's (``mdp.actions.BinaryGripper``).
     """
     grip = Term(actions.BinaryGripper, params={"hysteresis": hysteresis})
     hand = {"gripper": grip, "speed_limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
@@ -42,23 +43,23 @@ def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: Non
     }
 
 
-# Of the learner: noise of half of an action at most; for velocities, a policy that changes its mind for a reason, too.
+# Learner settings. Quiet: noise of at most half an action. Calm, for velocities: changing the action costs, too.
 QUIET = {"network.init_std": 0.5, "max_std": 0.5}
 CALM = {**QUIET, "change_cost": 0.03}
 
 
 def drive_targets() -> dict[str, Term]:
-    """The drives' position targets themselves [rad or m], one a drive; their speed is left to whoever gives them: controllers."""
+    """Lists the one action term of controllers: a position target per drive [rad or m]. The controller limits their speed."""
     return {"drives": Term(actions.DriveTargets)}
 
 
 @dataclasses.dataclass(frozen=True)
 class SuccessCfg:
-    """``condition`` has held for the end of the episode; ``distance`` [m] is what it is about.
+    """Success: ``condition`` held at the end of the episode. ``distance`` is the length that it judges [m].
 
     Attributes:
-        hold_s: for how long it has held [s].
-        follows: the distance is an error, which is to stay small once the robot is there; else it is a way to go.
+        hold_s: how long it must have held [s].
+        follows: the distance is an error to keep small once there. Otherwise it is a distance to cover once.
     """
 
     condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
@@ -69,12 +70,12 @@ class SuccessCfg:
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """What a training of the task takes, where nobody asks for another number of env steps.
+    """Default length of a training run, and when the task counts as learnt.
 
     Attributes:
-        steps: env steps, with the thousands of environments of a GPU.
-        steps_on_cpu: env steps with the hundreds of environments of a CPU, which learn from fewer.
-        success: the success rate from which on the task counts as learnt.
+        steps: env steps with a GPU's thousands of environments.
+        steps_on_cpu: env steps with a CPU's hundreds of environments, which need fewer.
+        success: success rate at which the task counts as learnt.
     """
 
     steps: Count = 100_000_000
@@ -84,14 +85,14 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumCfg:
-    """What grows harder in training.
+    """Everything that grows harder during training.
 
     Attributes:
-        weights: changes the weight of the reward of the same name (``mdp.curriculum``).
-        levels: scales randomization, sensors, late observations and actions, the targets' noise, and pushes by each training
-            environment's own successes, and rewards by ``curriculum.level_weight``. None: always full, as outside of training.
-        expert_starts: share of the episodes that begin, at first, where the first of the task's controllers has been in episodes
-            of its own; 0: none. It falls to nothing as the usual starts succeed (``curriculum.chances``).
+        weights: terms that change the weight of the reward of the same name (``mdp.curriculum``).
+        levels: scales randomization, sensors, delays, target noise, pushes and ``curriculum.level_weight`` by each environment's
+            own success rate. None: always full, as outside of training.
+        expert_starts: initial share of episodes that start from states visited by the task's first controller; 0: none. The share
+            falls to zero as the usual starts succeed (``curriculum.chances``).
     """
 
     weights: Mapping[str, Term] = dataclasses.field(default_factory=dict)
@@ -104,24 +105,24 @@ class CurriculumCfg:
 
 @dataclasses.dataclass(frozen=True)
 class EnvCfg:
-    """All of a task. Read ``tasks/lift.py`` for an example; every field can be overridden by its dotted name.
+    """A whole task. Read ``tasks/lift.py`` for an example. Every field can be overridden by its dotted name.
 
     Attributes:
-        actions: from the policy's output to the drives' targets, in this order.
-        action_clip: bounds every action to +-this before use; 0 leaves them alone.
-        randomization: model fields that every episode draws anew (``mdp.randomization``).
-        sensors: stand between the world and the observation groups that are ``sensed``, in this order (``mdp.sensors``). They are
-            always on, unlike the noise of observations.
-        obstacles: where the scene's obstacles stand, drawn for every episode once its start and goal are (``mdp.obstacles``).
-        pushes: sudden changes of objects' velocities (``mdp.pushes``).
-        identified: a file of ``python -m mjx_nero identify``, whose drives and delay take the place of the robot's own.
-        controllers: those of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config by
-            dotted name.
-        training: fields of the learner's config that suit the task, likewise.
-        budget: how long a training takes.
+        actions: terms from the policy's output to the drives' targets, in this order.
+        action_clip: bound of every action entry; 0: none.
+        randomization: draws of model fields, anew in every episode (``mdp.randomization``).
+        sensors: errors between the true state and the ``sensed`` observation groups, in this order (``mdp.sensors``). Unlike
+            observation noise, they are always on.
+        obstacles: draws where the scene's obstacles stand, after each episode's start and goal (``mdp.obstacles``).
+        pushes: sudden velocities added to objects (``mdp.pushes``).
+        identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
+        controllers: controllers of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config
+            by dotted name.
+        training: fields of the learner's config that suit the task, by dotted name.
+        budget: default length of a training run.
 
     Raises:
-        UserError: a field is out of its bounds, or terms name what is not there.
+        UserError: a field is out of bounds, or a term names an object that does not exist.
     """
 
     robot: RobotCfg
@@ -163,7 +164,7 @@ class EnvCfg:
             self._check_objects(name, term)
 
     def _check_objects(self, name: str, term: Term) -> None:
-        """A term names objects that are there; ``name`` is its own."""
+        """Checks that the objects of the term called ``name`` exist."""
         targets, seen = self.command.targets, tuple(f"{group}." for group in ("sensors", *self.view_terms()))
         there = (*self.scene.objects, *((TARGET,) if targets and name.startswith(seen) else ()))
         listed = ", ".join(there) or "none"
@@ -177,16 +178,16 @@ class EnvCfg:
             raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(targets)} targets")
 
     def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Fields by dotted name with the names that they have now: see ``envs.old_names``."""
+        """Translates fields of version 0.5.0 to their present names: see ``envs.old_names``."""
         return old_names.current(fields, self.observations, self.curriculum.weights)
 
     def uncorrupted(self) -> "EnvCfg":
-        """The task without observation noise, as policies are measured."""
+        """Returns the task without observation noise, for measuring policies."""
         groups = {name: dataclasses.replace(group, corruption=False) for name, group in self.observations.items()}
         return dataclasses.replace(self, observations=groups)
 
     def view_terms(self) -> dict[str, Mapping[str, Term]]:
-        """The terms of a view by the dotted names of their groups; of observations as the episode's memory has them."""
+        """Collects the terms that read a view, by the dotted names of their groups in the episode's memory."""
         observed = {f"observations.{name}": group.terms for name, group in self.observations.items()}
         ends = {"condition": self.success.condition, "distance": self.success.distance}
         return {
@@ -198,7 +199,7 @@ class EnvCfg:
         }
 
     def terms(self) -> dict[str, Term]:
-        """All terms that may name an object, by their dotted names."""
+        """Collects all terms that may name an object, by their dotted names."""
         groups = {
             **self.view_terms(),
             "events": self.events,
@@ -210,10 +211,10 @@ class EnvCfg:
 
 
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
-    """The task as controllers act in it: by drive targets, in place of the actions that policies learn."""
+    """Returns the task with drive targets in place of the actions that policies learn."""
     given = any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values())
     return cfg if given else dataclasses.replace(cfg, actions=drive_targets())
 
 
-Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, the default first
-Envs = dict[str, tuple[RobotCfg | None, Presets]]  # by name, with the robot each is meant for
+Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, default first
+Envs = dict[str, tuple[RobotCfg | None, Presets]]  # by name, with each one's robot

@@ -1,4 +1,4 @@
-"""From the physics state and the carry to what the terms read."""
+"""Turns the physics state and the carry into the ``View`` that terms read."""
 
 from collections.abc import Iterable
 
@@ -16,19 +16,19 @@ from mjx_nero.types import TARGET, Carry, ObjectView, Sim, View
 
 
 class Viewer:
-    """Looks names up once; ``__call__`` is pure.
+    """Reads views. It looks names up once; ``__call__`` is pure.
 
     Args:
-        model: compiled scene.
-        robot: whose joints and end effector to read.
-        objects: names of the scene's.
+        model: the compiled scene.
+        robot: the robot whose joints and end effector to read.
+        objects: names of the scene's objects.
         max_steps: control steps of an episode.
-        dt: of a control step [s].
-        command: says how the goal moves, and which of the objects may be commanded.
-        obstacles: the scene's.
+        dt: duration of a control step [s].
+        command: how the goal moves, and which objects may be commanded.
+        obstacles: the scene's obstacles.
 
     Attributes:
-        objects: addresses in qpos and qvel by name.
+        objects: each object's addresses in qpos and qvel, by name.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Viewer:
         self._obstacles, self._targets = obstacles, command.targets
 
     def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
-        """The view after a step that ``action`` caused; ``carry.action`` is the action before it."""
+        """Returns the view after the step that ``action`` caused; ``carry.action`` is the action before it."""
         ee_pos, ee_quat = self._ee_pose(sim.qpos)
         goal, goal_linvel = self.goal(carry)
         objects = {name: _object(sim.qpos[at:][:7], sim.qvel[dof:][:6]) for name, (at, dof) in self.objects.items()}
@@ -84,14 +84,15 @@ class Viewer:
         )
 
     def _encoder_bias(self, sim: Sim) -> Float[Array, " nj"] | None:
-        """As ``randomization.encoder_bias`` put it into the drives: their pull is stiffness (target - joint - bias) - ..."""
+        """Recovers the bias from the drives, which pull with stiffness * (target - joint - bias) - ...
+        (``randomization.encoder_bias``)."""
         if "actuator_biasprm" not in sim.fields:
             return None
         gain = sim.fields.get("actuator_gainprm", self._gain)
         return -sim.fields["actuator_biasprm"][:, 0] / gain[:, 0]
 
     def goal(self, carry: Carry) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Position [m] and velocity [m/s] of the goal in the world frame, now."""
+        """Returns the goal's current position [m] and velocity [m/s] in the world frame."""
         at = carry.command + self._root
         if self._motion is None:
             return at, jnp.zeros(3)

@@ -1,4 +1,4 @@
-"""Wrappers for training: a batch axis, and episodes that restart by themselves."""
+"""Training wrappers: a batch axis, automatic restarts, Brax's bookkeeping and expert starts."""
 
 import mjx_nero.sim.quiet  # noqa: F401
 
@@ -14,11 +14,11 @@ from mjx_nero.mdp import curriculum
 from mjx_nero.types import PHASE, Bank, Carry, Key, Progress, Sim
 
 Start = tuple[Sim, Carry]
-PHASES = 8  # of an expert's way, equally long
+PHASES = 8  # equal parts of an expert's episode
 
 
 class AutoReset(Wrapper):
-    """Starts a fresh episode in an environment that is done (``ManipulationEnv.step_and_reset``), by the task's curriculum."""
+    """Starts a new episode when one ends (``ManipulationEnv.step_and_reset``), at the level of the task's curriculum."""
 
     def reset(self, rng: Key, starts: Starts | None = None) -> State:
         return self.env.reset(rng, self.env.first_level, starts)
@@ -28,7 +28,7 @@ class AutoReset(Wrapper):
 
 
 class Vectorize(Wrapper):
-    """A batch of environments: ``reset`` takes keys [n, ...], ``step`` states and actions [n, ...]."""
+    """Batches the environment: ``reset`` takes keys [n, ...], ``step`` takes states and actions [n, ...]."""
 
     def reset(self, rng: Key, starts: Starts | None = None) -> State:
         return jax.vmap(self.env.reset, (0, None))(rng, starts)
@@ -37,12 +37,12 @@ class Vectorize(Wrapper):
         return jax.vmap(self.env.step)(state, action, start)
 
     def following(self, state: State, starts: Starts | None = None) -> Start:
-        """The start of each environment's next episode: see ``ManipulationEnv.step_and_reset``."""
+        """Draws the start of each environment's next episode: see ``ManipulationEnv.step_and_reset``."""
         return jax.vmap(self.env.following, (0, None))(state, starts)
 
 
 class BraxEpisode(Wrapper):
-    """The bookkeeping fields that Brax's PPO reads beside ``truncation``."""
+    """Adds the bookkeeping fields that Brax's PPO reads besides ``truncation``."""
 
     def reset(self, rng: Key, starts: Starts | None = None) -> State:
         state = self.env.reset(rng, starts)
@@ -54,9 +54,10 @@ class BraxEpisode(Wrapper):
 
 
 class ExpertStarts(Wrapper):
-    """Begins some episodes where the task's expert has been, in turn with the usual starts (``curriculum.chances``).
+    """Starts some episodes from states that the task's expert has visited (``curriculum.chances``).
 
-    ``reset`` takes the bank; without one all episodes start as usual. Those that a loop does not draw ahead do so, too.
+    ``reset`` takes the bank of states. Without one, all episodes start as usual, and so do those whose start the loop did not
+    draw ahead.
     """
 
     def reset(self, rng: Key, bank: Bank | None = None) -> State:
@@ -68,7 +69,7 @@ class ExpertStarts(Wrapper):
         return state.replace(info={**state.info, "starts": progress}, metrics=metrics)
 
     def following(self, state: State) -> Start:
-        """The start of each environment's next episode."""
+        """Draws the start of each environment's next episode."""
         return self.env.following(state, _starts(state.info["starts"]))
 
     def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
@@ -86,6 +87,6 @@ def _starts(progress: Progress) -> Starts:
 
 
 def for_training(env: ManipulationEnv) -> Env:
-    """Vectorized, auto-resetting, with Brax's bookkeeping, and the expert's starts where the task asks for them."""
+    """Wraps an environment for training: batched, restarting, with Brax's bookkeeping and, if the task asks, expert starts."""
     made = BraxEpisode(Vectorize(AutoReset(env)))
     return ExpertStarts(made) if env.cfg.curriculum.expert_starts else made

@@ -1,9 +1,4 @@
-"""What a real arm's drives are, from a log of what they were told and where they went; what drives move, and how they answer.
-
-``plant`` simulates an arm's drives, ``excitation`` gives targets that show all there is to find, ``log`` reads and writes what
-was told and seen, ``fit`` finds the drives' parameters in it, ``simulate`` makes such logs. ``model``, ``load`` and ``response``
-look at drives without a log. The commands ``record``, ``identify`` and ``tune-gains`` are in ``tools``.
-"""
+"""Identifies a real arm's drives from a log of their targets and motions: what the drives move, and how they answer."""
 
 from mjx_nero.identify.fit import Fit, identify
 from mjx_nero.identify.log import Log

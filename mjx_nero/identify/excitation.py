@@ -58,7 +58,7 @@ def _sweep(time: np.ndarray, seconds: float, joint: int, speed: float, room: flo
 
 
 def _clear(model: mujoco.MjModel, robot: RobotCfg, targets: np.ndarray) -> bool:
-    """Whether what is apart at home stays so."""
+    """True if links that are apart at home stay apart."""
     data = mujoco.MjData(model)
     at = [int(model.joint(j).qposadr[0]) for j in (*robot.arm.joints, *robot.gripper.joints)]
     pictures = ("table_top", "floor", "goal")  # the table itself is a plane

@@ -109,7 +109,7 @@ def _solve(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray, enough: floa
 
 
 def _unit(plant: Plant) -> np.ndarray:
-    """Of the free numbers: the model's own parameters, 1e-2 rad and 10 ms."""
+    """Scale of the free numbers: the model's own parameters, 1e-2 rad and 10 ms."""
     return np.concatenate([plant.nominal.vector()[: 4 * plant.n], np.full(plant.n + 1, 0.01)])
 
 
@@ -132,7 +132,7 @@ def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int)
 
 
 def _correlation(residuals: Float[np.ndarray, "k n"], longest: int = 400) -> float:
-    """How many readings are as good as one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
+    """Number of readings worth one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
     total = np.sum(residuals**2)
     out = 1.0
     for lag in range(1, min(longest, len(residuals) // 2)):

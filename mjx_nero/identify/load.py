@@ -12,7 +12,7 @@ _POSES = 500
 
 @dataclasses.dataclass(frozen=True)
 class Load:
-    """What a drive has to move over the workspace.
+    """The load of a drive over the workspace.
 
     Attributes:
         joint: its name.
@@ -31,7 +31,7 @@ class Load:
 
 
 def loads(model: mujoco.MjModel, poses: int = _POSES, seed: int = 0) -> tuple[Load, ...]:
-    """What each drive of a model has to move, over random poses within the joint limits.
+    """Measures each drive's load over random poses within the joint limits.
 
     Joints that equalities couple move as one: their drives share its inertia and load.
     """

@@ -38,7 +38,7 @@ def moves(model: mujoco.MjModel) -> np.ndarray:
 
 
 def leaders(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """For each drive the degree of freedom that moves its joint, itself or the one that leads it, and the ratio; [nu] each."""
+    """Finds for each drive the degree of freedom that moves its joint, itself or its leader, and the ratio; [nu] each."""
     rows = moves(model)[driven(model)[1]]
     leader = np.abs(rows).argmax(axis=1)
     return leader, np.take_along_axis(rows, leader[:, None], axis=1)[:, 0]

@@ -28,7 +28,7 @@ POSITIVE = ("stiffness", "damping", "armature", "friction")
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """What is identified; arrays along the arm's joints.
+    """The identified quantities, as arrays along the arm's joints.
 
     Attributes:
         stiffness: [N m/rad or N/m].
@@ -110,7 +110,7 @@ class Plant:
         start: np.ndarray,
         times: Float[np.ndarray, " k"],
     ) -> Float[np.ndarray, "b k n"]:
-        """What the encoders read at ``times``, for each of some parameters.
+        """Simulates the encoders' readings at ``times``, for each of several parameter sets.
 
         Args:
             sent: times of the targets [s], ascending.

@@ -44,17 +44,17 @@ class Response:
 
     @property
     def rise(self) -> float:
-        """From 10% to 90% of the way [s]."""
+        """Time from 10% to 90% of the step [s]."""
         return self._first(0.9) - self._first(0.1)
 
     @property
     def overshoot(self) -> float:
-        """Beyond the end, as a share of the way."""
+        """Motion beyond the end, as a share of the step."""
         return float(np.max(self.share)) - 1.0
 
     @property
     def settling(self) -> float:
-        """Until within 2% of the way for good [s]; inf if the joint still moves at the end."""
+        """Time until the joint stays within 2% of the step [s]; inf if it still moves at the end."""
         share = self.share
         outside = np.flatnonzero(~(np.abs(share - 1) <= _BAND))
         last = outside[-1] if len(outside) else -1

@@ -14,7 +14,7 @@ from mjx_nero.identify.plant import POSITIVE, Drives, Plant
 
 @dataclasses.dataclass(frozen=True)
 class RecordCfg:
-    """How a simulated arm is recorded.
+    """Settings for recording a simulated arm.
 
     Attributes:
         seconds: of the log.

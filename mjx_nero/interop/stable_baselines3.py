@@ -88,5 +88,5 @@ class VecEnv(vec_env.VecEnv):
         return [getattr(self.envs, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """They are not."""
+        """Returns False for each: no environment is wrapped."""
         return [False] * len(list(self._get_indices(indices)))

@@ -1,9 +1,9 @@
-"""Policies and how they are trained and measured."""
+"""Training and evaluation of policies."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-# Name of before 0.6 -> the module that it is now: code that imports it from here goes on.
+# Module names before 0.6 -> today's modules, so that older code can still import them from here.
 _MOVED = {
     "evaluation": "play.evaluation",
     "ppo_cfg": "ppo.cfg",
@@ -12,7 +12,7 @@ _MOVED = {
     "training": "runs.training",
 }
 
-if not TYPE_CHECKING:  # this package's own code says where a module lies
+if not TYPE_CHECKING:  # the package's own code imports the modules themselves
 
     def __getattr__(name: str) -> Any:
         if name not in _MOVED:

@@ -1,4 +1,4 @@
-"""Arrays and a JSON description in one safetensors file: no pickle, so a file from a stranger runs no code."""
+"""Checkpoints: arrays and a JSON description in one safetensors file. No pickle, so a stranger's file runs no code."""
 
 import json
 import pathlib
@@ -20,7 +20,7 @@ Tree = TypeVar("Tree")
 
 
 class Damaged(UserError):
-    """A file that is not what ``save`` wrote."""
+    """A file that ``save`` did not write, or that has changed since."""
 
 
 def _names(tree: Any) -> list[str]:
@@ -32,12 +32,12 @@ def _renamed(name: str, held: Mapping[str, str]) -> str:
 
 
 def fetch(tree: Tree) -> Tree:
-    """The tree's arrays copied to this process's memory, so that the device may go on with its own."""
+    """Copies the tree's arrays to this process's memory, so that the device may overwrite its own."""
     return jax.tree.map(machines.fetch, tree)
 
 
 def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
-    """Writes the leaves of ``tree`` by name, and ``meta``; the file appears whole or not at all.
+    """Writes the leaves of ``tree`` by name, and ``meta``. The file appears whole or not at all.
 
     Raises:
         UserError: the folder cannot be written.
@@ -48,10 +48,10 @@ def save(path: pathlib.Path, tree: Any, meta: dict[str, Any]) -> None:
 
 
 def verify(path: pathlib.Path) -> None:
-    """Reads a file's numbers.
+    """Checks a file's numbers against their checksum.
 
     Raises:
-        Damaged: it is missing, or they are not those that ``save`` wrote.
+        Damaged: the file is missing, or its numbers have changed.
     """
     try:
         load_meta(path)
@@ -68,7 +68,7 @@ def verify(path: pathlib.Path) -> None:
 
 
 def not_finite(tree: Any) -> str | None:
-    """The name of the first array with a number that is not finite; None if all are."""
+    """Returns the name of the first array with a number that is not finite, or None."""
     for name, x in zip(_names(tree), jax.tree.leaves(tree), strict=True):
         if not np.isfinite(np.asarray(x)).all():
             return name
@@ -76,13 +76,13 @@ def not_finite(tree: Any) -> str | None:
 
 
 def check_finite(tree: Any, path: pathlib.Path) -> None:
-    """Are all numbers of a policy finite?
+    """Checks that all numbers of a policy are finite.
 
     Raises:
-        UserError: one of the file at ``path`` is not.
+        UserError: the file at ``path`` holds one that is not.
     """
     if name := not_finite(tree):
-        raise UserError(f"{path} holds numbers that are not finite, in {name}: give an earlier one, or copy it anew")
+        raise UserError(f"{path} holds numbers that are not finite, in {name}: give an earlier file, or copy it again")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
@@ -93,10 +93,10 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def load_meta(path: pathlib.Path) -> dict[str, Any]:
-    """The description in the file.
+    """Reads the description in the file.
 
     Raises:
-        UserError: missing, or not a file that ``save`` wrote.
+        UserError: the file is missing, or ``save`` did not write it.
     """
     if not path.is_file():
         raise UserError(f"no such file: {path}")
@@ -111,19 +111,19 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
 
 
 def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = None) -> Tree:
-    """The arrays in the file as a tree like ``template`` (whose leaves need only shape and dtype).
+    """Reads the arrays as a tree like ``template``, whose leaves need only shape and dtype.
 
     Args:
-        held: the start of a name in ``template`` -> in the file, where the file is that of a larger tree.
+        held: prefix of a name in ``template`` -> its prefix in the file, if the file holds a larger tree.
 
     Raises:
-        UserError: missing, damaged, or other names, shapes or types than the template's.
+        UserError: the file is missing or damaged, or its names, shapes or types differ from the template's.
     """
     verify(path)
     there, _ = header.read(path)
     names = [_renamed(name, held or {}) for name in _names(template)]
     wanted = dict(zip(names, jax.tree.leaves(template), strict=True))
-    for name, want in wanted.items():  # before any is read: the file may hold more than the memory
+    for name, want in wanted.items():  # checked before reading: the file may be larger than the memory
         kind, shape = there.get(name, (str(want.dtype), want.shape))
         if (kind, shape) != (str(want.dtype), want.shape):
             raise UserError(f"{path} does not fit: {name} is {kind}{shape}, expected {want.dtype}{want.shape}")

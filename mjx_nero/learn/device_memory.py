@@ -1,7 +1,7 @@
-"""What training needs of a device's memory, so that too many environments end in one line, before the memory does.
+"""Memory checks: a run with too many environments ends in one clear line, before the device's memory does.
 
-First the learner's estimate from the sizes of what it keeps, then what XLA says of the program that it has compiled. Warp's
-buffers are outside XLA's memory, and counted apart.
+The first check uses the learner's estimate from the sizes of what it keeps, the second what XLA says of the compiled program.
+Warp's buffers lie outside XLA's memory and are counted separately.
 """
 
 import contextlib
@@ -16,35 +16,37 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import Learner
 
-_SCRATCH = 1.25  # a step's own arrays, beside what a backend keeps outside JAX
-_STATES = 3  # that a loop holds at once: the one before, the one after, and fresh starts
+_SCRATCH = 1.25  # factor for a step's own arrays, on top of what a backend keeps outside JAX
+_STATES = 3  # states that a loop holds at once: before, after, and new starts
 
 
 @dataclasses.dataclass(frozen=True)
 class Pool:
-    """One kind of memory on a device [bytes]: what there is of it, and what training takes."""
+    """One kind of memory on a device [bytes]: the total, and what training takes."""
 
     limit: float
     fixed: float
-    per_env: float  # for each environment on that device
+    per_env: float  # per environment on the device
 
     def check(self, learner: Learner) -> None:
-        """Raises:
-        UserError: it is not enough.
+        """Checks that the memory suffices.
+
+        Raises:
+            UserError: it does not.
         """
         devices, n, parts = learner.num_devices, learner.num_envs, learner.divisor
         need = self.fixed + self.per_env * n / devices
         if need <= self.limit:
             return
         most = int(max(0.0, self.limit - self.fixed) / self.per_env) * devices // parts * parts
-        text = f"{n} environments need about {need / 1e9:.1f} GB of memory on a device, and there are {self.limit / 1e9:.1f} GB"
+        text = f"{n} environments need about {need / 1e9:.1f} GB of memory on a device, which has {self.limit / 1e9:.1f} GB"
         if not most:
-            raise UserError(f"{text}: too little for {parts} even; free some, or make the networks or ppo.unroll_length smaller")
+            raise UserError(f"{text}: too little even for {parts}; free some, or reduce the networks or ppo.unroll_length")
         raise UserError(f"{text}: pass --num-envs {most} or fewer")
 
 
 def check(learner: Learner) -> None:
-    """Before anything is compiled: does it fit by estimate?
+    """Checks the learner's estimate before anything is compiled.
 
     Raises:
         UserError: it does not.
@@ -56,12 +58,14 @@ def check(learner: Learner) -> None:
 
 
 def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) -> None:
-    """Before anything of a batch is made: does it fit? Each number of a task may be within its bounds, and their product not.
+    """Checks that a batch of environments fits, before it is made.
+
+    Each number of a task may be within its bounds while their product is not.
 
     Args:
-        count: environments side by side.
-        name: what the user calls that number.
-        kept: what a program keeps beside the environments themselves [bytes].
+        count: number of environments side by side.
+        name: the user's name for that number.
+        kept: what the program keeps besides the environments [bytes].
 
     Raises:
         UserError: it does not.
@@ -75,13 +79,13 @@ def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) 
         if need > there:
             raise UserError(
                 f"{name} {count:,} with {state / 1e3:,.0f} kB of state each, and {kept / 1e9:.1f} GB of records, needs about "
-                f"{need / 1e9:,.1f} GB of memory, and there are {there / 1e9:.1f} GB: pass fewer, shorter episodes, or smaller "
+                f"{need / 1e9:,.1f} GB of memory, and {there / 1e9:.1f} GB are free: pass fewer, shorter episodes, or smaller "
                 "histories and delays"
             )
 
 
 def check_compiled(learner: Learner, program: Any) -> None:
-    """Does the compiled ``Learner.run`` fit, by what XLA says?
+    """Checks that the compiled ``Learner.run`` fits, by what XLA says.
 
     Raises:
         UserError: it does not.
@@ -95,10 +99,12 @@ def check_compiled(learner: Learner, program: Any) -> None:
 
 @contextlib.contextmanager
 def out_of_memory_as_user_error(learner: Learner) -> Iterator[None]:
-    """For what no estimate foresees, such as another program on the device: running out of memory is the user's to mend.
+    """Turns running out of memory into an error that the user can mend.
+
+    No estimate foresees everything, such as another program on the device.
 
     Raises:
-        UserError: in place of any error that says so.
+        UserError: replaces any error that says so.
     """
     try:
         yield
@@ -109,13 +115,13 @@ def out_of_memory_as_user_error(learner: Learner) -> Iterator[None]:
 
 
 def says_so(error: BaseException) -> bool:
-    """True of an error whose message tells that memory ran out."""
+    """True for an error whose message says that memory ran out."""
     text = str(error).lower()
     return any(sign in text for sign in ("resource_exhausted", "out of memory", "failed to allocate"))
 
 
 def program_bytes(program: Any) -> int | None:
-    """What a compiled program takes of XLA's memory on a device, arguments and results included; None if nobody knows."""
+    """Memory of a device that a compiled program takes from XLA, arguments and results included; None if unknown."""
     use = program.memory_analysis()
     if use is None:
         return None
@@ -128,7 +134,7 @@ def size(tree: Any) -> int:
 
 
 def _limit(num_devices: int) -> float:
-    """What XLA may take of a device: of a CPU what is free of the machine's memory, shared among its devices."""
+    """Memory that XLA may take on a device [bytes]. A CPU's devices share the machine's free memory."""
     stats = jax.local_devices()[0].memory_stats() or {}
     return stats.get("bytes_limit") or _free_of_machine() / num_devices
 

@@ -1,4 +1,5 @@
-"""The head of a policy or checkpoint, which may be a stranger's: read with limits before a library sees the file."""
+"""The header of a policy or checkpoint. A stranger may have made the file, so its header is read with limits before any library
+sees it."""
 
 import math
 import pathlib
@@ -10,11 +11,11 @@ from mjx_nero.config.values import short
 from mjx_nero.errors import UserError
 
 MAX_HEAD = 2_000_000  # bytes
-MAX_FILE = 20_000_000_000  # bytes; a checkpoint holds its environments
+MAX_FILE = 20_000_000_000  # bytes; a checkpoint holds all environments
 MAX_POLICY = 200_000_000  # bytes
 MAX_ARRAYS = 5_000
-MAX_LAYERS, MAX_WIDTH = 16, 8192  # of a network
-MAX_SIZE = 1_000_000  # numbers in an observation group
+MAX_LAYERS, MAX_WIDTH = 16, 8192  # of networks
+MAX_SIZE = 1_000_000  # numbers per observation group
 DTYPES = {
     "F64": "float64",
     "F32": "float32",
@@ -30,19 +31,19 @@ DTYPES = {
     "BOOL": "bool",
 }
 _BYTES = {name: 1 if name == "BOOL" else int(name[1:]) // 8 for name in DTYPES}
-Arrays = dict[str, tuple[str, tuple[int, ...]]]  # name -> type as numpy calls it, shape
+Arrays = dict[str, tuple[str, tuple[int, ...]]]  # name -> (numpy's name of the type, shape)
 
 
 def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
-    """The arrays of a safetensors file, and its own texts by name.
+    """Reads which arrays a safetensors file holds, and its texts by name.
 
     Raises:
-        UserError: missing, too large, damaged, or no such file.
+        UserError: the file is missing, too large or damaged.
     """
     with files.open_file(path) as (file, size):
         length = int.from_bytes(file.read(8), "little")
         if size > MAX_FILE:
-            raise UserError(f"{path} has {size / 1e9:.0f} GB: more than {MAX_FILE / 1e9:.0f} GB are not read")
+            raise UserError(f"{path} has {size / 1e9:.0f} GB: files above {MAX_FILE / 1e9:.0f} GB are not read")
         head = file.read(length) if length <= min(MAX_HEAD, size - 8) else b""
     try:
         found = files.parse_json(head)
@@ -57,15 +58,15 @@ def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
 
 
 def damaged(path: pathlib.Path) -> UserError:
-    """The error of a file that is not what was written."""
-    return UserError(f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew")
+    """Makes the error for a file that mjx_nero did not write."""
+    return UserError(f"{path} is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it again")
 
 
 def check(meta: Mapping[str, Any], path: pathlib.Path) -> None:
-    """What files say of themselves: each field that the package uses is of its type and of a size that is usual.
+    """Checks what a file says of its policy: each field that the package uses has its type and a plausible size.
 
     Raises:
-        UserError: one is not, or one that every policy has is missing.
+        UserError: a field is missing, has the wrong type, or is too large.
     """
     for name in ("env", "preset", "observation_size", "observations", "action_size"):
         if name not in meta:
@@ -74,10 +75,10 @@ def check(meta: Mapping[str, Any], path: pathlib.Path) -> None:
 
 
 def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
-    """As ``check``, of those that are there: checkpoints of older versions have fewer.
+    """Checks the fields that are there, as ``check`` does: checkpoints of older versions have fewer.
 
     Raises:
-        UserError: one is not of its type, or too large.
+        UserError: a field has the wrong type, or is too large.
     """
     for name, good in _FIELDS.items():
         if name in meta and not good(meta[name]):
@@ -86,13 +87,13 @@ def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
 
 
 def acts_alike(*metas: Mapping[str, Any]) -> bool:
-    """Whether two policies' actions are of the same kinds. Files of before 0.5.0 do not say: the arm's are positions."""
+    """True if two policies' actions are of the same kinds. Files before 0.5.0 do not say; their arms take positions."""
     said = [list(meta["actions"]) for meta in metas if "actions" in meta]
     return said[0] == said[1] if len(said) == 2 else all(kinds[:1] == ["JointPosition"] for kinds in said)
 
 
 def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
-    """Type, shape, first byte and the one after the last."""
+    """Returns type, shape, first byte and end of an array."""
     kind, shape, (first, last) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
     whole = all(type(n) is int and 0 <= n < 1 << 40 for n in (*shape, first, last))
     if not whole or len(shape) > 8 or math.prod(shape) * _BYTES[kind] != last - first:
@@ -113,7 +114,7 @@ def _list(good: Callable[[Any], bool], most: int) -> Callable[[Any], bool]:
 
 
 def _groups(good: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    """A mapping with the group that every policy observes."""
+    """Checks a mapping that holds the group ``state``, which every policy observes."""
     return lambda value: isinstance(value, dict) and "state" in value and all(_word(k) and good(v) for k, v in value.items())
 
 
@@ -122,7 +123,7 @@ def _size(value: Any) -> bool:
 
 
 def _sizes(value: Any) -> bool:
-    """The shape of a group, or of each of its terms where they stay apart."""
+    """Checks the shape of a group, or the shapes of its terms if they stay apart."""
     return (
         _size(value) or isinstance(value, dict) and 0 < len(value) <= 200 and all(_word(k) and _size(v) for k, v in value.items())
     )
@@ -133,7 +134,7 @@ def _number(most: float) -> Callable[[Any], bool]:
 
 
 def _tally(value: Any) -> bool:
-    """What a run counts: numbers, of which some may be open, and its last evaluation."""
+    """Checks the counts of a run: numbers, some of them optional, and its last evaluation."""
     open = ("seconds_to_95", "steps_to_95", "rewound_at")
     return isinstance(value, dict) and all(
         isinstance(v, dict) if k == "evaluation" else type(v) in (int, float) or v is None and k in open for k, v in value.items()

@@ -1,4 +1,4 @@
-"""What learns: a protocol, and learners by name. Training, evaluation and the benchmark know no more of a learner than this."""
+"""The protocol of learners, and a registry of them. Training, evaluation and benchmarks know nothing more of a learner."""
 
 import dataclasses
 import importlib
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mjx_nero import config
-from mjx_nero.errors import UserError
+from mjx_nero.config.registry import Registry
 
 if TYPE_CHECKING:
     import jax
@@ -14,27 +14,27 @@ if TYPE_CHECKING:
 
     from mjx_nero.types import Bank, Key
 
-Params = Any  # what a policy acts by: a pytree of arrays
+Params = Any  # a policy's parameters: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
 Observation = Mapping[str, "jax.Array"]
 Act = Callable[[Params, Observation], "jax.Array"]
 
 
 class State(Protocol):
-    """A pytree with all of a run: saved and loaded as it is, training goes on bit for bit."""
+    """The whole state of a run, as a pytree. Training that resumes from a saved state continues bit for bit."""
 
-    iteration: Any  # how many ``run`` has made so far, int32
+    iteration: Any  # iterations so far, int32
 
 
 class Learner(Protocol):
     """Learns on a batch of environments. ``init`` and ``run`` are pure.
 
     Attributes:
-        env: from ``wrappers.for_training``.
-        num_envs: on all devices together.
-        num_devices: over how many they are spread.
-        divisor: ``num_envs`` is a multiple of it.
-        steps_per_iteration: env steps.
+        env: the batch, from ``wrappers.for_training``.
+        num_envs: number of environments on all devices together.
+        num_devices: number of devices that they are spread over.
+        divisor: ``num_envs`` must be a multiple of it.
+        steps_per_iteration: env steps of an iteration.
     """
 
     env: "Env"
@@ -44,56 +44,59 @@ class Learner(Protocol):
     steps_per_iteration: int
 
     def init(self, key: "Key", bank: "Bank | None" = None) -> Any:
-        """A fresh ``State``; ``bank`` is for the environments' ``reset``, where the task asks for an expert's starts."""
+        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts."""
         ...
 
     def place(self, state: Any) -> Any:
-        """The state, or its shapes, where ``run`` takes it: spread over the devices."""
+        """Spreads the state, or its shapes, over the devices, as ``run`` takes it."""
         ...
 
     def run(self, state: Any, iterations: int) -> tuple[Any, Metrics]:
-        """So many iterations, and means of their metrics. ``sum/<name>``: an environment's metric summed over an iteration."""
+        """Makes ``iterations`` iterations; returns the state and the mean metrics of an iteration.
+
+        ``sum/<name>`` is an environment's metric summed over an iteration.
+        """
         ...
 
     def policy(self, state: Any) -> Params:
-        """What the policy acts by, on one device."""
+        """Returns the policy's parameters, on one device."""
         ...
 
     def with_policy(self, state: Any, params: Params) -> Any:
-        """A fresh state that starts from a policy."""
+        """Returns a new state that starts from a policy."""
         ...
 
     def slower(self, state: Any) -> Any:
-        """The state, learning more slowly and from other draws: to go back to after divergence."""
+        """Returns the state with a lower learning rate and other random draws, for a restart after divergence."""
         ...
 
     def act(self, params: Params, obs: Observation) -> "jax.Array":
-        """The deterministic action; single or batched."""
+        """Computes the deterministic action, single or batched."""
         ...
 
     def describe(self) -> dict[str, Any]:
-        """What a policy file says of the policy beside the environment, enough for ``Kind.policy``; plain JSON."""
+        """Describes the policy for its file, beside the environment: plain JSON, enough for ``Kind.policy``."""
         ...
 
     def footprint(self) -> tuple[float, float]:
-        """About what ``run`` takes of a device's memory [bytes]: in any case, and for each environment there."""
+        """Estimates the memory of ``run`` on a device [bytes]: the fixed part, and the part per environment."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A way to learn.
+    """A registered learner.
 
     Attributes:
         make: (environment from ``wrappers.for_training``, config, number of devices) -> learner.
-        presets: its config by the environment's preset; ``default`` for the others. A frozen dataclass with at least ``num_envs``
-            and ``num_timesteps``, 0: chosen for the machine.
-        policy: what a policy file says -> a template of the policy's parameters, and how it acts.
-        fit: (config, number of devices that a run starts on) -> the config with what they decide, which the run keeps.
-        held: where a checkpoint holds the policy's parameters: the start of their names in a policy's file -> in the learner's
-            state, as in ``{"['w']": ".best"}``. Empty: no checkpoint can be played, only a policy's file.
-        differing: (what a file says of its policy, what the run's own says) -> the config's fields in which they differ, by
-            dotted name, with the file's values.
+        presets: its config for each preset of an environment; ``default`` for the others. A config is a frozen dataclass with at
+            least ``num_envs`` and ``num_timesteps``, where 0 means chosen for the machine.
+        policy: description in a policy's file -> (template of the policy's parameters, act function).
+        fit: (config, devices at the run's start) -> the config with what their number decides, which the run keeps.
+        held: prefix of the parameters' names in a policy's file -> their prefix in the learner's state, as in
+            ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
+        differing: (description in a file, the run's own) -> the config's fields that differ, by dotted name, with the file's
+            values.
     """
 
     make: Callable[["Env", Any, int], Learner]
@@ -104,46 +107,34 @@ class Kind:
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
 
 
-# The package's own: the folder whose ``learner`` has its ``KIND``; the presets stand in ``cfg`` beside it, without Brax.
-_KINDS: dict[str, Kind | str] = {"ppo": "mjx_nero.learn.ppo"}
-
-
-def register(name: str, kind: Kind) -> None:
-    """Adds a learner: ``--learner NAME`` trains with it, ``--NAME.field`` sets its config.
-
-    Raises:
-        UserError: there is one of that name.
-    """
-    if name in _KINDS:
-        raise UserError(f"there is a learner {name!r} already: register it under another name")
-    _KINDS[name] = kind
+# The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
+# ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
+KINDS: Registry[Kind | str] = Registry("learner", {"ppo": "mjx_nero.learn.ppo"})
 
 
 def names() -> tuple[str, ...]:
     """Names of all learners."""
-    return tuple(_KINDS)
+    return tuple(KINDS)
 
 
 def find(name: str) -> Kind:
-    """A learner by name.
+    """Finds a learner by name.
 
     Raises:
-        UserError: unknown.
+        UserError: there is no such learner.
     """
-    kind = _KINDS.get(name)
-    if kind is None:
-        raise UserError(f"unknown learner {name!r}{config.hint(name, _KINDS)}: choose one of {', '.join(_KINDS)}")
+    kind = KINDS.find(name)
     return importlib.import_module(f"{kind}.learner").KIND if isinstance(kind, str) else kind
 
 
 def cfg_for(name: str, preset: str, fields: Mapping[str, Any]) -> Any:
-    """The config of a learner that goes with an environment's preset.
+    """Returns a learner's config for a preset of an environment.
 
     Args:
-        fields: what the task asks for, by dotted name (``EnvCfg.training``); those that this learner does not have are left out.
+        fields: the task's wishes by dotted name (``EnvCfg.training``); fields that this learner lacks are ignored.
     """
-    kind = _KINDS.get(name)
-    presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else find(name).presets
+    kind = KINDS.find(name)
+    presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else kind.presets
     cfg = presets.get(preset, presets["default"])
     known = config.flatten(cfg)
     return config.override(cfg, {field: value for field, value in fields.items() if field in known})

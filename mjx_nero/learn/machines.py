@@ -1,6 +1,6 @@
-"""One run on several machines: a process on each, which JAX joins to one mesh of devices.
+"""Runs on several machines: one process on each, joined by JAX to one mesh of devices.
 
-The first process alone writes, evaluates and decides; the others do as it does. With one process nothing here does anything.
+Only the first process writes, evaluates and decides; the others follow. With a single process, these functions do nothing.
 """
 
 import glob
@@ -13,10 +13,10 @@ from jax.experimental import multihost_utils
 
 
 def join() -> None:
-    """Joins the processes that ``srun`` or ``mpirun`` started together; before JAX is used.
+    """Joins the processes that ``srun`` or ``mpirun`` started. Call it before JAX is used.
 
-    Where nothing tells JAX of the others (Kubernetes without its Python package, a shell), ``JAX_COORDINATOR_ADDRESS``,
-    ``JAX_NUM_PROCESSES`` and ``JAX_PROCESS_ID`` (or ``JOB_COMPLETION_INDEX``) do.
+    Without such a launcher (Kubernetes without its Python package, or a shell), set ``JAX_COORDINATOR_ADDRESS``,
+    ``JAX_NUM_PROCESSES`` and ``JAX_PROCESS_ID`` (or ``JOB_COMPLETION_INDEX``).
     """
     env = os.environ
     how: dict[str, Any] = {}
@@ -26,7 +26,7 @@ def join() -> None:
     elif max(int(env.get(name, 1)) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")) == 1:
         return
     elif "1" in (env.get("SLURM_STEP_TASKS_PER_NODE", "").partition("(")[0], env.get("OMPI_COMM_WORLD_LOCAL_SIZE")):
-        how = {"local_device_ids": _gpus()}  # a process a machine has all of it; JAX would give it the first GPU alone
+        how = {"local_device_ids": _gpus()}  # one process per machine gets all its GPUs; JAX would give it only the first
     jax.distributed.initialize(**how)
 
 
@@ -41,12 +41,12 @@ def first() -> bool:
 
 
 def default_devices() -> int:
-    """How many of a machine's devices a run takes if nobody says: one, or where machines are joined all."""
+    """Default number of devices per machine: one, or all where machines are joined."""
     return jax.local_device_count() if several() else 1
 
 
 def devices(each: int) -> list[Any]:
-    """``each`` devices of every process."""
+    """Returns the first ``each`` devices of every process."""
     count: dict[int, int] = {}
     found = []
     for device in jax.devices():
@@ -57,20 +57,20 @@ def devices(each: int) -> list[Any]:
 
 
 def gather(values: list[float]) -> np.ndarray:
-    """The values of all processes [processes, n], the first's first."""
+    """Collects the values of all processes [processes, n]; the first process comes first."""
     mine = np.array(values, np.float64)
     return np.asarray(multihost_utils.process_allgather(mine)).reshape(-1, len(values)) if several() else mine[None]
 
 
 def fetch(x: Any) -> np.ndarray:
-    """A copy of an array in this process's memory, put together of all processes' parts."""
+    """Copies an array to this process's memory, assembled from all processes' parts."""
     if isinstance(x, jax.Array) and not x.is_fully_addressable and not x.is_fully_replicated:
         x = multihost_utils.process_allgather(x, tiled=True)
     return np.array(x, order="C")
 
 
 def wait() -> None:
-    """Until all processes are here."""
+    """Waits until all processes are here."""
     gather([0.0])
 
 

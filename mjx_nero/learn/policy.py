@@ -1,4 +1,4 @@
-"""Policies: the file they live in, and whether one fits an environment."""
+"""Policies: the files that hold them, and whether one fits an environment."""
 
 import dataclasses
 import functools
@@ -24,9 +24,9 @@ class Policy:
     """A trained policy.
 
     Attributes:
-        meta: what it was trained on: env, preset, robot, sizes, learner, env steps.
-        params: what it acts by; of PPO (normalizer, network parameters), as Brax's inference function takes them.
-        act: observation groups -> the deterministic action; single or batched.
+        meta: its training: env, preset, robot, sizes, learner, env steps.
+        params: its parameters. PPO's are (normalizer, network parameters), as Brax's inference function takes them.
+        act: observation groups -> deterministic action; single or batched.
     """
 
     meta: dict[str, Any]
@@ -35,11 +35,11 @@ class Policy:
 
 
 def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: Mapping[str, Any]) -> dict[str, Any]:
-    """What a policy file says of the policy in it.
+    """Describes a policy for its file.
 
     Args:
-        by: name of the learner.
-        learnt: of ``Learner.describe``.
+        by: the learner's name.
+        learnt: result of ``Learner.describe``.
     """
     terms = {name: list(group.terms) for name, group in env.cfg.observations.items()}
     return {
@@ -58,17 +58,17 @@ def describe(env: ManipulationEnv, env_name: str, preset: str, by: str, learnt: 
 
 
 def checkpoint_policy(path: pathlib.Path | str) -> Policy:
-    """The policy in a policy's file or in a checkpoint of a run, rebuilt by its learner from what the file says of it.
+    """Rebuilds the policy in a policy's file or a run's checkpoint, through the learner that the file names.
 
     Raises:
-        UserError: missing, damaged, or it describes no policy.
+        UserError: the file is missing or damaged, or it describes no policy.
     """
     path = pathlib.Path(path)
     meta = checkpoint.load_meta(path)
     header.check(meta, path)
     whole, size = meta.get("kind") == "checkpoint", path.stat().st_size
     if not whole and size > header.MAX_POLICY:
-        raise UserError(f"{path} has {size / 1e6:.0f} MB: policies of more than {header.MAX_POLICY / 1e6:.0f} MB are not read")
+        raise UserError(f"{path} has {size / 1e6:.0f} MB: policies above {header.MAX_POLICY / 1e6:.0f} MB are not read")
     kind = learner.find(meta.get("learner", "ppo"))
     if whole and not kind.held:
         raise UserError(
@@ -94,15 +94,15 @@ def load_for(
     any_robot: bool = False,
     preset: str = "default",
 ) -> Policy:
-    """Reads the policy at ``path`` (default: the bundled one for ``env_name``) and checks that it fits ``env``.
+    """Reads the policy at ``path`` (default: the bundled one) and checks that it fits ``env``.
 
     Args:
-        preset: of the bundled policy, where it has one of its own.
-        robot: what the user named for another than the environment's own, for the messages.
-        any_robot: play it even if it was trained for another model of the robot.
+        preset: preset of the bundled policy, if it has its own.
+        robot: the robot that the user named in place of the environment's own, for messages.
+        any_robot: allow a policy that was trained for another model of the robot.
 
     Raises:
-        UserError: missing, damaged, or trained on another environment, robot or other observations.
+        UserError: the policy is missing, damaged, or trained on another environment, robot or observations.
     """
     path = pathlib.Path(path or shipped(env_name, preset))
     if path == shipped(env_name, preset) and not path.is_file():
@@ -116,12 +116,12 @@ def load_for(
 
 
 def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = False) -> str:
-    """What keeps a policy from being played in an environment, and what to do; empty if nothing does.
+    """Says why a policy cannot be played in an environment, and what to do; empty if it can.
 
     Args:
-        there: what the policy's file says (``describe``). Those of older versions say less.
-        here: the same of the environment.
-        any_robot: it may be of another model of the robot.
+        there: the description in the policy's file (``describe``). Older versions say less.
+        here: the same for the environment.
+        any_robot: allow another model of the robot.
     """
     kind, robot = there.get("kind", "policy"), here["robot"]
     if there["env"] != here["env"]:
@@ -153,6 +153,6 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
 
 
 def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
-    """Where the package's own policy for an environment lies: the preset's, or where it has none the default's."""
+    """Path of the package's own policy for an environment: the preset's, or else the default's."""
     own = ASSETS / "policies" / f"{env_name}_{preset}.safetensors"
     return own if own.is_file() else ASSETS / "policies" / f"{env_name}.safetensors"

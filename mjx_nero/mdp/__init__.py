@@ -1,1 +1,1 @@
-"""The terms of which tasks are built: pure functions of a ``View``."""
+"""The terms that tasks are built of: pure functions of a ``View``."""

@@ -1,9 +1,9 @@
-"""Action terms: from the policy's output to the drives' position targets, one after another as a task lists them.
+"""Action terms turn the policy's output into the drives' position targets, one after another in the task's order.
 
-A term is a class, made as ``Term(drives, **params)``. ``home`` holds the entries of the action that it reads, as they are at
-home; ``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are those entries. A term also
-describes itself as JSON, which ``deploy.executor`` runs in numpy, tells the bounds of its entries, and inverts itself, from
-targets back to entries.
+A term is a class, made as ``Term(drives, **params)``. ``home`` holds the values of the action entries that the term reads, with
+the robot at home. The term has ``init(key, act) -> memory`` and ``step(memory, own, act) -> (memory, act)``, where ``own`` are
+its entries. It describes itself as JSON, which ``deploy.executor`` runs in numpy; it gives the bounds of its entries; and it
+inverts itself, from targets back to entries.
 """
 
 import dataclasses
@@ -26,13 +26,13 @@ Memory = Any
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """A group of drives, arrays along its joints [rad or m].
+    """A group of drives, as arrays along its joints [rad or m].
 
     Attributes:
-        speed: of targets, at most [rad/s or m/s].
-        lag: of a joint behind a target that moves [s].
-        dt: control step [s].
-        joints: names.
+        speed: speed limit of the targets [rad/s or m/s].
+        lag: how long a joint lags behind a moving target [s].
+        dt: duration of a control step [s].
+        joints: the joints' names.
     """
 
     home: np.ndarray
@@ -47,34 +47,34 @@ class Drives:
 
     @property
     def step(self) -> np.ndarray:
-        """How far targets move in a control step, at most."""
+        """The farthest that targets move in one control step [rad or m]."""
         return self.speed * np.float32(self.dt)
 
 
-Groups = Mapping[str, Drives]  # ``arm`` and ``gripper``
+Groups = Mapping[str, Drives]  # the groups ``arm`` and ``gripper``
 
 
 @struct.dataclass
 class Act:
-    """An action on its way to the drives. Positions and targets by group of drives [rad or m]."""
+    """An action on its way to the drives. Positions and targets are split by group of drives [rad or m]."""
 
-    action: Float[Array, "... na"]  # all of it, bounded
+    action: Float[Array, "... na"]  # the whole action, bounded
     joint_pos: dict[str, Float[Array, "... n"]]
-    ctrl: dict[str, Float[Array, "... n"]]  # the targets now in force
-    targets: dict[str, Float[Array, "... n"]]  # what comes of the action: at first, home
+    ctrl: dict[str, Float[Array, "... n"]]  # the current targets
+    targets: dict[str, Float[Array, "... n"]]  # the new targets; at first, home
     level: Float[Array, ""] | None = None  # see ``types.LEVEL``
 
     def to(self, group: str, targets: Float[Array, " n"]) -> "Act":
-        """With other targets of a group."""
+        """Returns a copy with new targets for one group."""
         return dataclasses.replace(self, targets={**self.targets, group: targets})
 
 
-Description = dict[str, Any]  # ``type``, and what else ``deploy.executor`` reads of that type
-Bounds = tuple[np.ndarray, np.ndarray]  # the least and the greatest
+Description = dict[str, Any]  # ``type``, and the fields that ``deploy.executor`` reads for that type
+Bounds = tuple[np.ndarray, np.ndarray]  # least and greatest entries
 
 
 class ActionTerm(Protocol):
-    """See above."""
+    """The protocol of action terms, described at the top of this module."""
 
     home: np.ndarray
 
@@ -87,51 +87,52 @@ class ActionTerm(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
-    """Base of terms that read no entry and remember nothing."""
+    """Base of terms that read no entry and have no memory."""
 
     groups: Groups
 
     @property
     def home(self) -> np.ndarray:
-        """No entry."""
+        """An empty vector: the term reads no entry."""
         return np.zeros(0, np.float32)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """Nothing."""
+        """Returns an empty memory."""
         return ()
 
     def describe(self) -> Description | None:
-        """None: only this package knows what the term does."""
+        """Returns None: only this package knows what the term does."""
         return None
 
     def bounds(self) -> Bounds:
-        """The entries beyond which nothing more happens: +-1."""
+        """Returns the entries beyond which nothing more happens: +-1."""
         return -np.ones(len(self.home), np.float32), np.ones(len(self.home), np.float32)
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """The entries that give ``act.targets``, or come nearest. Actions take effect up to ``late`` control steps late."""
+        """Computes the entries whose targets come nearest to ``act.targets``. Actions take effect up to ``late`` control steps
+        late."""
         return jnp.zeros((*next(iter(act.targets.values())).shape[:-1], 0))
 
 
 @dataclasses.dataclass(frozen=True)
 class Joints(Plain):
-    """Base of terms that read an entry for each joint of a group, zero at home."""
+    """Base of terms that read one entry per joint of a group, zero at home."""
 
     group: str = dataclasses.field(default="arm", kw_only=True)
 
     @property
     def home(self) -> np.ndarray:
-        """Zero."""
+        """Zero for every joint."""
         return np.zeros_like(self.groups[self.group].home)
 
 
 @dataclasses.dataclass(frozen=True)
 class Gripper(Plain):
-    """Base of terms that read one entry for all joints of the gripper, if there is one."""
+    """Base of terms that read one entry for all gripper joints, if the robot has a gripper."""
 
     @property
     def drives(self) -> Drives:
-        """The gripper's."""
+        """The gripper's drives."""
         return self.groups["gripper"]
 
     def _described(self, kind: str) -> Description:
@@ -141,54 +142,57 @@ class Gripper(Plain):
 
 @dataclasses.dataclass(frozen=True)
 class JointPosition(Joints):
-    """One entry a joint: ``home + scale * action`` [rad], within the joints' ranges. Isaac Lab's ``JointPositionAction``."""
+    """One entry per joint: ``target = home + scale * entry`` [rad], clipped to the joint range. Isaac Lab's
+    ``JointPositionAction``."""
 
     scale: float = dataclasses.field(kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the group."""
+        """Sets the group's targets."""
         drives = self.groups[self.group]
         return memory, act.to(self.group, jnp.clip(drives.home + self.scale * own, drives.low, drives.high))
 
     def describe(self) -> Description:
-        """``offset + scale * action``, an entry a joint."""
+        """Describes ``target = offset + scale * entry``, one entry per joint."""
         drives = self.groups[self.group]
         of = {"joints": list(drives.joints), "scale": self.scale, "offset": decimals(drives.home)}
         return {"type": "joint_position", **of}
 
     def bounds(self) -> Bounds:
-        """Where each joint reaches its limits."""
+        """Returns the entries that take each joint to its limits."""
         drives = self.groups[self.group]
         low, high = np.sort([(end - drives.home) / np.float32(self.scale) for end in (drives.low, drives.high)], axis=0)
         return low, high
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Exact."""
+        """Inverts exactly."""
         return (act.targets[self.group] - self.groups[self.group].home) / self.scale
 
 
 @dataclasses.dataclass(frozen=True)
 class JointVelocity(Joints):
-    """One entry a joint: how fast its set-point moves, at +-1 as fast as the drive; targets lead it by the drives' lag.
+    """One entry per joint: the speed of its set-point, where +-1 is the drive's full speed. Targets lead the set-point by the
+    drives' lag.
 
-    Absolute targets whose noise is wider than the speed limit teach a policy that only their signs count: without its noise it
-    throws targets from limit to limit, and a step of delay undoes it. Here noise is a share of the limit, and smooth.
+    If absolute targets get noise wider than the speed limit, the policy learns that only their signs matter. Without the noise
+    such a policy throws its targets from limit to limit, and one step of delay ruins it. Here noise is a share of the limit, and
+    smooth.
 
     Attributes:
         time: time constant with which velocities follow the action [s].
-        ahead: a set-point is never farther from its joint than it moves in this time at full speed [s]: a hand that leans on a
-            table would wind it up until no action has an effect.
+        ahead: a set-point leads its joint by at most the distance covered in this time at full speed [s]. Without this limit, a
+            hand that leans on a table winds the set-point up until no action has an effect.
     """
 
     time: Positive = dataclasses.field(default=0.15, kw_only=True)
     ahead: Positive = dataclasses.field(default=0.1, kw_only=True)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """The set-point [rad or m] and its rate [share of the speed]: at the joints, at rest."""
+        """Returns the set-point [rad or m], at the joints, and its rate [share of full speed], zero."""
         return act.joint_pos[self.group], jnp.zeros_like(act.joint_pos[self.group])
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the group, ahead of its set-point."""
+        """Moves the set-points, and sets the group's targets ahead of them."""
         (point, rate), drives, joint_pos = memory, self.groups[self.group], act.joint_pos[self.group]
         rate = rate + (1.0 - np.exp(-drives.dt / self.time)) * (jnp.clip(own, -1.0, 1.0) - rate)
         most = drives.speed * self.ahead
@@ -198,13 +202,13 @@ class JointVelocity(Joints):
         return (point, rate), act.to(self.group, targets)
 
     def describe(self) -> Description:
-        """Entries move set-points, which targets lead by ``lag`` [s]."""
+        """Describes entries that move set-points, which the targets lead by ``lag`` [s]."""
         drives = self.groups[self.group]
         of = {"joints": list(drives.joints), "time": self.time, "ahead": self.ahead, "lag": decimals(drives.lag)}
         return {"type": "joint_velocity", **of}
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Towards the targets as slowly as velocities follow the action: faster would swing."""
+        """Moves towards the targets no faster than velocities follow the action; anything faster oscillates."""
         drives, slow = self.groups[self.group], 2 * (self.time + late * self.groups[self.group].dt)
         way = act.targets[self.group] - act.joint_pos[self.group]
         return jnp.clip(way / (slow * drives.speed), -1.0, 1.0)
@@ -212,57 +216,57 @@ class JointVelocity(Joints):
 
 @dataclasses.dataclass(frozen=True)
 class DriveTargets(Plain):
-    """One entry a drive: its position target itself [rad or m], within the joints' ranges. For controllers."""
+    """One entry per drive: its position target [rad or m], clipped to the joint range. Used by controllers."""
 
     @property
     def home(self) -> np.ndarray:
-        """The robot's."""
+        """The home position of all drives."""
         return np.concatenate([drives.home for drives in self.groups.values()])
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of all groups."""
+        """Sets the targets of all groups."""
         for group, drives in self.groups.items():
             targets, own = own[: len(drives.home)], own[len(drives.home) :]
             act = act.to(group, jnp.clip(targets, drives.low, drives.high))
         return memory, act
 
     def describe(self) -> Description:
-        """Joint positions of scale 1."""
+        """Describes joint positions with scale 1."""
         joints = [name for drives in self.groups.values() for name in drives.joints]
         return {"type": "joint_position", "joints": joints, "scale": 1.0, "offset": [0.0] * len(joints)}
 
     def bounds(self) -> Bounds:
-        """The joints' ranges."""
+        """Returns the joint ranges."""
         every = self.groups.values()
         return np.concatenate([drives.low for drives in every]), np.concatenate([drives.high for drives in every])
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """The targets themselves."""
+        """Returns the targets themselves."""
         return jnp.concatenate([act.targets[group] for group in self.groups], axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class BinaryGripper(Gripper):
-    """One entry, if there is a gripper: closed where negative, else open. Isaac Lab's ``BinaryJointPositionAction``.
+    """One entry, if there is a gripper: negative closes it, anything else opens it. Isaac Lab's ``BinaryJointPositionAction``.
 
     Attributes:
-        hysteresis: it closes below minus that, opens from plus that on, and stays as it is between, at first open. Noise about
-            zero opens and closes a hand many times a second; so it stays closed for long enough to grasp by chance.
+        hysteresis: the gripper closes below -hysteresis, opens at +hysteresis and above, and otherwise keeps its state. It starts
+            open. Otherwise noise about zero opens and closes the hand many times a second, and it never grasps by chance.
     """
 
     hysteresis: NonNegative = dataclasses.field(default=0.0, kw_only=True)
 
     @property
     def home(self) -> np.ndarray:
-        """Open."""
+        """Zero, which reads as open; empty without a gripper."""
         return np.zeros(int(len(self.drives.home) > 0), np.float32)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """Whether it is closed, if that may matter."""
+        """Remembers whether the gripper is closed, if hysteresis needs it."""
         return jnp.zeros((), bool) if self.hysteresis and len(self.home) else ()
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the gripper."""
+        """Sets the gripper's targets."""
         drives = self.drives
         if not len(own):
             return memory, act
@@ -271,11 +275,11 @@ class BinaryGripper(Gripper):
         return (closed if self.hysteresis else memory), act.to("gripper", targets)
 
     def describe(self) -> Description:
-        """``close`` for an entry below minus ``hysteresis``, ``open`` from plus that on, between as it was."""
+        """Describes ``close`` below -hysteresis, ``open`` at +hysteresis and above, and the last state in between."""
         return {**self._described("binary"), "hysteresis": self.hysteresis}
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Whichever of open and closed is nearer."""
+        """Picks whichever of open and closed is nearer."""
         if not len(self.home):
             return super().invert(act, late)
         to_open, to_close = (jnp.abs(act.targets["gripper"] - end).sum(-1) for end in (self.drives.open, self.drives.close))
@@ -284,22 +288,22 @@ class BinaryGripper(Gripper):
 
 @dataclasses.dataclass(frozen=True)
 class ContinuousGripper(Gripper):
-    """One entry, if there is a gripper: closed at -1, open at 1, and between in proportion.
+    """One entry, if there is a gripper: -1 is closed, 1 is open, in proportion between.
 
-    A binary gripper that must not lose what it carries is told to close so surely that noise hardly ever opens it, and what would
-    be paid for letting go is not found. Of a continuous one a little more is told at every step.
+    A binary gripper that must not drop its load learns to close so firmly that noise hardly ever opens it, and the policy never
+    finds the reward for letting go. A continuous gripper lets every step open it a little further.
     """
 
     @property
     def home(self) -> np.ndarray:
-        """As far open as it is at home."""
+        """The entry for the gripper's opening at home."""
         drives = self.drives
         if not len(drives.home):
             return np.zeros(0, np.float32)
         return np.array([opening(drives.home, drives.open, drives.close)], np.float32)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the gripper."""
+        """Sets the gripper's targets."""
         drives = self.drives
         if not len(own):
             return memory, act
@@ -307,11 +311,11 @@ class ContinuousGripper(Gripper):
         return memory, act.to("gripper", jnp.clip(drives.close + share * (drives.open - drives.close), drives.low, drives.high))
 
     def describe(self) -> Description:
-        """From ``close`` at -1 to ``open`` at 1."""
+        """Describes ``close`` at -1 to ``open`` at 1."""
         return self._described("continuous")
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """As far open as comes nearest."""
+        """Finds the opening that comes nearest."""
         if not len(self.home):
             return super().invert(act, late)
         return opening(act.targets["gripper"], self.drives.open, self.drives.close)[..., None]
@@ -319,17 +323,17 @@ class ContinuousGripper(Gripper):
 
 @dataclasses.dataclass(frozen=True)
 class AntiWindup(Plain):
-    """Targets of a group that turn back start at most ``ahead`` [s] of full speed from their joints; for before a speed limit.
+    """Lets targets that turn back start at most ``ahead`` [s] of full speed from their joints. Place it before a speed limit.
 
-    Fingers press with a target that lies far behind what they hold. To let go they would first have to take that way back, at the
-    speed of the drives: half a second in which nothing happens. Without any way back noise opens the hand.
+    Fingers press with a target far behind the surface of what they hold. To let go, the target would first have to travel back at
+    the drives' speed, so nothing would happen for half a second. With ``ahead`` zero, however, noise opens the hand.
     """
 
     group: str = dataclasses.field(default="gripper", kw_only=True)
     ahead: NonNegative = dataclasses.field(default=0.1, kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """The targets in force nearer to the joints, if the way to the new ones leads there."""
+        """Moves the current targets nearer to the joints, if the way to the new targets leads there."""
         to, now, joints = act.targets[self.group], act.ctrl[self.group], act.joint_pos[self.group]
         most = jnp.asarray(self.groups[self.group].speed * np.float32(self.ahead))
         start = jnp.clip(now, joints - most, joints + most)
@@ -337,114 +341,115 @@ class AntiWindup(Plain):
         return memory, dataclasses.replace(act, ctrl={**act.ctrl, self.group: start})
 
     def describe(self) -> Description:
-        """Targets ``of`` joints that turn back."""
+        """Names the joints whose targets turn back, as ``of``."""
         return {"type": "anti_windup", "of": list(self.groups[self.group].joints), "ahead": self.ahead}
 
 
 @dataclasses.dataclass(frozen=True)
 class SpeedLimit(Plain):
-    """Targets move at most as fast as the drives: those of a group, or of all of them (empty)."""
+    """Limits targets to the drives' speed, in one group or, if ``group`` is empty, in all."""
 
     group: str = dataclasses.field(default="", kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets nearer to those in force."""
+        """Moves the current targets towards the new ones."""
         for group in (self.group,) if self.group else self.groups:
             step = jnp.asarray(self.groups[group].step)
             act = act.to(group, rate_limit(act.targets[group], act.ctrl[group], step=step))
         return memory, act
 
     def describe(self) -> Description:
-        """Targets ``of`` joints move at most as fast as their drives."""
+        """Names the joints whose targets are limited, as ``of``."""
         limited = (self.group,) if self.group else self.groups
         return {"type": "speed_limit", "of": [name for group in limited for name in self.groups[group].joints]}
 
 
 @dataclasses.dataclass(frozen=True)
 class Delay(Plain):
-    """The terms after this one get the action of some control steps ago (see ``memory.Delay``)."""
+    """Gives the terms after this one an earlier action (see ``memory.Delay``)."""
 
     steps: Steps = dataclasses.field(kw_only=True)
     hold: Share = dataclasses.field(default=1.0, kw_only=True)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """It has been home's."""
+        """Fills the memory with the home action."""
         return memories.Delay(self.steps, self.hold).init(key, act.action)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """An action late."""
+        """Swaps the action for a delayed one."""
         memory, action = memories.Delay(self.steps, self.hold).step(memory, act.action)
         return memory, dataclasses.replace(act, action=toward(act.level, act.action, action))
 
     def describe(self) -> Description:
-        """Control steps, the least and the most: what training reckoned with."""
+        """Gives the least and greatest delay of training [control steps]."""
         return {"type": "delay", "steps": list(self.steps)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Noise(Plain):
-    """The arm's targets are off by up to ``amount`` in every step [rad or m], uniformly, within the joints' ranges."""
+    """Shifts the arm's targets by up to ``amount`` at every step [rad or m], uniformly, within the joint ranges."""
 
     amount: NonNegative = dataclasses.field(kw_only=True)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """Its own random key."""
+        """Keeps a random key of its own."""
         return key
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Targets of the arm."""
+        """Shifts the arm's targets."""
         memory, k_noise = jax.random.split(memory)
         drives, targets = self.groups["arm"], act.targets["arm"]
         off = jax.random.uniform(k_noise, targets.shape, minval=-self.amount, maxval=self.amount)
         return memory, act.to("arm", jnp.clip(toward(act.level, targets, targets + off), drives.low, drives.high))
 
     def describe(self) -> Description:
-        """What training reckoned with."""
+        """Gives the noise of training."""
         return {"type": "noise", "amount": self.amount}
 
 
 @dataclasses.dataclass(frozen=True)
 class LowPass(Plain):
-    """The terms after this one get the action smoothed by a first-order filter of time constant ``time`` [s], steps of ``dt``."""
+    """Smooths the action for the terms after this one: a first-order filter of time constant ``time`` [s] at steps of ``dt``
+    [s]."""
 
     time: Positive = dataclasses.field(kw_only=True)
     dt: Positive = dataclasses.field(kw_only=True)
 
     def init(self, key: Key, act: Act) -> Memory:
-        """It has been home's."""
+        """Starts from the home action."""
         return act.action
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """An action nearer to the last one."""
+        """Moves the action towards the latest one."""
         memory = memory + (1.0 - np.exp(-self.dt / self.time)) * (act.action - memory)
         return memory, dataclasses.replace(act, action=memory)
 
     def describe(self) -> Description:
-        """The time constant and the step [s]."""
+        """Gives the time constant and the step [s]."""
         return {"type": "low_pass", "time": self.time, "dt": self.dt}
 
 
 def decimals(values: np.ndarray) -> list[float]:
-    """Single-precision numbers as the shortest decimals that stand for them: 0.05, not 0.05000000074505806."""
+    """Writes single-precision numbers as their shortest decimals: 0.05, not 0.05000000074505806."""
     return [float(str(np.float32(value))) for value in values]
 
 
 def opening(at: Any, open: np.ndarray, close: np.ndarray) -> Any:
-    """The action of a ``ContinuousGripper`` that brings fingers nearest to ``at`` [..., joints] [rad or m]."""
+    """Finds the ``ContinuousGripper`` entry that brings the fingers nearest to ``at`` [..., joints] [rad or m]."""
     way = open - close
     return 2.0 * ((at - close) @ way) / (way @ way or 1.0) - 1.0
 
 
 class Chain:
-    """All action terms of a task, in their order.
+    """All action terms of a task, in order.
 
     Args:
-        terms: by name.
+        terms: the terms by name.
         groups: the robot's drives, in the order of ``ctrl``.
 
     Attributes:
         home: the action that keeps the robot at home [na].
-        kinds: of the terms that read it.
+        kinds: class names of the terms that read the action.
 
     Raises:
         UserError: no term reads the action.
@@ -460,10 +465,10 @@ class Chain:
         self.kinds = [type(term).__name__ for term in self.terms.values() if len(term.home)]
 
     def init(self, key: Key, joint_pos: Float[Array, " nj"], action: Float[Array, " na"] | None = None) -> dict[str, Memory]:
-        """What the terms remember at the start, by their dotted names in the task; those that remember nothing are left out.
+        """Collects what the terms remember at the start, by their dotted names in the task. Terms without memory are left out.
 
         Args:
-            action: as it has been till then; None: home's.
+            action: the action that was in force until now. None: the home action.
         """
         act = self._act(jnp.asarray(self.home) if action is None else action, joint_pos, joint_pos)
         memory = {f"actions.{n}": term.init(jax.random.fold_in(key, i), act) for i, (n, term) in enumerate(self.terms.items())}
@@ -472,7 +477,7 @@ class Chain:
     def step(
         self, memory: Mapping[str, Memory], action: Float[Array, " na"], joint_pos: Float[Array, " nj"], ctrl: Float[Array, " nu"]
     ) -> tuple[dict[str, Memory], Float[Array, " nu"]]:
-        """The drives' targets for an action; of the episode's memory, what is the terms' changes."""
+        """Turns an action into the drives' targets, and updates the terms' part of the episode's memory."""
         act, after = dataclasses.replace(self._act(action, joint_pos, ctrl), level=memory.get(LEVEL)), dict(memory)
         for i, (name, term) in enumerate(self.terms.items()):
             own = jnp.split(act.action, self._splits)[i]
@@ -482,10 +487,10 @@ class Chain:
         return after, jnp.concatenate(list(act.targets.values()))
 
     def describe(self) -> list[Description]:
-        """How the action becomes position targets of the drives, as JSON: see ``docs/guides/deploy_onnx.md``.
+        """Describes as JSON how an action becomes position targets: see ``docs/guides/deploy_onnx.md``.
 
         Raises:
-            UserError: a term that only this package knows.
+            UserError: a term does not describe itself.
         """
         out = []
         for name, term in self.terms.items():
@@ -493,21 +498,21 @@ class Chain:
             if what is None:
                 kind = type(term).__name__
                 raise UserError(f"the action term {name} ({kind}) does not describe itself, so only this package knows it")
-            if what.get("joints", True):  # a gripper's term of a robot without one does nothing
+            if what.get("joints", True):  # a gripper term does nothing on a robot without a gripper
                 out.append({"name": name, **what})
         return out
 
     def bounds(self) -> Bounds:
-        """The actions that take each joint to its limits; beyond them nothing more happens."""
+        """Returns the actions that take each joint to its limits; beyond them nothing more happens."""
         low, high = zip(*(term.bounds() for term in self.terms.values()), strict=True)
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 
     def invert(self, targets: Float[Array, "... nu"], joint_pos: Float[Array, "... nu"]) -> Float[Array, "... na"]:
-        """The action that gives position targets of the drives, or comes nearest: so a controller acts where a policy would.
+        """Finds the action whose targets come nearest to those given, so that a controller can act in a policy's place.
 
         Args:
-            targets: [rad or m].
-            joint_pos: where the joints are [rad or m].
+            targets: position targets of the drives [rad or m].
+            joint_pos: current joint positions [rad or m].
         """
         delays: list[Any] = [term for term in self.terms.values() if isinstance(term, Delay)]
         late = sum(term.steps[1] for term in delays)

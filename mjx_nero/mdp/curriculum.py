@@ -1,6 +1,8 @@
-"""Curriculum: (step count, level, weight, *, params) -> weight of a reward term; and what makes an environment's episodes harder.
+"""Curriculum terms: (step count, level, weight, *, params) -> weight of a reward term. Also what makes episodes harder as
+training goes on.
 
-A level is what share of all that makes them harder an episode has (``types.LEVEL``); None, outside of training: all of it.
+A level is the share of all episode-to-episode differences that an episode gets (``types.LEVEL``). None, outside of training: all
+of them.
 """
 
 import dataclasses
@@ -17,25 +19,29 @@ Level = Float[Array, ""] | None
 
 
 def step_weight(count: Int[Array, ""], level: Level, weight: float, *, to: float, num_steps: int) -> Float[Array, ""]:
-    """Changes the weight at once after ``num_steps`` control steps of every environment. Isaac Lab's ``modify_reward_weight``."""
+    """Changes the weight at once, after ``num_steps`` control steps of every environment. Isaac Lab's
+    ``modify_reward_weight``."""
     return jnp.where(count > num_steps, to, weight)
 
 
 def level_weight(count: Int[Array, ""], level: Level, weight: float, *, start: float) -> Float[Array, ""]:
-    """From ``start`` at level 0 to the weight itself at level 1: what would keep a beginner from trying counts as it succeeds."""
+    """Moves the weight from ``start`` at level 0 to its full value at level 1.
+
+    Costs that would keep a beginner from trying come in as it succeeds.
+    """
     return jnp.asarray(toward(level, start, weight))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BySuccess:
-    """What share of all that differs from episode to episode an environment has: more after a success, less after a failure.
+    """Adapts an environment's level: up after a success, down after a failure.
 
-    Where ``up`` times the success rate is ``down`` times the failures', it stays.
+    The level is steady where ``up`` times the success rate equals ``down`` times the failure rate.
 
     Attributes:
-        start: of the first episode.
-        up: after a success.
-        down: after a failure.
+        start: level of the first episode.
+        up: step after a success.
+        down: step after a failure.
     """
 
     start: Share = 0.0
@@ -43,27 +49,27 @@ class BySuccess:
     down: Share = 0.02
 
     def step(self, level: Float[Array, ""], success: Float[Array, ""]) -> Float[Array, ""]:
-        """The next episode's level; ``success`` is 1 or 0."""
+        """Returns the next episode's level; ``success`` is 1 or 0."""
         return jnp.clip(level + jnp.where(success > 0, self.up, -self.down), 0.0, 1.0)
 
 
-_UNSOLVED = 0.05  # of every phase's weight: the most that a rate of success adds to it is a quarter
+_UNSOLVED = 0.05  # floor of every phase's weight; p (1 - p) adds at most a quarter
 
 
 def chances(last: Int[Array, " n"], won: Float[Array, " n"], share: Float[Array, ""], phases: int) -> Float[Array, " k"]:
-    """How likely the next episodes begin as usual, and in each of an expert's ``phases``.
+    """Computes the probability that the next episode starts as usual, or in each of an expert's ``phases``.
 
-    Of the environments whose last episode began in phase k, p_k have succeeded (phase 0: the usual start). Then
+    Let p_k be the success rate of the environments whose last episode began in phase k (phase 0: the usual start). Then
 
         chance_k = share * max(0, 1 - 2 p_0) * w_k / sum(w),  w_k = p_k (1 - p_k) + 0.05
 
-    So most begin where the policy succeeds now and then, which moves back from the end to the beginning of the task as it learns;
-    none do from when half of the usual starts succeed.
+    Most expert starts are thus where the policy succeeds now and then. As it learns, they move back from the end of the task to
+    its beginning. They stop once half of the usual starts succeed.
 
     Args:
-        last: the phase in which each environment's last episode began; -1: none has ended.
-        won: 1 where that succeeded, else 0.
-        share: of all episodes, at most.
+        last: the phase in which each environment's last episode began; -1 if none has ended.
+        won: 1 where that episode succeeded, else 0.
+        share: greatest share of expert starts.
     """
     began = last[:, None] == jnp.arange(phases + 1)
     rate = jnp.sum(began * won[:, None], axis=0) / jnp.maximum(jnp.sum(began, axis=0), 1)
@@ -73,7 +79,7 @@ def chances(last: Int[Array, " n"], won: Float[Array, " n"], share: Float[Array,
 
 
 def toward(level: Level, plain: Tree, drawn: Tree) -> Tree:
-    """From what is plain to what was drawn, as far as the level; None: all the way. Integers are the drawn ones."""
+    """Blends from ``plain`` to ``drawn`` by the level; None: fully drawn. Integers are always the drawn ones."""
 
     def blend(a, b):
         return a + level * (b - a) if jnp.issubdtype(jnp.result_type(b), jnp.floating) else b

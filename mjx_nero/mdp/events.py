@@ -12,7 +12,7 @@ from mjx_nero.types import Bank, Key, Start, UserError
 
 
 def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Range, object: str = "cube") -> Start:
-    """Puts the object at a uniform ``x`` and ``y`` of the world, ``z`` above where it was [m]."""
+    """Puts the object at a uniform ``x`` and ``y`` in the world, ``z`` above its height in the scene [m]."""
     low, high = jnp.array([x, y, z]).T
     height = start.object_pos_w[object] * jnp.array([0.0, 0.0, 1.0])
     pos = height + jax.random.uniform(key, (3,), minval=low, maxval=high)
@@ -20,14 +20,14 @@ def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Ra
 
 
 def object_apart_from_goal(key: Key, start: Start, *, x: Range, y: Range, apart: NonNegative, object: str = "cube") -> Start:
-    """Puts the object at a uniform ``x`` and ``y`` of the world, at least ``apart`` from the goal along the table [m].
+    """Puts the object at a uniform ``x`` and ``y`` in the world, at least ``apart`` from the goal along the table [m].
 
-    The first of sixteen places that is; the farthest one, should none be.
+    Of sixteen random places, it takes the first that is far enough, or else the farthest.
     """
     low, high = jnp.array([x, y]).T
     places = jax.random.uniform(key, (16, 2), minval=low, maxval=high)
     away = jnp.linalg.norm(places - start.goal_pos_w[:2], axis=1)
-    place = places[jnp.argmax(jnp.minimum(away, apart))]  # the first of those that are far enough, which count alike
+    place = places[jnp.argmax(jnp.minimum(away, apart))]  # the first that is far enough: they tie
     pos = jnp.append(place, start.object_pos_w[object][2])
     return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
 
@@ -44,22 +44,22 @@ def scatter(
     jitter: NonNegative,
     away: tuple[float, float],
 ) -> Start:
-    """Puts some of the objects on the table and chooses the one that is commanded; the others are parked far away.
+    """Puts some of the objects on the table, picks the commanded one, and parks the others far away.
 
-    The commanded one lies anywhere in a box of the world, the others in cells around it, of a grid of which it is the centre; all
-    are turned about the vertical at random. Which come, where, and which is commanded are equally likely for all.
+    The commanded object lies anywhere in a box of the world. The others lie in the eight cells of a grid around it. All are
+    turned about the vertical at random. Every choice of objects, cells and command is equally likely.
 
     Args:
-        objects: up to nine; the index of the commanded one is ``start.target``.
-        count: the least and the most of them that come.
-        x, y: of the commanded one [m].
-        pitch: from one cell to the next [m].
-        jitter: how far from the middle of its cell an object may lie, along x and y [m]: two of them are at least ``pitch - 2
+        objects: up to nine; ``start.target`` is the index of the commanded one.
+        count: least and greatest number of objects on the table.
+        x, y: ranges of the commanded object [m].
+        pitch: distance between neighbouring cells [m].
+        jitter: greatest offset of an object from its cell's middle, along x and y [m]. Two objects are at least ``pitch - 2
             jitter`` apart.
-        away: x and y where the first of the parked objects would lie; the next ones ``pitch`` further along x [m].
+        away: x and y of the first parking place; the next ones lie ``pitch`` further along x [m].
 
     Raises:
-        UserError: there are more objects than cells, or fewer objects than may come.
+        UserError: there are more objects than cells, or fewer objects than ``count`` asks for.
     """
     n = len(objects)
     if not 1 <= count[0] <= count[1] <= n <= 9:
@@ -67,7 +67,7 @@ def scatter(
             f"scatter takes up to 9 objects and a count from 1 to their number, got {n} objects and the count {count}"
         )
     k_rank, k_count, k_at, k_cell, k_jitter, k_turn = jax.random.split(key, 6)
-    rank = jnp.argsort(jax.random.uniform(k_rank, (n,)))  # the first is commanded, the next ones come
+    rank = jnp.argsort(jax.random.uniform(k_rank, (n,)))  # rank 0 is commanded; the next ranks are on the table
     there = rank < jax.random.randint(k_count, (), count[0], count[1] + 1)
     low, high = jnp.array([x, y]).T
     at = jax.random.uniform(k_at, (2,), minval=low, maxval=high)
@@ -86,13 +86,13 @@ def scatter(
 
 
 def objects_apart(key: Key, start: Start, *, objects: tuple[str, ...], x: Range, y: Range, apart: Positive) -> Start:
-    """Puts objects at uniform ``x`` and ``y`` of the world, at least ``apart`` from one another along the longer of the two [m].
+    """Puts objects at uniform ``x`` and ``y`` in the world, at least ``apart`` from one another along the longer side [m].
 
-    Exact and without a second try: uniform points on what is left of that side without the gaps, in order, with the gaps put back
-    in, for the objects in random order.
+    The draw is exact and needs no retry. It shortens that side by the gaps, sorts uniform points on the rest, puts the gaps back,
+    and deals the points to the objects in random order.
 
     Raises:
-        UserError: there is no room for that many.
+        UserError: the objects do not fit.
     """
     sides, n = (x, y), len(objects)
     along = int(y[1] - y[0] > x[1] - x[0])
@@ -121,7 +121,7 @@ def joints_by_scale(key: Key, start: Start, *, low: float, high: float) -> Start
 
 
 def joints_offset_uniform(key: Key, start: Start, *, offset: NonNegative) -> Start:
-    """Moves every joint by a uniform offset of at most ``offset`` [rad or m]; ranges are kept by the caller."""
+    """Moves every joint by a uniform offset of at most ``offset`` [rad or m]. The caller clips to the joint ranges."""
     joint_pos = start.joint_pos
     return dataclasses.replace(
         start, joint_pos=joint_pos + jax.random.uniform(key, joint_pos.shape, minval=-offset, maxval=offset)
@@ -129,17 +129,17 @@ def joints_offset_uniform(key: Key, start: Start, *, offset: NonNegative) -> Sta
 
 
 def joint_turned(key: Key, start: Start, *, joint: int, by: Range) -> Start:
-    """Moves one joint, counted from 0, by a uniform offset [rad or m]; ranges are kept by the caller."""
+    """Moves one joint, counted from 0, by a uniform offset [rad or m]. The caller clips to the joint ranges."""
     offset = jax.random.uniform(key, minval=by[0], maxval=by[1])
     return dataclasses.replace(start, joint_pos=start.joint_pos.at[joint].add(offset))
 
 
 def visited(key: Key, start: Start, *, bank: Bank, chances: Float[Array, " phases"]) -> Start:
-    """Begins where an expert has been, by chance; otherwise the start stays as it is.
+    """Replaces the start by a state that an expert has visited, with the given probabilities.
 
     Args:
-        bank: rows of states.
-        chances: of the usual start, and of each of the expert's phases (``curriculum.chances``).
+        bank: visited states, one a row.
+        chances: probabilities of the usual start and of each of the expert's phases (``curriculum.chances``).
     """
     phases, n = len(chances) - 1, len(bank.arrived)
     which, at = jax.random.uniform(key, (2,))

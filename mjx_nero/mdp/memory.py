@@ -1,4 +1,4 @@
-"""What actions and observations remember: how they were some steps ago. ``init`` and ``step`` as of any term with memory."""
+"""Delays and histories of actions and observations. They have ``init`` and ``step``, as all terms with memory do."""
 
 import dataclasses
 from typing import Any
@@ -13,27 +13,27 @@ from mjx_nero.types import DelayMemory, Key
 
 @dataclasses.dataclass(frozen=True)
 class Delay:
-    """A value as it was some control steps ago; at the start, as it was there.
+    """Returns a value some control steps late; at the start, the first value.
 
     Attributes:
-        steps: the least and the most; drawn uniformly at the start of an episode.
-        hold: the chance that a step keeps the delay of the one before; otherwise it is drawn anew.
+        steps: least and greatest delay, drawn uniformly at the start of an episode.
+        hold: probability that a step keeps the previous delay; otherwise it draws a new one.
     """
 
     steps: Steps
     hold: Share = 1.0
 
     def init(self, key: Key, value: Array) -> DelayMemory:
-        """Before the first value, it has always been ``value``."""
+        """Fills the line with ``value``, and draws the delay."""
         rng, k_lag = jax.random.split(key)
         return DelayMemory(rng, self._lag(k_lag), jnp.broadcast_to(value, (self.steps[1], *value.shape)))
 
     def step(self, memory: DelayMemory, value: Array) -> tuple[DelayMemory, Array]:
-        """Takes a value in, gives an old one out."""
+        """Takes a value in and returns an older one."""
         rng, lag = memory.rng, memory.lag
         if self.hold < 1 and self.steps[0] < self.steps[1]:
             rng, k_now = jax.random.split(rng)
-            kept, anew = jax.random.uniform(k_now, (2,))  # at once, as on a GPU each draw costs some kernels
+            kept, anew = jax.random.uniform(k_now, (2,))  # one draw: on a GPU each draw costs several kernels
             span = self.steps[1] + 1 - self.steps[0]
             lag = jnp.where(kept < self.hold, lag, self.steps[0] + (anew * span).astype(lag.dtype))
         line = jnp.concatenate([value[None], memory.past])
@@ -45,19 +45,19 @@ class Delay:
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """The last values of a vector in one, the newest at the end.
+    """Returns the latest values as one vector, newest last.
 
     Attributes:
-        length: how many.
+        length: number of values.
     """
 
     length: int
 
     def init(self, key: Key, value: Array) -> Any:
-        """Before the first value, it has always been ``value``."""
+        """Fills the line with ``value``."""
         return jnp.broadcast_to(value, (self.length - 1, *value.shape))
 
     def step(self, memory: Array, value: Array) -> tuple[Array, Array]:
-        """Takes a value in, gives all of them out."""
+        """Takes a value in and returns all of them."""
         line = jnp.concatenate([memory, value[None]])
         return line[1:], line.reshape(-1, *value.shape[1:])

@@ -1,4 +1,4 @@
-"""Metrics of an episode: terms with memory, ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, value)``."""
+"""Episode metrics: terms with memory, ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, value)``."""
 
 import dataclasses
 from typing import Any
@@ -15,70 +15,70 @@ from mjx_nero.types import Key, View
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Grasped:
-    """Whether the object has been held (see ``rewards.held``) since the start."""
+    """1 if the object has been held since the start (see ``rewards.held``)."""
 
     minimal_height: Heights
     grasp_radius: Positive
     object: str = "cube"
 
     def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Not yet."""
+        """Starts with False."""
         return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Now, or before."""
+        """Becomes true when the object is held."""
         memory = memory | held(view, **dataclasses.asdict(self))
         return memory, memory
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GraspTime:
-    """When the object was first held (see ``rewards.held``) [s]; 0: not yet."""
+    """Time at which the object was first held (see ``rewards.held``) [s]; 0 if it never was."""
 
     minimal_height: Heights
     grasp_radius: Positive
     object: str = "cube"
 
     def init(self, key: Key, view: View) -> Float[Array, ""]:
-        """Never."""
+        """Starts with infinity, for never."""
         return jnp.array(jnp.inf)
 
     def step(self, memory: Float[Array, ""], view: View) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The first time."""
+        """Keeps the earliest time."""
         memory = jnp.minimum(memory, jnp.where(held(view, **dataclasses.asdict(self)), view.time, jnp.inf))
         return memory, jnp.where(jnp.isfinite(memory), memory, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Touched:
-    """Whether an obstacle has been touched, or the robot has touched itself, since the start (``View.readings``)."""
+    """1 if anything has touched an obstacle, or the robot has touched itself, since the start (``View.readings``)."""
 
     def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Not yet."""
+        """Starts with False."""
         return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Now, or before."""
+        """Becomes true at the first touch."""
         memory = memory | touched(view)
         return memory, memory
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TargetChange:
-    """How far the targets of the arm's drives move in a control step: root mean square since the start [rad or m].
+    """Root mean square change of the arm's drive targets per control step, since the start [rad or m].
 
     Attributes:
-        joints: of the arm, which come first.
+        joints: number of arm joints, which come first.
     """
 
     joints: Count
 
     def init(self, key: Key, view: View) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The targets at the start, and no change."""
+        """Keeps the first targets, with no change yet."""
         return self._read(view), jnp.zeros(())
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, Float[Array, ""]]:
-        """One step more."""
+        """Adds one step."""
         (last, total), now = memory, self._read(view)
         total = total + jnp.mean(jnp.square(now - last))
         return (now, total), jnp.sqrt(total / view.step)
@@ -88,10 +88,10 @@ class TargetChange:
 
 
 class JointAcceleration(TargetChange):
-    """How much the speeds of the arm's joints change: root mean square since the start, of control steps [rad/s^2 or m/s^2]."""
+    """Root mean square acceleration of the arm's joints from one control step to the next, since the start [rad/s^2 or m/s^2]."""
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, Float[Array, ""]]:
-        """One step more."""
+        """Adds one step."""
         memory, change = super().step(memory, view)
         return memory, change * view.step / view.time
 
@@ -100,7 +100,7 @@ class JointAcceleration(TargetChange):
 
 
 def grasping(**held: Any) -> dict[str, MetricTerm]:
-    """Whether and when an object was first held.
+    """Builds the metrics that tell whether and when an object was first held.
 
     Args:
         held: parameters of ``rewards.held``.
@@ -112,6 +112,6 @@ def grasping(**held: Any) -> dict[str, MetricTerm]:
 
 
 def calmness(joints: int) -> dict[str, MetricTerm]:
-    """What says how calm a policy is, of an arm of so many joints."""
+    """Builds the metrics that tell how calmly a policy moves an arm of ``joints`` joints."""
     params = {"joints": joints}
     return {"target_change": MetricTerm(TargetChange, params=params), "joint_acc": MetricTerm(JointAcceleration, params=params)}

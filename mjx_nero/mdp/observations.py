@@ -20,12 +20,12 @@ def joint_pos_rel(view: View) -> Float[Array, " nj"]:
 
 
 def joint_vel_rel(view: View) -> Float[Array, " nj"]:
-    """Joint speeds; home stands still [rad/s, m/s]."""
+    """Joint speeds relative to home, which stands still [rad/s, m/s]."""
     return view.joint_vel
 
 
 def object_position(view: View, *, object: str = "cube") -> Float[Array, "3"]:
-    """Object in the robot's root frame [m]."""
+    """Position of the object in the robot's root frame [m]."""
     return view.objects[object].pos_w - view.root_pos_w
 
 
@@ -40,34 +40,34 @@ def pose_command(view: View) -> Float[Array, "7"]:
 
 
 def last_action(view: View) -> Float[Array, " na"]:
-    """The action that led here (zero after a reset)."""
+    """Previous action; zero after a reset."""
     return view.action
 
 
 def ee_position(view: View) -> Float[Array, "3"]:
-    """Grasp point in the robot's root frame [m]."""
+    """Position of the grasp point in the robot's root frame [m]."""
     return view.ee_pos_w - view.root_pos_w
 
 
 def ee_to_object(view: View, *, object: str = "cube") -> Float[Array, "3"]:
-    """From the grasp point to the object [m]."""
+    """Vector from the grasp point to the object [m]."""
     return view.objects[object].pos_w - view.ee_pos_w
 
 
 def ee_to_objects(view: View, *, objects: tuple[str, ...], limit: Positive) -> Float[Array, " n"]:
-    """From the grasp point to each of the objects, one after another; to what is further away than ``limit``, only so far [m]."""
+    """Vectors from the grasp point to each of the objects, each shortened to ``limit`` at most [m]."""
     ways = jnp.stack([view.objects[name].pos_w - view.ee_pos_w for name in objects])
     far = jnp.linalg.norm(ways, axis=1, keepdims=True)
     return (ways * jnp.minimum(1.0, limit / jnp.maximum(far, 1e-6))).reshape(-1)
 
 
 def object_to_goal(view: View, *, object: str = "cube") -> Float[Array, "3"]:
-    """From the object to the commanded point [m]."""
+    """Vector from the object to the commanded point [m]."""
     return view.goal_pos_w - view.objects[object].pos_w
 
 
 def target_error(view: View) -> Float[Array, " nj"]:
-    """How far the rate-limited position targets are ahead of the joints [rad, m]."""
+    """Lead of the rate-limited position targets over the joints [rad, m]."""
     return view.ctrl - view.joint_pos
 
 
@@ -83,22 +83,22 @@ def object_orientation(view: View, *, object: str = "cube") -> Float[Array, "4"]
 
 
 def object_heading(view: View, *, object: str = "cube") -> Float[Array, "2"]:
-    """Where the object's x axis points, seen from above: its x and y in the world."""
+    """Direction of the object's x axis seen from above: its x and y in the world frame."""
     return math.rotate(view.objects[object].quat_w, jnp.array([1.0, 0.0, 0.0]))[:2]
 
 
 def object_turn_to_goal(view: View, *, fold: Count = 1, object: str = "cube") -> Float[Array, "3"]:
-    """The rotation vector that turns the object to the goal's orientation (see ``success.object_turn``) [rad]."""
+    """Rotation vector that turns the object to the goal's orientation (see ``success.object_turn``) [rad]."""
     return success.object_turn(view, fold=fold, object=object)
 
 
 def ee_to_goal(view: View) -> Float[Array, "3"]:
-    """From the end effector to the goal [m]."""
+    """Vector from the end effector to the goal [m]."""
     return view.goal_pos_w - view.ee_pos_w
 
 
 def ee_turn_to_goal(view: View) -> Float[Array, "3"]:
-    """The rotation vector that turns the end effector to the goal's orientation, in its own frame [rad]."""
+    """Rotation vector that turns the end effector to the goal's orientation, in the end effector's frame [rad]."""
     return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), view.goal_quat_w))
 
 
@@ -108,7 +108,7 @@ def ee_orientation(view: View) -> Float[Array, "4"]:
 
 
 def goal_position(view: View) -> Float[Array, "3"]:
-    """Where the goal is now, in the robot's root frame [m]."""
+    """Current position of the goal in the robot's root frame [m]."""
     return view.goal_pos_w - view.root_pos_w
 
 

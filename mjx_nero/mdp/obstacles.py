@@ -1,5 +1,7 @@
-"""Obstacles: (key, view, *, params) -> boxes by name, drawn once an episode's start and goal are. Those that are not named stay
-where the scene has them, below the table."""
+"""Obstacles: (key, view, *, params) -> boxes by name, drawn after an episode's start and goal.
+
+Boxes that a term does not name stay where the scene parks them, below the table.
+"""
 
 import dataclasses
 
@@ -13,26 +15,26 @@ from mjx_nero.config.bounds import Positive, PositiveRange, Range
 from mjx_nero.types import Key, ObstacleView, UserError, View
 
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
-_PARKED, _SMALL = np.array([0.0, 0.0, -0.5], np.float32), np.full(3, 0.05, np.float32)  # as ``scene.ObstacleCfg`` has it
-_BELOW, _ABOUT = (0.06, 0.1), (-0.03, 0.02)  # [m] of a shelf: its board below the goal, the end's top about the goal's height
-_DEEP = 0.05  # [m] a shelf's board reaches that much farther behind the goal than before it
-Box = tuple[Float[Array, "3"], Float[Array, "3"]]  # centre, and edges along the way, across it and up [m]
+_PARKED, _SMALL = np.array([0.0, 0.0, -0.5], np.float32), np.full(3, 0.05, np.float32)  # the values of ``scene.ObstacleCfg``
+_BELOW, _ABOUT = (0.06, 0.1), (-0.03, 0.02)  # [m] a shelf's board is this far below the goal, its end's top this far above
+_DEEP = 0.05  # [m] a shelf's board reaches this much farther behind the goal than in front of it
+Box = tuple[Float[Array, "3"], Float[Array, "3"]]  # centre; edges along the path, across it and up [m]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Site:
-    """A place on the straight way from start to goal, and the sizes drawn for what is to stand there; lengths in m.
+    """A point on the straight path from start to goal, and the sizes drawn for the obstacle there [m].
 
     Attributes:
-        goal: the end of the way.
-        along, side: horizontal unit vectors, to the goal and to the left of it.
-        at: the point on the way.
-        high: height of the top there.
-        ceiling: the highest that any top may be.
-        thick: along the way.
-        wide: across it.
+        goal: the end of the path.
+        along, side: horizontal unit vectors towards the goal and to its left.
+        at: the point on the path.
+        high: height of the obstacle's top.
+        ceiling: greatest height of any top.
+        thick: size along the path.
+        wide: size across the path.
         board: thickness of a shelf's board.
-        room: what start and goal have to themselves on every side.
+        room: free space around start and goal.
     """
 
     goal: Float[Array, "3"]
@@ -60,26 +62,25 @@ def across(
     room: Positive,
     object: str | None = None,
 ) -> dict[str, ObstacleView]:
-    """One of ``kinds`` between start and goal, turned to face the straight way from one to the other; nothing where these are too
-    close for it.
+    """Draws one of ``kinds`` between start and goal, facing the straight path; nothing if the two are too close.
 
     - ``wall``: a slab that stands on the table,
     - ``bar``: a beam in the air,
-    - ``posts``: two posts that stand side by side, too close to each other to pass between them, or with room for it,
+    - ``posts``: two posts side by side, with or without room to pass between them,
     - ``shelf``: a board below the goal, with an upright end that faces the start.
 
     Args:
-        kinds: drawn from, each as likely.
-        names: of the two boxes that it takes at most.
-        thickness: of all but the shelf's board, whose is the lowest [m].
-        width: across the way [m].
-        above: how far the top is above the straight way there [m].
-        top: the highest that anything may be above the robot's foot [m].
-        room: what start and goal have to themselves on every side [m].
-        object: what goes to the goal; None: the end effector.
+        kinds: kinds to draw from, all equally likely.
+        names: names of the two boxes that make an obstacle.
+        thickness: range of the thickness [m]. A shelf's board takes the least.
+        width: range of the size across the path [m].
+        above: range of the top's height above the path [m].
+        top: greatest height above the robot's foot [m].
+        room: free space around start and goal [m].
+        object: the object that travels to the goal; None: the end effector.
 
     Raises:
-        UserError: there is no such kind.
+        UserError: a kind is unknown.
     """
     if not kinds or set(kinds) - set(KINDS):
         raise UserError(f"obstacles.params.kinds takes some of {', '.join(KINDS)}, got {', '.join(kinds) or 'none'}")
@@ -104,7 +105,7 @@ def across(
 
 
 def _shown(centre: Float[Array, "3"], edges: Float[Array, "3"], facing: Float[Array, "4"], fits: Bool[Array, ""]) -> ObstacleView:
-    """A box where it fits, else one that is not there."""
+    """Shows a box if it fits, and parks it otherwise."""
     there = fits & (centre[2] > 0)
     return ObstacleView(pos_w=jnp.where(there, centre, _PARKED), quat_w=facing, size=jnp.where(there, edges, _SMALL))
 
@@ -131,18 +132,18 @@ def _shelf(site: _Site, keys: Key) -> tuple[Box, Box]:
     return under, _box(site.goal - (site.room + site.thick / 2) * site.along, 0.0, top, site.thick, site.wide)
 
 
-# Kind -> its two boxes, by two keys.
+# Makes a kind's two boxes from two keys.
 _MAKERS = {"wall": _wall, "bar": _bar, "posts": _posts, "shelf": _shelf}
 KINDS = tuple(_MAKERS)
 
 
 def _box(centre: Float[Array, "3"], low, up, *edges) -> Box:
-    """From the height ``low`` to ``up``, with horizontal edges along the way and across it."""
+    """Makes a box from the height ``low`` to ``up``, with horizontal edges along the path and across it."""
     return jnp.append(centre[:2], (low + up) / 2), jnp.stack([*edges, up - low])
 
 
 def _parked() -> Box:
-    """A box that is not there."""
+    """Makes a parked box."""
     return jnp.asarray(_PARKED), jnp.asarray(_SMALL)
 
 

@@ -1,4 +1,5 @@
-"""Pushes: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, velocity)``, what is added to an object's [m/s]."""
+"""Pushes: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, velocity)``, the velocity to add to an object's
+[m/s]."""
 
 import dataclasses
 
@@ -12,12 +13,12 @@ from mjx_nero.types import Key, View
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Push:
-    """Every now and then an object suddenly moves.
+    """Gives an object a sudden velocity at random intervals.
 
     Attributes:
-        object: its name.
-        speed: that it gets along each axis, at most [m/s].
-        interval: from one push to the next [s].
+        object: the object's name.
+        speed: greatest added speed along each axis [m/s].
+        interval: range of the time between pushes [s].
     """
 
     object: str = "cube"
@@ -25,12 +26,12 @@ class Push:
     interval: PositiveRange
 
     def init(self, key: Key, view: View) -> tuple[Key, Float[Array, ""]]:
-        """When the first one comes."""
+        """Draws the time of the first push."""
         key, k_wait = jax.random.split(key)
         return key, self._wait(jax.random.uniform(k_wait))
 
     def step(self, memory: tuple[Key, Float[Array, ""]], view: View) -> tuple[tuple, Float[Array, "3"]]:
-        """Zero between pushes."""
+        """Returns the velocity to add, zero between pushes."""
         key, due = memory
         key, k_now = jax.random.split(key)
         drawn, now = jax.random.uniform(k_now, (4,)), view.time >= due

@@ -1,7 +1,7 @@
-"""Domain randomization: (key, model, *, params) -> {field: (rows, values)}, applied in order at every reset.
+"""Domain randomization terms: (key, model, *, params) -> {field: (rows, values)}, applied in order at every reset.
 
-Fields are MuJoCo's (``mjModel``), their values as those of the model or of the term before. Which rows a term draws must not
-depend on the key. Constants that follow from masses (inverse weights, masses of subtrees) follow by themselves.
+Fields are MuJoCo's (``mjModel``); their values are the model's, or those of the term before. The rows that a term draws must not
+depend on the key. Constants derived from masses (inverse weights, subtree masses) are recomputed.
 """
 
 import dataclasses
@@ -20,21 +20,21 @@ Drawn = dict[str, tuple[np.ndarray, Array]]
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """What a term reads of the compiled model.
+    """The parts of the compiled model that terms read.
 
     Attributes:
-        fields: arrays by MuJoCo's names; rows are bodies, geoms, degrees of freedom or actuators.
-        index: row by name, of each kind: ``body``, ``geom``, ``dof`` (by its joint) and ``actuator``.
+        fields: arrays by MuJoCo's names. Rows are bodies, geoms, degrees of freedom or actuators.
+        index: row numbers by name, for each kind: ``body``, ``geom``, ``dof`` (by its joint) and ``actuator``.
     """
 
     fields: Mapping[str, Array]
     index: Mapping[str, Mapping[str, int]]
 
     def rows(self, kind: str, names: Sequence[str]) -> np.ndarray:
-        """The rows of some names.
+        """Looks up the rows of names.
 
         Raises:
-            UserError: the model has no such name.
+            UserError: the model lacks one of the names.
         """
         known = self.index[kind]
         if unknown := [name for name in names if name not in known]:
@@ -43,7 +43,7 @@ class Model:
 
 
 def mass(key: Key, model: Model, *, bodies: tuple[str, ...], scale: PositiveRange) -> Drawn:
-    """Multiplies masses, and inertias with them, by a uniform factor a body."""
+    """Scales masses, with their inertias, by one uniform factor per body."""
     rows = model.rows("body", bodies)
     (factor,) = _uniform(key, len(rows), scale)
     inertia = model.fields["body_inertia"][rows] * factor[:, None]
@@ -59,9 +59,9 @@ def friction(
     spin: PositiveRange | None = None,
     roll: PositiveRange | None = None,
 ) -> Drawn:
-    """Friction coefficients, for each geom its own: sliding uniform, spinning and rolling [m] log-uniform; None: as they are.
+    """Draws friction coefficients per geom: sliding uniform, spinning and rolling [m] log-uniform. None keeps the model's.
 
-    Where two geoms meet, the one of higher priority counts, else the larger coefficient.
+    Where two geoms meet, the geom of higher priority decides; at equal priority, the larger coefficient does.
     """
     rows, values = model.rows("geom", geoms), model.fields["geom_friction"]
     columns = list(_uniform(key, len(rows), slide, np.log(spin or (1.0, 1.0)), np.log(roll or (1.0, 1.0))))
@@ -79,7 +79,7 @@ def gains(
     damping: PositiveRange = (1.0, 1.0),
     effort: PositiveRange = (1.0, 1.0),
 ) -> Drawn:
-    """Multiplies stiffness, damping and effort of position drives by uniform factors, for each drive its own."""
+    """Scales stiffness, damping and effort of position drives by uniform factors per drive."""
     rows = model.rows("actuator", actuators)
     kp, kd, force = _uniform(key, len(rows), stiffness, damping, effort)
     factors = jnp.stack([jnp.ones_like(kp), kp, kd], axis=1)
@@ -102,11 +102,11 @@ def joints(
     damping: PositiveRange = (1.0, 1.0),
     friction: NonNegativeRange = (0.0, 0.0),
 ) -> Drawn:
-    """Multiplies armature and damping of hinges and slides by uniform factors, for each joint its own.
+    """Scales armature and damping of hinges and slides by uniform factors per joint.
 
     Args:
-        armature, damping: factors.
-        friction: dry friction (MuJoCo's ``frictionloss``) as a share of the effort of the joint's drive; (0, 0): as it is.
+        armature, damping: ranges of the factors.
+        friction: dry friction (MuJoCo's ``frictionloss``) as a share of the drive's effort. (0, 0) keeps the model's.
     """
     rows = model.rows("dof", joints)
     *factors, dry = _uniform(key, len(rows), armature, damping, friction)
@@ -119,15 +119,15 @@ def joints(
 
 
 def center_of_mass(key: Key, model: Model, *, bodies: tuple[str, ...], offset: NonNegative) -> Drawn:
-    """Moves centres of mass by up to ``offset`` along each axis of the body [m]."""
+    """Moves centres of mass by up to ``offset`` along each body axis [m]."""
     rows = model.rows("body", bodies)
     moved = jax.random.uniform(key, (len(rows), 3), minval=-offset, maxval=offset)
     return {"body_ipos": (rows, model.fields["body_ipos"][rows] + moved)}
 
 
 def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) -> Drawn:
-    """Multiplies an object's lengths by one uniform factor; its mass stays, its inertia follows."""
-    sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # a can has one
+    """Scales an object's lengths by one uniform factor. Its mass stays; its inertia follows."""
+    sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # only a can has one
     geoms, body = model.rows("geom", (object, *sides)), model.rows("body", (object,))
     fields, ((factor,),) = model.fields, _uniform(key, 1, scale)
     return {
@@ -138,24 +138,26 @@ def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) 
 
 
 def color(key: Key, model: Model, *, geoms: tuple[str, ...]) -> Drawn:
-    """A colour for each geom, any but green, which is the goal's; for pictures."""
+    """Draws a colour for each geom, for pictures. It is never green, the goal's colour."""
     rows = model.rows("geom", geoms)
-    hue = jax.random.uniform(key, (len(rows), 1), minval=0.55, maxval=1.12)  # of a turn: from blue by red to orange
-    # Each channel is at its full value within a sixth of a turn of its own hue, and at its least beyond a third.
+    hue = jax.random.uniform(key, (len(rows), 1), minval=0.55, maxval=1.12)  # [turns] from blue through red to orange
+    # A channel is full within a sixth of a turn of its own hue, and least beyond a third.
     far = jnp.abs(jnp.mod(hue - jnp.array([0.0, 1.0, 2.0]) / 3 + 0.5, 1.0) - 0.5)
     rgb = 0.2 + 0.65 * jnp.clip(2.0 - 6.0 * far, 0.0, 1.0)
     return {"geom_rgba": (rows, jnp.concatenate([rgb, jnp.ones_like(hue)], axis=1))}
 
 
 def gravity_compensation(key: Key, model: Model, *, bodies: tuple[str, ...], scale: NonNegativeRange) -> Drawn:
-    """Multiplies the shares of the bodies' weights that the drives carry by uniform factors, for each body its own."""
+    """Scales the share of each body's weight that the drives carry, by uniform factors per body."""
     rows = model.rows("body", bodies)
     return {"body_gravcomp": (rows, model.fields["body_gravcomp"][rows] * _uniform(key, len(rows), scale)[0])}
 
 
 def encoder_bias(key: Key, model: Model, *, actuators: tuple[str, ...], bias: NonNegative) -> Drawn:
-    """Encoders read up to ``bias`` beside the joints' positions [rad or m]: the drives pull the readings, not the joints, to the
-    targets. ``View.encoder_bias`` is what was drawn, ``sensors.Encoders`` what observations make of it. Comes after ``gains``."""
+    """Makes encoders read up to ``bias`` off the joints' positions [rad or m], so that drives pull the readings to the targets.
+
+    ``View.encoder_bias`` holds the draw, and ``sensors.Encoders`` adds it to observations. List this term after ``gains``.
+    """
     rows = model.rows("actuator", actuators)
     drawn = jax.random.uniform(key, (len(rows),), minval=-bias, maxval=bias)
     stiffness, terms = model.fields["actuator_gainprm"][rows, 0], model.fields["actuator_biasprm"][rows]
@@ -172,13 +174,13 @@ def drives(
     armature: tuple[PositiveRange, ...],
     friction: tuple[NonNegativeRange, ...],
 ) -> Drawn:
-    """Parameters of position drives and their joints themselves, uniform, a range a joint: what ``identify`` writes.
+    """Draws the parameters of position drives and joints, uniformly, one range per joint: what ``identify`` writes.
 
     Args:
-        stiffness: [N m/rad or N/m].
-        damping: [N m s/rad or N s/m], of drive and joint together.
-        armature: [kg m2 or kg].
-        friction: dry friction [N m or N].
+        stiffness: ranges [N m/rad or N/m].
+        damping: ranges for drive and joint together [N m s/rad or N s/m].
+        armature: ranges [kg m2 or kg].
+        friction: ranges of dry friction [N m or N].
     """
     actuators, dofs = model.rows("actuator", joints), model.rows("dof", joints)
     kp, kd, inertia, dry = _uniform(key, len(joints), *(np.array(part).T for part in (stiffness, damping, armature, friction)))
@@ -193,6 +195,6 @@ def drives(
 
 
 def _uniform(key: Key, n: int, *bounds) -> Float[Array, "parts n"]:
-    """``n`` numbers for each of the bounds: at once, as on a GPU each draw costs some kernels."""
+    """Draws ``n`` numbers for each pair of bounds, all in one draw: on a GPU each draw costs several kernels."""
     low, high = (np.stack([np.broadcast_to(b[end], n) for b in bounds]).astype(np.float32) for end in (0, 1))
     return jax.random.uniform(key, (len(bounds), n), minval=low, maxval=high)

@@ -1,4 +1,4 @@
-"""Reward terms: (View, *, params) -> scalar. Unsigned and unscaled: sign and weight stand in the task's config."""
+"""Reward terms: (View, *, params) -> scalar. Terms are unsigned and unscaled; the task's config sets sign and weight."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -16,27 +16,27 @@ def _ee_distance(view: View, object: str) -> Float[Array, ""]:
 
 
 def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
-    """The object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
+    """True if the object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
-    A cube that was knocked into the air is up, too; only a gripped one stays at the grasp point. Several heights are those of
-    ``CommandTerm.targets``, for the object that the episode commands.
+    A cube that was knocked into the air is above the height too, but only a gripped one stays at the grasp point. A tuple gives
+    one height per object of ``CommandTerm.targets``; the commanded object's counts.
     """
     height = jnp.array(minimal_height)[view.target] if isinstance(minimal_height, tuple) else minimal_height
     return (view.objects[object].pos_w[2] > height) & (_ee_distance(view, object) < grasp_radius)
 
 
 def object_ee_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:
-    """1 - tanh(d / std), d the distance from the grasp point to the object [m]. Isaac Lab's lift task."""
+    """1 - tanh(d / std), where d is the distance from the grasp point to the object [m]. Isaac Lab's lift task."""
     return 1.0 - jnp.tanh(_ee_distance(view, object) / std)
 
 
 def behind_object_distance(
     view: View, *, std: Positive, behind: Positive, near: Positive = 0.02, object: str = "cube"
 ) -> Float[Array, ""]:
-    """1 - tanh(d / std), d the distance from the grasp point to where the object is pushed from [m].
+    """1 - tanh(d / std), where d is the distance from the grasp point to the spot to push the object from [m].
 
-    That is ``behind`` its centre as seen from the goal, along the table; less from about ``near`` the goal on, where it is the
-    centre itself [m].
+    The spot lies ``behind`` the object's centre [m], opposite the goal, along the table. Within about ``near`` of the goal [m] it
+    moves in to the centre itself.
     """
     seen = view.objects[object].pos_w
     way = (view.goal_pos_w - seen).at[2].set(0.0)
@@ -50,17 +50,17 @@ def object_is_lifted(view: View, *, minimal_height: float, object: str = "cube")
 
 
 def object_goal_distance(view: View, *, std: Positive, minimal_height: float, object: str = "cube") -> Float[Array, ""]:
-    """1 - tanh(distance to the commanded point / std), while lifted. Isaac Lab's lift task."""
+    """1 - tanh(d / std) while lifted, where d is the distance from the object to the goal [m]. Isaac Lab's lift task."""
     return object_is_lifted(view, minimal_height=minimal_height, object=object) * goal_distance(view, std=std, object=object)
 
 
 def goal_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:
-    """1 - tanh(distance of the object to the goal / std)."""
+    """1 - tanh(d / std), where d is the distance from the object to the goal [m]."""
     return 1.0 - jnp.tanh(success.object_distance(view, object=object) / std)
 
 
 def ee_goal_distance(view: View, *, std: Positive) -> Float[Array, ""]:
-    """1 - tanh(distance of the end effector to the goal / std)."""
+    """1 - tanh(d / std), where d is the distance from the end effector to the goal [m]."""
     return 1.0 - jnp.tanh(success.ee_distance(view) / std)
 
 
@@ -75,22 +75,22 @@ def ee_orientation_error(view: View) -> Float[Array, ""]:
 
 
 def ee_goal_pose(view: View, *, std: Positive, angle_std: Positive) -> Float[Array, ""]:
-    """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), from the end effector to the goal.
+    """(1 - tanh(distance / std)) * (1 - tanh(angle / angle_std)), from the end effector to the goal.
 
-    As a sum, a turn that is right in the wrong place would hold the arm there.
+    A sum would let the arm settle in the wrong place with the right orientation.
     """
     return ee_goal_distance(view, std=std) * (1.0 - jnp.tanh(success.ee_angle(view) / angle_std))
 
 
 def object_is_held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Float[Array, ""]:
-    """1 while the object is held (see ``held``)."""
+    """1 while the object is held (see ``held``), else 0."""
     return held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object).astype(jnp.float32)
 
 
 def held_goal_distance(
     view: View, *, std: Positive, minimal_height: Heights, grasp_radius: Positive, object: str = "cube"
 ) -> Float[Array, ""]:
-    """1 - tanh(distance to the commanded point / std), while held."""
+    """1 - tanh(d / std) while held, where d is the distance from the object to the goal [m]."""
     gate = object_is_held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)
     return gate * (1.0 - jnp.tanh(success.object_distance(view, object=object) / std))
 
@@ -98,7 +98,7 @@ def held_goal_distance(
 def held_at_goal(
     view: View, *, threshold: Positive, minimal_height: Heights, grasp_radius: Positive, object: str = "cube"
 ) -> Float[Array, ""]:
-    """1 while the object is held within ``threshold`` [m] of the commanded point."""
+    """1 while the object is held within ``threshold`` [m] of the goal."""
     gate = held(view, minimal_height=minimal_height, grasp_radius=grasp_radius, object=object)
     return (gate & success.object_at_goal(view, threshold=threshold, object=object)).astype(jnp.float32)
 
@@ -106,44 +106,45 @@ def held_at_goal(
 def object_goal_pose(
     view: View, *, std: Positive, angle_std: Positive, fold: Count = 1, object: str = "cube"
 ) -> Float[Array, ""]:
-    """Product of 1 - tanh(distance / std) and 1 - tanh(angle / angle_std), object to goal (see ``success.object_turn``)."""
+    """(1 - tanh(distance / std)) * (1 - tanh(angle / angle_std)), from the object to the goal (see ``success.object_turn``)."""
     angle = jnp.linalg.norm(success.object_turn(view, fold=fold, object=object))
     return goal_distance(view, std=std, object=object) * (1.0 - jnp.tanh(angle / angle_std))
 
 
 def object_goal_turn(view: View, *, std: Positive, fold: Count = 1, object: str = "cube") -> Float[Array, ""]:
-    """1 - tanh(angle / std), object to goal [rad] (see ``success.object_turn``), wherever the object is."""
+    """1 - tanh(angle / std), from the object's orientation to the goal's [rad], wherever the object is (see
+    ``success.object_turn``)."""
     return 1.0 - jnp.tanh(jnp.linalg.norm(success.object_turn(view, fold=fold, object=object)) / std)
 
 
 def object_at_pose(
     view: View, *, threshold: Positive, angle: Positive, fold: Count = 1, object: str = "cube"
 ) -> Float[Array, ""]:
-    """1 while the object is within ``threshold`` [m] and ``angle`` [rad] of the goal (``success.object_turn``)."""
+    """1 while the object is within ``threshold`` [m] and ``angle`` [rad] of the goal (see ``success.object_turn``)."""
     return success.object_at_pose(view, threshold=threshold, angle=angle, fold=fold, object=object).astype(jnp.float32)
 
 
 def action_rate_l2(view: View) -> Float[Array, ""]:
-    """Squared change of the action since the last step."""
+    """Squared change of the action since the previous step."""
     return jnp.sum(jnp.square(view.action - view.last_action))
 
 
 def gripper_action_l2(view: View) -> Float[Array, ""]:
-    """Squared action of the gripper, the last one: of a binary one only the sign acts."""
+    """Squared gripper action, the last entry. Only the sign of a binary gripper's action matters, so its size is wasted."""
     return jnp.square(view.action[-1])
 
 
 def joint_vel_l2(view: View) -> Float[Array, ""]:
-    """Squared joint speeds, all joints of the robot [rad^2/s^2, m^2/s^2]."""
+    """Squared joint speeds, summed over all joints of the robot [rad^2/s^2, m^2/s^2]."""
     return jnp.sum(jnp.square(view.joint_vel))
 
 
 def touching(view: View) -> Float[Array, ""]:
-    """1 while an obstacle is touched, or the robot touches itself."""
+    """1 while the robot or its object touches an obstacle, or the robot touches itself."""
     return success.touched(view).astype(jnp.float32)
 
 
 def obstacle_nearness(view: View, *, margin: Positive) -> Float[Array, ""]:
-    """How far the end effector has come into the ``margin`` [m] about an obstacle: 0 at its edge, 1 at the obstacle's surface."""
+    """Depth of the end effector in the ``margin`` [m] around an obstacle: 0 at its edge, 1 at the obstacle's surface."""
     far = [math.box_distance(view.ee_pos_w, box.pos_w, box.quat_w, box.size) for box in view.obstacles.values()]
     return jnp.clip(1.0 - jnp.min(jnp.stack(far)) / margin, 0.0, 1.0)

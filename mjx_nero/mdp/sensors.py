@@ -1,7 +1,8 @@
-"""Sensors: between what is and what a policy sees, ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, view)``.
+"""Sensors stand between the true state and the policy: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory,
+view)``.
 
-One after another, as a task lists them; all terms of an observation group then see the same wrong world: an object that is seen
-a centimetre to the left is as much farther from the gripper as it is nearer to the goal.
+They apply in the task's order, before the observation terms, so all terms of a group see the same wrong world. An object seen a
+centimetre too far left is that much farther from the gripper and that much nearer to the goal.
 """
 
 import dataclasses
@@ -18,14 +19,14 @@ from mjx_nero.types import Key, View
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Encoders:
-    """Joint positions as the encoders read them, where ``randomization.encoder_bias`` puts these off."""
+    """Joint encoders, which read positions off by the bias of ``randomization.encoder_bias``."""
 
     def init(self, key: Key, view: View) -> tuple[()]:
-        """Nothing: the bias is the physics'."""
+        """Returns an empty memory: the physics holds the bias."""
         return ()
 
     def step(self, memory: tuple[()], view: View) -> tuple[tuple[()], View]:
-        """The readings in place of the positions."""
+        """Replaces the positions by the readings."""
         if view.encoder_bias is None:
             return memory, view
         return memory, dataclasses.replace(view, joint_pos=view.joint_pos + view.encoder_bias)
@@ -33,14 +34,14 @@ class Encoders:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectPosition:
-    """Where a camera sees an object: off by a constant of the episode, by noise, and late.
+    """A camera's estimate of an object's position: off by a constant per episode, noisy, and late.
 
     Attributes:
-        object: its name.
-        offset: along each axis, at most, the same for an episode [m].
-        noise: along each axis, at most, drawn in every step [m].
-        delay: by how many control steps it is late, the least and the most.
-        hold: the chance that a step keeps the delay of the one before.
+        object: the object's name.
+        offset: greatest constant offset along each axis [m].
+        noise: greatest noise along each axis, drawn at every step [m].
+        delay: least and greatest delay [control steps].
+        hold: probability that a step keeps the previous step's delay.
     """
 
     object: str = "cube"
@@ -50,13 +51,13 @@ class ObjectPosition:
     hold: Share = 1.0
 
     def init(self, key: Key, view: View) -> tuple:
-        """The episode's offset, and where the object has always been."""
+        """Draws the episode's offset, and fills the delay with the first position."""
         key, k_offset, k_delay = jax.random.split(key, 3)
         offset = jax.random.uniform(k_offset, (3,), minval=-self.offset, maxval=self.offset)
         return key, offset, self._line.init(k_delay, view.objects[self.object].pos_w) if self._late else ()
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """The view with the object elsewhere."""
+        """Moves the object in the view."""
         key, offset, line = memory
         key, k_noise = jax.random.split(key)
         seen = view.objects[self.object]
@@ -78,27 +79,27 @@ class ObjectPosition:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BasePose:
-    """The robot stands beside where it was calibrated to stand: all objects are seen moved by one rigid motion about its base.
+    """A wrongly calibrated base: all objects are seen moved by one rigid motion about it.
 
-    That is what a base elsewhere comes to for an arm that knows the world by cameras alone, as long as the base stands upright;
-    the commanded point is the robot's own.
+    For an arm that knows the world through cameras alone, this equals a displaced base, as long as the base stands upright. The
+    commanded point stays, as it is given in the robot's own frame.
 
     Attributes:
-        offset: along each axis, at most [m].
-        turn: about the vertical axis, at most [rad].
+        offset: greatest offset along each axis [m].
+        turn: greatest turn about the vertical axis [rad].
     """
 
     offset: NonNegative = 0.0
     turn: NonNegative = 0.0
 
     def init(self, key: Key, view: View) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """The episode's motion."""
+        """Draws the episode's motion."""
         k_offset, k_turn = jax.random.split(key)
         offset = jax.random.uniform(k_offset, (3,), minval=-self.offset, maxval=self.offset)
         return offset, jax.random.uniform(k_turn, (), minval=-self.turn, maxval=self.turn)
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """The view with the objects elsewhere."""
+        """Moves the objects in the view."""
         offset, turn = memory
         quat = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
 

@@ -8,19 +8,22 @@ from mjx_nero.types import View
 
 
 def time_out(view: View) -> Bool[Array, ""]:
-    """The episode has run its length."""
+    """True once the episode has run its length."""
     return view.step >= view.max_steps
 
 
 def object_below(view: View, *, minimum_height: float, object: str = "cube") -> Bool[Array, ""]:
-    """The object's centre is below ``minimum_height`` [m]. Isaac Lab's ``root_height_below_minimum``."""
+    """True if the object's centre is below ``minimum_height`` [m]. Isaac Lab's ``root_height_below_minimum``."""
     return view.objects[object].pos_w[2] < minimum_height
 
 
 def object_off_table(
     view: View, *, center: tuple[float, float], size: tuple[Positive, Positive], object: str = "cube"
 ) -> Bool[Array, ""]:
-    """The object's centre has left the table top, where it would fall (the plane that carries it has no edge) [m]."""
+    """True if the object's centre is beyond the table top's edge [m].
+
+    The supporting plane has no edge, so the object does not fall.
+    """
     offset = jnp.abs(view.objects[object].pos_w[:2] - jnp.asarray(center))
     return jnp.any(offset > jnp.asarray(size) / 2)
 
@@ -28,7 +31,9 @@ def object_off_table(
 def any_off_table(
     view: View, *, center: tuple[float, float], size: tuple[Positive, Positive], objects: tuple[str, ...], parked: Positive
 ) -> Bool[Array, ""]:
-    """One of the objects has left the table top (see ``object_off_table``); those further than ``parked`` from its centre along x
-    or y have never been on it [m]."""
+    """True if one of the objects has left the table top (see ``object_off_table``).
+
+    Objects farther than ``parked`` from its centre along x or y [m] are ignored: they were never on it.
+    """
     offset = jnp.stack([jnp.abs(view.objects[name].pos_w[:2] - jnp.asarray(center)) for name in objects])
     return jnp.any((offset > jnp.asarray(size) / 2).any(axis=1) & (offset < parked).all(axis=1))

@@ -1,7 +1,7 @@
-"""Term configs and the folds that apply them. A term is a function plus keyword parameters, checked when it is made.
+"""Term configs, and the folds that apply them. A term is a function with keyword parameters, checked when the term is made.
 
-The function is pure, or a class whose objects remember: ``Class(**params)`` has ``init(key, view) -> memory`` and
-``step(memory, view) -> (memory, value)``. What terms remember of an episode is one dict, by their dotted names.
+The function is pure, or it is a class whose objects remember: ``Class(**params)`` has ``init(key, view) -> memory`` and
+``step(memory, view) -> (memory, value)``. One dict, keyed by dotted name, holds what all terms remember of an episode.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from mjx_nero.types import LEVEL, Key, UserError, View
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """A function and its keyword parameters; those that have defaults may be left out.
+    """A function and its keyword parameters; parameters with defaults may be omitted.
 
     Raises:
         UserError: a parameter is missing or unknown; the message lists the valid names.
@@ -47,44 +47,44 @@ class Term:
 
     @property
     def name(self) -> str:
-        """Of the function."""
+        """The function's name."""
         return bounds.unwrapped(self.func).__name__
 
     @property
     def remembers(self) -> bool:
-        """Whether it is a class whose objects have a memory."""
+        """True if the function is a class whose objects have a memory."""
         return hasattr(bounds.unwrapped(self.func), "step")
 
     @functools.cached_property
     def made(self) -> Any:
-        """Of a term that remembers."""
+        """The object of a term that remembers."""
         return self.func(**self.params)
 
     def __call__(self, *args: Any) -> Any:
-        """The function with its parameters."""
+        """Calls the function with its parameters."""
         return self.func(*args, **self.params)
 
     def hints(self) -> dict[str, Any]:
-        """What ``bounds.check`` asks for: the parameters' annotations."""
+        """The annotations of the parameters, for ``bounds.check``."""
         return {"params": bounds.parameter_hints(self.func)}
 
 
 @dataclasses.dataclass(frozen=True)
 class RewardTerm(Term):
-    """``weight * func(view)`` per second of simulated time."""
+    """A term worth ``weight * func(view)`` per second of simulated time."""
 
-    weight: float = dataclasses.field(kw_only=True)  # times the function, per second of simulated time
+    weight: float = dataclasses.field(kw_only=True)  # multiplies the function, per second of simulated time
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservationTerm(Term):
-    """A part of an observation group.
+    """One part of an observation group.
 
     Attributes:
-        noise: uniform in +-``noise`` while the group's corruption is on.
-        delay: by how many control steps it is late, the least and the most (see ``memory.Delay``).
-        hold: the chance that a step keeps the delay of the one before.
-        history: so many last values in one.
+        noise: half-width of the uniform noise added while the group's corruption is on.
+        delay: least and greatest delay [control steps] (see ``memory.Delay``).
+        hold: probability that a step keeps the previous step's delay.
+        history: number of latest values to stack.
     """
 
     noise: NonNegative = dataclasses.field(default=0.0, kw_only=True)
@@ -94,20 +94,20 @@ class ObservationTerm(Term):
 
     @property
     def lines(self) -> tuple[Delay | History, ...]:
-        """What the value goes through before it is seen."""
+        """The delay and the history that the value passes through before it is seen."""
         delay = (Delay(self.delay, self.hold),) if self.delay != (0, 0) else ()
         return delay + ((History(self.history),) if self.history > 1 else ())
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservationGroup:
-    """Terms that a policy, a critic or another reader gets together, by name.
+    """Named terms that one reader gets together: the policy, the critic or another.
 
     Attributes:
-        terms: by name, in this order.
-        corruption: adds the terms' noise: on to train, off to play.
-        apart: the terms stay apart, a dict of arrays of any shape by name, instead of being concatenated.
-        sensed: the terms read the world through the task's sensors; otherwise they read it as it is.
+        terms: the terms by name, in the order of the vector.
+        corruption: adds the terms' noise. On for training, off for play.
+        apart: keeps the terms as a dict of arrays of any shape, instead of concatenating them.
+        sensed: the terms read the world through the task's sensors. Otherwise they read the true state.
     """
 
     terms: Mapping[str, ObservationTerm]
@@ -120,20 +120,20 @@ class ObservationGroup:
 
 
 def privileged(terms: Mapping[str, ObservationTerm], more: Mapping[str, ObservationTerm] | None = None) -> ObservationGroup:
-    """What a critic may see: the same terms without noise, and ``more``, all of the world as it is."""
+    """Makes a critic's group: the same terms without noise, plus ``more``, all read from the true state."""
     exact = {name: dataclasses.replace(term, noise=0.0) for name, term in terms.items()}
     return ObservationGroup({**exact, **(more or {})}, sensed=False)
 
 
 @dataclasses.dataclass(frozen=True)
 class MetricTerm(Term):
-    """A figure of an episode, and how those of many episodes become one.
+    """One number per episode, and how to combine the numbers of many episodes.
 
     Attributes:
-        at_end: 0 before the last step, so that their sum is the last one.
-        over: what the episodes' figures become: their ``mean``, or the ``rate`` of the episodes in which they are above 0.
-        where: another metric: the mean is that of the episodes in which it is above 0. Empty: of all.
-        figure: what the result is called, with ``_mean`` or ``_rate`` behind; empty: as the metric is.
+        at_end: 0 before the last step, so that the sum over the episode is the final value.
+        over: how episodes combine: their ``mean``, or the ``rate`` of episodes whose number is above 0.
+        where: another metric; the mean covers only episodes where that metric is above 0. Empty: all episodes.
+        figure: name of the result, before the suffix ``_mean`` or ``_rate``. Empty: the metric's own name.
     """
 
     at_end: bool = dataclasses.field(default=True, kw_only=True)
@@ -144,23 +144,23 @@ class MetricTerm(Term):
 
 @dataclasses.dataclass(frozen=True)
 class DoneTerm(Term):
-    """Ends the episode."""
+    """A condition that ends the episode."""
 
-    time_out: bool = dataclasses.field(default=False, kw_only=True)  # a truncation: to the learner no terminal state
+    time_out: bool = dataclasses.field(default=False, kw_only=True)  # truncates: the learner sees no terminal state
 
 
-ONCE = 1e6  # [s], as ``CommandTerm.resample_s``: longer than any episode, so the goal is drawn at the reset alone
+ONCE = 1e6  # [s] for ``CommandTerm.resample_s``: longer than any episode, so the goal is drawn only at the reset
 
 
 @dataclasses.dataclass(frozen=True)
 class CommandTerm(Term):
-    """Draws the goal at every reset, and now and then.
+    """Draws the goal at every reset, and then at a fixed interval.
 
     Attributes:
-        resample_s: time between draws [s].
-        motion: moves the goal from where it was drawn: a path of ``mdp.commands``. None: the goal stays.
-        targets: objects of which every episode commands one. The terms of a view call that one ``target``; an event says which it
-            is (``Start.target``), else it is the first.
+        resample_s: interval between draws [s].
+        motion: a path of ``mdp.commands`` that moves the goal from where it was drawn. None: the goal stays.
+        targets: candidate objects; each episode commands one of them, which terms find as ``target``. An event picks it
+            (``Start.target``); otherwise it is the first.
     """
 
     resample_s: Positive = dataclasses.field(default=5.0, kw_only=True)
@@ -169,30 +169,30 @@ class CommandTerm(Term):
 
 
 class Recall:
-    """Calls the terms of one step: those that remember find their memory here, and leave what it becomes.
+    """Calls the terms of one step, and reads and updates the memory of those that remember.
 
     Attributes:
-        memory: by dotted name.
+        memory: the terms' memory by dotted name.
     """
 
     def __init__(self, memory: Mapping[str, Any]):
         self.memory = dict(memory)
 
     def __call__(self, name: str, term: Term, view: View) -> Any:
-        """The term's value."""
+        """Computes the term's value."""
         return self.through(name, term.made, view) if term.remembers else term(view)
 
     def through(self, name: str, step: Any, value: Any) -> Any:
-        """What anything with a ``step`` and a memory makes of a value."""
+        """Passes a value through anything that has a ``step`` and a memory."""
         self.memory[name], value = step.step(self.memory[name], value)
         return value
 
 
 def init(groups: Mapping[str, Mapping[str, Term]], key: Key, view: View) -> dict[str, Any]:
-    """What terms remember at the start of an episode, as ``view`` shows it.
+    """Collects what the terms remember at the start of an episode, given its first ``view``.
 
     Args:
-        groups: the terms, by the dotted name of their group in the task.
+        groups: the terms of each group, by the group's dotted name in the task.
     """
     memory: dict[str, Any] = {}
     for group, terms in groups.items():
@@ -214,11 +214,11 @@ def _key(key: Key, memory: Mapping[str, Any]) -> Key:
 def rewards(
     terms: Mapping[str, RewardTerm], curriculum: Mapping[str, Term], view: View, count: Int[Array, ""], dt: float, recall: Recall
 ) -> dict[str, Float[Array, ""]]:
-    """Weighted terms of one control step of ``dt`` seconds; their sum is the reward.
+    """Computes the weighted terms of one control step of ``dt`` seconds; their sum is the reward.
 
     Args:
-        curriculum: by the name of the reward whose weight it changes.
-        count: control steps that the environment has made in all.
+        curriculum: terms that change a reward's weight, by the reward's name.
+        count: total control steps of the environment so far.
     """
     out, level = {}, recall.memory.get(LEVEL)
     for name, term in terms.items():
@@ -228,17 +228,17 @@ def rewards(
 
 
 def by_name(group: Mapping[str, ObservationTerm], view: View, recall: Recall, name: str) -> dict[str, Array]:
-    """The terms of the observation group ``name`` as they are now, without noise or delay."""
+    """Evaluates the terms of the observation group ``name``, without noise or delay."""
     return {term: recall(f"observations.{name}.{term}", group[term], view) for term in group}
 
 
 def observe(
     groups: Mapping[str, ObservationGroup], view: View, sensed: View, key: Key, recall: Recall
 ) -> dict[str, Array | dict[str, Array]]:
-    """Each group's terms, concatenated in the order of the config; of a group that stays ``apart``, a dict by name.
+    """Evaluates every group: its terms concatenated in the order of the config, or a dict by name if the group is ``apart``.
 
     Args:
-        sensed: what the groups read that see through the task's sensors.
+        sensed: the view after the task's sensors, for groups that read it.
     """
     out: dict[str, Any] = {}
     for i, (name, group) in enumerate(groups.items()):
@@ -249,7 +249,7 @@ def observe(
 
 
 def _late(values: dict[str, Array], terms: Mapping[str, ObservationTerm], recall: Recall, group: str) -> dict[str, Array]:
-    """The values after the terms' delays and histories."""
+    """Passes the values through the terms' delays and histories."""
     level = recall.memory.get(LEVEL)
     for name, term in terms.items():
         for line in term.lines:
@@ -259,7 +259,7 @@ def _late(values: dict[str, Array], terms: Mapping[str, ObservationTerm], recall
 
 
 def _apart(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: Key | None) -> dict[str, Array]:
-    """The values by name; with a key, with their noise."""
+    """Keeps the values by name; with a key, adds their noise."""
     if key is None:
         return values
     keys = jax.random.split(key, len(terms))
@@ -270,17 +270,17 @@ def _apart(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: 
 
 
 def _joined(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: Key | None) -> Array:
-    """All values in one vector; with a key, with their noise."""
+    """Concatenates all values to one vector; with a key, adds their noise."""
     joined = jnp.concatenate(list(values.values()))
     if key is None:
         return joined
-    # One draw for the group: many small ones would cost more time than the terms themselves.
+    # One draw for the whole group: many small draws would take longer than the terms themselves.
     noise = np.concatenate([np.full(values[name].shape, term.noise, np.float32) for name, term in terms.items()])
     return joined + noise * jax.random.uniform(key, noise.shape, minval=-1.0, maxval=1.0)
 
 
 def terminations(terms: Mapping[str, DoneTerm], view: View, recall: Recall) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """``(terminated, truncated)``; a step that does both counts as terminated."""
+    """Computes ``(terminated, truncated)``; a step that does both counts as terminated."""
     terminated = truncated = jnp.zeros((), bool)
     for name, term in terms.items():
         hit = recall(f"terminations.{name}", term, view)

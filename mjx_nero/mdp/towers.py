@@ -1,8 +1,8 @@
-"""Towers: objects that belong at the goal, or onto one another; what the terms of ``place`` and ``stack`` have in common.
+"""Towers: objects that belong at the goal or on one another. The terms of ``place`` and ``stack`` share this module.
 
-An object *stands* while it is at its place, whoever holds it there, and those below it stand. Rewards are sums over the objects
-that are to be moved, each from when those below it stand. What is paid for an object that is held is paid on while it stands, so
-nothing is lost by letting go of it there; for one that flies nothing is paid.
+An object *stands* while it is at its place, held or not, and all objects below it stand. Rewards sum over the objects to move,
+each from the moment the ones below it stand. A standing object keeps the rewards of a held one, so letting go there costs
+nothing. An object that flies earns nothing.
 """
 
 import dataclasses
@@ -16,23 +16,23 @@ from mjx_nero.config.bounds import NonNegative, Positive
 from mjx_nero.mdp.rewards import held
 from mjx_nero.types import View
 
-GOAL = "goal"  # at the bottom of a tower
+GOAL = "goal"  # the bottom of a tower that is not built on an object
 Within = tuple[Positive, Positive, Positive]
 Scalar = Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where objects belong, how near is there, and how far away a hand is that holds or has left one.
+    """A tower to build: where its objects belong, and when they count as held, standing or left.
 
     Attributes:
-        tower: the objects from the bottom up: ``("goal", "box")`` is a box at the goal, ``("blue", "red")`` the red one on the
-            blue one, wherever that is.
-        rise: from the centre of an object to that of the next one on it [m].
-        within: how far from its place an object stands: along the table [m], in height [m], and at the goal in angle [rad].
-        minimal_height: an object that is held is this high [m] ...
-        grasp_radius: ... and this near to the grasp point [m] (see ``rewards.held``).
-        clearance: from an object to the grasp point of a hand that has left it [m].
+        tower: the objects from the bottom up. ``("goal", "box")`` is a box at the goal; ``("blue", "red")`` is the red object on
+            the blue one, wherever that is.
+        rise: height from one object's centre to the next one's [m].
+        within: tolerances of a standing object: along the table [m], in height [m], and at the goal in angle [rad].
+        minimal_height: least height of a held object [m].
+        grasp_radius: greatest distance of a held object from the grasp point [m] (see ``rewards.held``).
+        clearance: distance of the grasp point from an object that the hand has left [m].
     """
 
     tower: tuple[str, ...]
@@ -44,19 +44,19 @@ class Place:
 
     @property
     def steps(self) -> Iterator[tuple[str, str]]:
-        """Each object that is to be moved, after the one below it."""
+        """Pairs of neighbours: the lower object, and the one to put on it."""
         return zip(self.tower, self.tower[1:], strict=False)
 
     def holds(self, view: View, object: str, minimal_height: float | None = None) -> Bool[Array, ""]:
-        """Whether the object is held; with another height than ``minimal_height``."""
+        """True if the object is held; ``minimal_height`` replaces the field of that name."""
         least = self.minimal_height if minimal_height is None else minimal_height
         return held(view, minimal_height=least, grasp_radius=self.grasp_radius, object=object)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """An object that is to be moved: the way to its place [m], whether those below it stand, whether it is over its place, and
-    whether it stands."""
+    """One object to move: the vector to its place [m], whether the objects below stand, whether it is over its place, and whether
+    it stands."""
 
     object: str
     below: str
@@ -67,19 +67,21 @@ class _Level:
 
 
 def way(view: View, *, below: str, object: str, rise: float) -> Float[Array, "3"]:
-    """From the object to its place on the one ``below``, or at the goal [m]."""
+    """Vector from the object to its place on the object ``below``, or at the goal [m]."""
     place = view.goal_pos_w if below == GOAL else view.objects[below].pos_w + jnp.array([0.0, 0.0, rise])
     return place - view.objects[object].pos_w
 
 
 def turn_to_goal(view: View, *, object: str) -> Float[Array, "3"]:
-    """The rotation vector that turns the object to the goal's orientation, in its own frame [rad]."""
+    """Rotation vector that turns the object to the goal's orientation, in the object's frame [rad]."""
     return math.quat_log(math.quat_mul(math.quat_conj(view.objects[object].quat_w), view.goal_quat_w))
 
 
 def turn_to_object(view: View, *, object: str, down: tuple[float, float, float, float]) -> Float[Array, "3"]:
-    """The rotation vector that turns the hand, straight down where it is ``down``, to the object's orientation, in its own frame
-    [rad]."""
+    """Rotation vector that aligns the hand with the object, in the hand's frame [rad].
+
+    The hand points straight down at the orientation ``down``; aligned, it is turned with the object about the vertical.
+    """
     wanted = math.quat_mul(view.objects[object].quat_w, jnp.array(down))
     return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), wanted))
 
@@ -98,14 +100,17 @@ def _levels(view: View, place: Place) -> Iterator[_Level]:
 
 
 def distance(view: View, *, place: Place) -> Scalar:
-    """Of the object that is farthest from its place [m]."""
+    """Distance of the farthest object from its place [m]."""
     ways = [way(view, below=below, object=object, rise=place.rise) for below, object in place.steps]
     return jnp.max(jnp.stack([jnp.linalg.norm(to) for to in ways]))
 
 
 def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
-    """All objects stand, are slower than ``max_speed`` [m/s], turn by less than ten of it [rad/s], and have been let go of: the
-    grasp point is at least ``place.clearance`` from each."""
+    """True if all objects stand at rest and the hand has let go.
+
+    At rest: slower than ``max_speed`` [m/s] and ten times that [rad/s]. Let go: the grasp point is more than ``place.clearance``
+    away.
+    """
     met = [level.stands for level in _levels(view, place)]
     for name in place.tower:
         if name == GOAL:
@@ -121,32 +126,32 @@ def _sum(values: Iterable[Array]) -> Scalar:
 
 
 def reached(view: View, *, place: Place, std: Positive) -> Scalar:
-    """1 - tanh(distance from the grasp point to the object / std); 1 where it stands."""
+    """1 - tanh(d / std), where d is the distance from the grasp point to the object; 1 once the object stands."""
     near = {name: 1.0 - jnp.tanh(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / std) for name in place.tower[1:]}
     levels = _levels(view, place)
     return _sum(level.due * jnp.where(level.stands, 1.0, near[level.object]) for level in levels)
 
 
 def _carried(view: View, level: _Level, place: Place) -> Bool[Array, ""]:
-    # Over its place an object may be as low as it likes: else its last centimetre down would cost all that is paid.
+    # Over its place an object may be at any height: otherwise its last centimetre down would forfeit the reward.
     lowered = level.over & place.holds(view, level.object, minimal_height=-jnp.inf)
     return level.due & (place.holds(view, level.object) | lowered | level.stands)
 
 
 def carried(view: View, *, place: Place) -> Scalar:
-    """1 while the object is held or stands."""
+    """1 while the object is held or stands, else 0."""
     return _sum(_carried(view, level, place) for level in _levels(view, place))
 
 
 def approached(view: View, *, place: Place, over: Positive, std: Positive, flat: NonNegative = 0.0) -> Scalar:
-    """1 - tanh(distance from the way to its place / std), while the object is held or stands.
+    """1 - tanh(d / std) while the object is held or stands, where d is the distance to its place by way of a cone [m].
 
-    The way comes down a cone of 45 degrees from ``over`` above the place [m]: straight to it would be through the side of what is
-    below. The distance is that along the table and that in height from the cone, together: 0 at the place alone.
+    The cone opens upwards at 45 degrees from the place, up to ``over`` [m]: the straight path would hit the object below from the
+    side. d combines the distance along the table with the height above the cone, and is 0 only at the place.
 
     Args:
-        flat: radius of the cone's flat tip [m]; inside it only height counts. Zero: a point, so that an object a little beside
-            its place is paid for as much height as that.
+        flat: radius of the cone's flat tip [m]; inside it only height counts. Zero: a point, so an object slightly beside its
+            place earns most if it is that much too high.
     """
 
     def near(level: _Level) -> Scalar:
@@ -158,21 +163,22 @@ def approached(view: View, *, place: Place, over: Positive, std: Positive, flat:
 
 
 def aligned(view: View, *, place: Place, std: Positive) -> Scalar:
-    """1 - tanh(angle of the lowest object from the goal's orientation / std), while it is held or stands."""
+    """1 - tanh(angle / std) while the lowest object is held or stands, where angle is its turn from the goal [rad]."""
     level = next(_levels(view, place))
     angle = jnp.linalg.norm(turn_to_goal(view, object=level.object))
     return _carried(view, level, place) * (1.0 - jnp.tanh(angle / std))
 
 
 def standing(view: View, *, place: Place) -> Scalar:
-    """1 while the object stands."""
+    """1 while the object stands, else 0."""
     return _sum(level.stands for level in _levels(view, place))
 
 
 def _away(view: View, level: _Level, place: Place) -> Scalar:
-    """How far the grasp point is from the object, from 0 to 1; where that is on another, above or beside it.
+    """Distance of the grasp point from the object, from 0 to 1. On another object, only distance above or beside counts.
 
-    Below is not away there: down a tower a hand slides that hardly opens, to hold what is there; up it takes the object along.
+    A hand below has not left: it slides down the tower with fingers hardly open to hold what is there, and takes the object along
+    on its way up.
     """
     off = view.ee_pos_w - view.objects[level.object].pos_w
     off = off if level.below == GOAL else off.at[2].max(0.0)
@@ -180,36 +186,42 @@ def _away(view: View, level: _Level, place: Place) -> Scalar:
 
 
 def _let_go(view: View, level: _Level, place: Place, at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
-    """How far fingers that are ``at`` are opened, from 0 to 1; below the top of a tower, where they have work elsewhere, or how
-    far they are away, if that is more."""
+    """Opening of the finger positions or targets ``at``, from 0 at ``hold`` to 1 at ``open``.
+
+    Below the top of a tower the hand has more work to do, so its distance counts instead, if that is more.
+    """
     opens, holds = jnp.array(open), jnp.array(hold)
     share = jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
     return share if level.object == place.tower[-1] else jnp.maximum(share, _away(view, level, place))
 
 
 def told_to_open(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
-    """How far the targets of the fingers are opened while the object stands, from 0 to 1: so a step to let go is paid at once.
-    Below the top of a tower, or how far they are from it (see ``left``), if that is more: they have work elsewhere.
+    """Opening of the fingers' targets while the object stands, from 0 to 1, so that a step to let go pays at once.
+
+    Below the top of a tower, the hand's distance counts (see ``left``), if that is more: the fingers have work elsewhere.
 
     Args:
-        open, hold: targets of the gripper's drives, the last of all, wide open and where that begins to count [rad or m].
+        open, hold: targets of the gripper's drives (the last ones) for wide open, and where the reward begins [rad or m].
     """
     levels = _levels(view, place)
     return _sum(level.stands * _let_go(view, level, place, view.ctrl, open, hold) for level in levels)
 
 
 def left(view: View, *, place: Place) -> Scalar:
-    """How far the grasp point is from an object that stands, as a share of ``place.clearance``, at most 1; where that is on
-    another one, above or beside it."""
+    """Distance of the grasp point from a standing object, as a share of ``place.clearance``, at most 1.
+
+    On another object, only distance above or beside counts.
+    """
     return _sum(level.stands * _away(view, level, place) for level in _levels(view, place))
 
 
 def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
-    """``left`` times how far the fingers are open, so a hand that still holds the edge earns nothing; below the top of a tower as
-    ``told_to_open``.
+    """``left`` times how far the fingers are open, so a hand that still holds the edge earns nothing.
+
+    Below the top of a tower, as in ``told_to_open``.
 
     Args:
-        open, hold: positions of the gripper's joints, the last of all, wide open and where that begins to count [rad or m].
+        open, hold: positions of the gripper's joints (the last ones) for wide open, and where the reward begins [rad or m].
     """
 
     def gone(level: _Level) -> Scalar:
@@ -219,5 +231,5 @@ def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...],
 
 
 def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:
-    """1 while all is as it should be (see ``built``)."""
+    """1 while the tower is built (see ``built``), else 0."""
     return built(view, place=place, max_speed=max_speed).astype(jnp.float32)

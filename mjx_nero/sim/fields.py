@@ -185,7 +185,7 @@ class _Tree:
 
 
 def _carries(model: mujoco.MjModel, body: int, other: int) -> bool:
-    """Whether ``other`` is the body or hangs on it."""
+    """True if ``other`` is the body or hangs on it."""
     while other > body:  # parents come before what they carry
         other = int(model.body_parentid[other])
     return other == body

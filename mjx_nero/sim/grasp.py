@@ -24,13 +24,15 @@ Pad = tuple[float, float, float]
 
 
 def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
-    """Of a cube that the gripper can lift [m]: ``SHARE`` of its opening, or more where long pads would touch the table before.
+    """Edge of a cube that the gripper can lift [m]: ``SHARE`` of its opening, or more if long pads would touch the table first.
+
+    It is larger than the gap of the closed gripper, by ``GRIPPED`` or a quarter of the stroke; 0 if no cube fits.
 
     It is larger than the gap of the closed gripper, by ``GRIPPED`` or a quarter of the stroke; 0 where no cube fits between.
 
     Args:
-        opening, closed: between the pads when open and when closed [m].
-        pad: its size along the approach, across, and along the opening [m].
+        opening, closed: distance between the pads when open and when closed [m].
+        pad: size of a pad along the approach, across, and along the opening [m].
     """
     wanted = min(max(SHARE * opening, pad[0] + 2 * CLEAR), MOST * opening, LARGEST)
     least = closed + min(GRIPPED, (opening - closed) / 4)
@@ -40,18 +42,21 @@ def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
 
 
 def height(opening: float, pad: Pad, closed: float = 0.0) -> float:
-    """Of the pads' middle above the table when they grasp that cube [m]: its own middle, or higher for the sake of ``CLEAR``."""
+    """Height of the pads' middle above the table when they grasp that cube [m]: the cube's middle, or higher to keep
+    ``CLEAR``."""
     return max(edge(opening, pad, closed) / 2, lowest(pad))
 
 
 def lowest(pad: Pad) -> float:
-    """Of the pads' middle above the table, so that they keep ``CLEAR`` of it [m]."""
+    """Least height of the pads' middle above the table, so that they keep ``CLEAR`` of it [m]."""
     return pad[0] / 2 + CLEAR
 
 
 def beyond(robot: RobotCfg, gap: float) -> float:
-    """How far beyond the grasp point, along the approach, the middle of the pads lies when they are ``gap`` apart [m]; 0 where
-    long ones reach back over it. An object that is round has to be between their middles: over an edge it would roll."""
+    """Distance of the pads' middle beyond the grasp point along the approach, when they are ``gap`` apart [m].
+
+    0 if long pads reach back over the grasp point. A round object must be between the pads' middles, or it rolls over an edge.
+    """
     hand = _Hand(robot)
     hand.move(hand.share(gap))
     site = hand.data.site(robot.ee_site)
@@ -62,8 +67,10 @@ def beyond(robot: RobotCfg, gap: float) -> float:
 
 
 def formulas(robot: RobotCfg) -> tuple[Callable, Callable] | None:
-    """``gap`` and ``positions`` of its gripper, or the like from where the pads are as the fingers move together; None: it has no
-    gripper, no two pads, or fingers that stay where they are."""
+    """Returns ``gap`` and ``positions`` of the gripper, or equivalents computed from the pads as the fingers move together.
+
+    None without a gripper, two pads, or moving fingers.
+    """
     fingers = robot.gripper
     if not fingers.joints:
         return None
@@ -87,8 +94,10 @@ def formulas(robot: RobotCfg) -> tuple[Callable, Callable] | None:
 
 
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:
-    """The robot with a hand that opens no further than to ``gap`` between its pads [m], and begins so; as it is where it opens
-    less, or has no two pads."""
+    """Returns the robot with a hand that opens no further than ``gap`` between its pads [m], and starts there.
+
+    The robot is unchanged if it opens less, or has no two pads.
+    """
     fingers = robot.gripper
     if fingers.gap is not None and fingers.positions is not None:
         if float(fingers.gap(jnp.array(fingers.open))) <= gap:
@@ -103,10 +112,10 @@ def opened(robot: RobotCfg, gap: float) -> RobotCfg:
 
 
 def shut(robot: RobotCfg, gap: float) -> RobotCfg:
-    """The robot with a hand that holds what is ``gap`` wide [m]: as it is, or one that closes as far as its joints go.
+    """Returns the robot with a hand that holds objects ``gap`` wide [m], if needed by closing as far as its joints go.
 
     Raises:
-        UserError: its pads are too far apart even so.
+        UserError: the pads are still too far apart.
     """
     hand, fingers = _Hand(robot), robot.gripper
     if hand.apart(0.0) <= gap:
@@ -122,14 +131,14 @@ def shut(robot: RobotCfg, gap: float) -> RobotCfg:
 
 
 def closing_time(robot: RobotCfg, gap: float) -> float:
-    """How long the fingers take from open to where their pads are ``gap`` apart [s]."""
+    """Time that the fingers take from open until their pads are ``gap`` apart [s]."""
     hand = _Hand(robot)
     way = np.abs(hand.positions(hand.share(gap)) - hand.positions(1.0))
     return float(np.max(way / np.array(robot.gripper.speed), initial=0.0))
 
 
 def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
-    """The shapes that grip, by their names."""
+    """Lists the names of the shapes that grip."""
     geoms = model.geoms if isinstance(model, mujoco.MjSpec) else map(model.geom, range(model.ngeom))
     return [geom.name for geom in geoms if "pad" in geom.name]
 
@@ -138,7 +147,7 @@ class _Hand:
     """A robot's fingers, moved from closed (0) to open (1), or beyond.
 
     Attributes:
-        pads: geoms that grip.
+        pads: ids of the geoms that grip.
     """
 
     def __init__(self, robot: RobotCfg):
@@ -149,7 +158,7 @@ class _Hand:
         self._sides = self._side() if len(self.pads) > 2 else {i: k > 0 for k, i in enumerate(self.pads)}
 
     def positions(self, share: float) -> np.ndarray:
-        """Of the gripper's joints."""
+        """Positions of the gripper's joints at a share of the way from closed to open."""
         close, open = np.array(self._robot.close), np.array(self._robot.open)
         return close + share * (open - close)
 
@@ -161,7 +170,7 @@ class _Hand:
         mujoco.mj_kinematics(self.model, self.data)
 
     def ends(self) -> tuple[float, float]:
-        """The shares at which the first of its joints is at a limit, closing and opening; 0 and 1 where one has none."""
+        """The shares at which the first joint reaches a limit, closing and opening; 0 and 1 if a joint has none."""
         close, way = self.positions(0.0), self.positions(1.0) - self.positions(0.0)
         joints = [self.model.joint(name).id for name in self._robot.joints]
         moving = way != 0
@@ -171,7 +180,7 @@ class _Hand:
         return float(ends[0].max()), float(ends[1].min())
 
     def share(self, gap: float) -> float:
-        """At which two pads are ``gap`` apart [m]; 1 where they never are as far."""
+        """Share at which two pads are ``gap`` apart [m]; 1 if they never are."""
         low, high = 0.0, 1.0
         while high - low > 1e-5 and self.apart(1.0) > gap:
             middle = (low + high) / 2
@@ -179,8 +188,7 @@ class _Hand:
         return high
 
     def apart(self, share: float) -> float:
-        """The least distance between two pads that are on different sides of the opening, or on different bodies where all pads
-        are on one side [m]."""
+        """Least distance between two pads on different sides of the opening [m]; if all are on one side, on different bodies."""
         self.move(share)
         bodies, far, ends = self.model.geom_bodyid, 1.0, np.zeros(6)
         pairs = [(a, b) for a, b in itertools.combinations(self.pads, 2) if bodies[a] != bodies[b]]
@@ -188,7 +196,7 @@ class _Hand:
         return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in opposed or pairs), default=0.0)
 
     def _side(self) -> dict[int, bool]:
-        """On which side of the opening each of the pads is when the hand is open."""
+        """Finds the side of the opening on which each pad is when the hand is open."""
         self.move(1.0)
         sites = [self.model.site(i).name for i in range(self.model.nsite)]
         frame = self.data.site(self._site) if self._site in sites else self.data.body(self._site)
@@ -203,7 +211,7 @@ def cube_for(robot: RobotCfg) -> ObjectCfg:
     """The cube that a robot can lift.
 
     Raises:
-        UserError: it has no gripper, nobody said how far that opens, or that is no more than it closes to.
+        UserError: the robot has no gripper, its opening is unknown, or no cube fits.
     """
     where = "its robot.yaml" if robot.folder else "its config"
     if not robot.gripper.joints:

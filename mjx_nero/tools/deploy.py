@@ -106,7 +106,7 @@ def _numbers(text: str | None, counts: Sequence[int], flag: str) -> list[float] 
 
 
 def _run(args: argparse.Namespace) -> bool:
-    """Whether it ended in a fault."""
+    """Runs the loop; returns True if it ended in a fault."""
     from mjx_nero.deploy import setup
     from mjx_nero.deploy.guard import WallClock, urgent
     from mjx_nero.deploy.loop import Brain, go_home, run
@@ -172,7 +172,7 @@ def _spec(args: argparse.Namespace, metadata: dict[str, Any], options: dict[str,
 
 @contextlib.contextmanager
 def _world(args: argparse.Namespace, metadata: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Where objects are, and the driver's options."""
+    """Returns where objects are, and the driver's options."""
     from mjx_nero.deploy import places
 
     simulated = args.arm == "sim" or args.emulate

@@ -90,7 +90,7 @@ def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
 
 
 def figures(path: pathlib.Path) -> dict[str, Any]:
-    """What a JSON file holds.
+    """Reads the figures of a JSON file.
 
     Raises:
         UserError: it is none, or no mapping.
@@ -162,6 +162,6 @@ def _said(row: Mapping[str, Any]) -> str:
 
 
 def _share(row: Mapping[str, Any], what: str) -> str:
-    """How many tries of the script came to something; empty if there were none."""
+    """Formats how many tries of the script succeeded; empty if there were none."""
     found = row.get("self_test", {"script": ""})
     return f"{found[what]} of {found['tries']}" if found["script"] == "pick_place" else ""

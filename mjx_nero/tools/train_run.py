@@ -1,4 +1,4 @@
-"""What ``train`` does once its flags are read: starts a run or goes on with one, and tells what it came to."""
+"""Runs ``train`` after its flags are read: starts or resumes a run, and reports its result."""
 
 import argparse
 import dataclasses
@@ -31,7 +31,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
     learner.find(args.learner)
     track.check(args.track)
     if args.seeds and (args.restore or args.resume):
-        raise UserError("--seeds starts new runs: go on with one of them by --restore RUN/seed_N alone")
+        raise UserError("--seeds starts new runs: to resume one, pass only --restore RUN/seed_N")
     run = training.resolve(
         args.env,
         args.preset,
@@ -77,7 +77,7 @@ def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[s
 
 
 def report(summary: dict[str, Any], films: bool) -> None:
-    """What a run came to, for people."""
+    """Describes a run's result for people."""
     pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
     print(f"{pace}, success {summary['evaluation']['success_rate']:.1%}")
     names = "policy.safetensors, best.safetensors, curve.png, metrics.jsonl, checkpoints/"

@@ -1,4 +1,4 @@
-"""Which joints are the arm's. A robot with more (a second arm, a head, wheels) is cut down to one arm as its user says."""
+"""Selects the arm's joints. A robot with more (a second arm, a head, wheels) is cut down to the one arm that its user names."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,14 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint, Tree, below, bodies, body_of
 
-HAND = 4  # driven joints of a branch at most, if all that leaves the base is fingers
-FINGERS = 3  # driven joints in series, from which on a branch may be an arm that goes on and not a finger
+HAND = 4  # most driven joints of a branch, if only fingers leave the base
+FINGERS = 3  # least driven joints in series that make a branch an arm, not a finger
 
 
 @dataclasses.dataclass(frozen=True)
 class Limb:
-    """An arm: its driven joints from the base on, and the bodies that it branches off from and that carries its hand."""
+    """An arm: its driven joints from the base outwards, the body that it branches off from, and the body that carries its
+    hand."""
 
     base: str
     end: str
@@ -24,15 +25,15 @@ class Limb:
 
 
 def selected(tree: Tree, chain: str | None, fix: Mapping[str, float | None], notes: Notes) -> Tree:
-    """The robot with one arm that moves.
+    """Returns the robot with one moving arm.
 
     Args:
-        chain: ``BASE:TIP``, links; what is neither between them nor hangs on the tip's body is held still.
-        fix: joint -> position to hold it at [rad, m]; None: the one nearest to 0.
+        chain: ``BASE:TIP``, two links. Joints that are neither between them nor on the tip's body are held still.
+        fix: joint -> position to hold it at [rad, m]; None: the position nearest to 0.
 
     Raises:
-        UserError: ``chain`` or ``fix`` name what is not there, nothing is left that moves, or the robot is more than an arm and
-            neither says which part of it.
+        UserError: ``chain`` or ``fix`` names something that does not exist, no moving joint is left, or the robot is more than an
+            arm and neither selects a part of it.
     """
     held = {name: _position(tree, name, value) for name, value in fix.items()}
     if chain is not None:
@@ -46,7 +47,7 @@ def selected(tree: Tree, chain: str | None, fix: Mapping[str, float | None], not
 
 
 def fixed(tree: Tree, held: Mapping[str, float], notes: Notes) -> Tree:
-    """The tree with joints held still at the given positions [rad, m], and with them those that mimic them."""
+    """Holds joints still at the given positions [rad, m], together with the joints that mimic them."""
     joints = dict(tree.joints)
     for name, joint in tree.joints.items():
         source, multiplier, offset = joint.mimic or (name, 1.0, 0.0)
@@ -60,12 +61,12 @@ def fixed(tree: Tree, held: Mapping[str, float], notes: Notes) -> Tree:
 
 
 def limb(parts: dict[str, Body]) -> Limb:
-    """The robot's arm, of several the first."""
+    """Finds the robot's arm; the first of several."""
     return _limbs(parts)[0]
 
 
 def _check(tree: Tree) -> None:
-    """Refuses what is more than an arm, naming the choices."""
+    """Refuses a robot that is more than an arm, and lists the choices."""
     parts = bodies(tree)
     limbs = _limbs(parts)
     branches = [b.name for b in parts.values() if b.parent == next(iter(parts))]
@@ -91,13 +92,16 @@ def _check(tree: Tree) -> None:
 
 
 def _limbs(parts: dict[str, Body]) -> list[Limb]:
-    """Where the tree forks, a branch that goes on for at least ``FINGERS`` joints is the arm; if several do and are longer than
-    the way there, they are arms; else the fork carries the hand."""
+    """Finds the arms.
+
+    Where the tree forks, a branch with at least ``FINGERS`` more joints is the arm. If several branches have, and are longer than
+    the path to the fork, they are arms. Otherwise the fork carries the hand.
+    """
     children: dict[str, list[Body]] = {name: [] for name in parts}
     for body in parts.values():
         if body.parent:
             children[body.parent].append(body)
-    length = dict.fromkeys(parts, 0)  # driven joints in series, this one's among them
+    length = dict.fromkeys(parts, 0)  # driven joints in series, including this one
     for body in reversed(parts.values()):
         longest = max((length[b.name] for b in children[body.name]), default=0)
         length[body.name] = longest + bool(body.joint and not body.joint.mimic)
@@ -121,12 +125,12 @@ def _limbs(parts: dict[str, Body]) -> list[Limb]:
 
 
 def _named(parts: dict[str, Body], end: str) -> str:
-    """The last link of a body: what a user knows the end of an arm by."""
+    """Returns the last link of a body, the name by which users know an arm's end."""
     return list(parts[end].links)[-1]
 
 
 def _outside(tree: Tree, chain: str) -> list[str]:
-    """Driven joints that are neither between the chain's links nor hang on the body of its tip."""
+    """Lists the driven joints that are neither between the chain's links nor on the body of its tip."""
     base, colon, tip = chain.partition(":")
     if not colon:
         raise UserError(f"--chain takes BASE:TIP, two links, got {config.short(chain)}")
@@ -167,7 +171,7 @@ def _position(tree: Tree, name: str, value: float | None) -> float:
 
 
 def nearest(joint: Joint) -> float:
-    """The position nearest to 0 [rad, m]."""
+    """Returns the position nearest to 0 [rad, m]."""
     return float(np.clip(0.0, joint.lower, joint.upper))
 
 

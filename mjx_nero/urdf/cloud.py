@@ -1,4 +1,4 @@
-"""The robot in random poses, and inverse kinematics that starts from them."""
+"""A cloud of the robot's random poses, and inverse kinematics that starts from them."""
 
 from collections.abc import Mapping
 
@@ -11,22 +11,22 @@ from mjx_nero.urdf.tree import Body, Points, Pose, Poses, Values, Vec, body_of
 from mjx_nero.urdf.tree import poses as body_poses
 
 SAMPLES = 20_000
-ITERATIONS = 40  # most steps of a descent
-MISS, TILT = 2e-3, 0.03  # [m, rad] how near it has to come
+ITERATIONS = 40  # greatest number of steps of a descent
+MISS, TILT = 2e-3, 0.03  # [m, rad] tolerances of a descent
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
 class Cloud:
-    """The robot in ``SAMPLES`` random poses, where it is mounted, and its inverse kinematics.
+    """The mounted robot in ``SAMPLES`` random poses, and its inverse kinematics.
 
-    Damped least squares in NumPy over the tree's own poses, thousands of goals at once: the JAX one of ``control`` takes longer
-    to compile than all of an import may last.
+    Inverse kinematics is damped least squares in NumPy, thousands of goals at once. The JAX version in ``control`` would take
+    longer to compile than a whole import may take.
 
     Attributes:
-        q: joint -> positions [n] of the driven joints: first the arm's guess of a home pose, then random; the gripper is open.
-        poses: body -> [n, 4, 4], in the unturned frame (the mount's position left out).
+        q: driven joint -> positions [n]: first a guess of the home pose, then random ones, with an open gripper.
+        poses: body -> poses [n, 4, 4] in the unturned frame (without the mount's position).
         height: of that frame above the table [m].
-        arm: names of the arm's joints; ``lower`` and ``upper`` [k] their limits.
+        arm: names of the arm's joints, with the limits ``lower`` and ``upper`` [k].
     """
 
     def __init__(self, parts: dict[str, Body], hand: Hand, mount: Pose, home: Mapping[str, float]):
@@ -52,26 +52,26 @@ class Cloud:
 
     @property
     def shoulder(self) -> Vec:
-        """Where the first joint that turns stands."""
+        """Position of the first turning joint."""
         turning = [b for b in self._parts.values() if b.joint and b.joint.name in self.arm and b.joint.type != "prismatic"]
         return self.poses[turning[0].name][0, :3, 3] if turning else np.zeros(3)
 
     def at(self, q: Float[np.ndarray, "n k"]) -> dict[str, Poses]:
-        """Poses [n, 4, 4] of the bodies with the arm's joints at ``q``, the gripper open."""
+        """Poses [n, 4, 4] of the bodies with the arm's joints at ``q`` and an open gripper."""
         driven = {j: np.full(len(q), self.q[j][1]) for j in self._hand.joints} | dict(zip(self.arm, q.T, strict=True))
         return {name: self._turn @ p for name, p in body_poses(self._parts, driven, len(q)).items()}
 
     def grasp_point(self, q: Mapping[str, float]) -> Pose:
-        """Its pose [4, 4] with the arm's joints at ``q``, the gripper open."""
+        """Pose of the grasp point [4, 4] with the arm's joints at ``q`` and an open gripper."""
         return self.sites(self.at(np.array([[q[j] for j in self.arm]])))[0]
 
     def sites(self, poses: Mapping[str, Poses]) -> Poses:
-        """The grasp point's [n, 4, 4] in poses of the bodies."""
+        """Poses of the grasp point [n, 4, 4], given the bodies' poses."""
         body = body_of(self._parts, self._hand.link)
         return poses[body.name] @ body.links[self._hand.link] @ self._hand.site
 
     def jacobian(self, poses: Mapping[str, Poses]) -> Float[np.ndarray, "n 6 k"]:
-        """How the grasp point moves and turns with each of the arm's joints, and with those that follow it by mimic."""
+        """Jacobian of the grasp point over the arm's joints, including joints that follow them by mimic."""
         site, body = self.sites(poses)[:, :3, 3], body_of(self._parts, self._hand.link)
         out = np.zeros((len(site), 6, len(self.arm)))
         while body.joint is not None:
@@ -99,17 +99,17 @@ class Cloud:
         along: Vec | None = None,
         shun: Bool[np.ndarray, " samples"] | None = None,
     ) -> Float[np.ndarray, "g s k"]:
-        """Positions that bring the grasp point to each of the goals [g, 3], pointing down if asked; NaN where a descent fails.
+        """Finds positions that bring the grasp point to each goal [g, 3], pointing down if asked; NaN where a descent fails.
 
-        Every goal has ``starts`` descents, from the random poses that are nearest to it.
+        Each goal gets ``starts`` descents, from the random poses nearest to it.
 
         Args:
-            hold: joint -> position that it keeps.
-            calm: how many metres of nearness a radian away from the guess of a home pose counts.
-            one: the first descent that gets to a goal ends the others.
-            tilt: how far from down it may point [rad].
-            along: direction in the grasp point's frame that has to lie along y.
-            shun: of the poses, those that are no good to start from.
+            hold: joint -> position to keep.
+            calm: distance that a radian away from the guessed home pose counts as, when choosing starts [m/rad].
+            one: stop at the first descent that reaches a goal.
+            tilt: greatest angle from pointing down [rad].
+            along: direction in the grasp point's frame that must lie along y.
+            shun: poses that no descent should start from.
         """
         lower, upper = self.lower.copy(), self.upper.copy()
         for name, value in (hold or {}).items():
@@ -144,7 +144,7 @@ class Cloud:
     def followed(
         self, q: Float[np.ndarray, "n k"], goals: Points, steps: int, tilt: float, along: Vec | None
     ) -> Float[np.ndarray, "n k"]:
-        """``q`` after a few steps towards goals [n, 3] with the hand pointing down; ``tilt`` and ``along`` as in ``solve``."""
+        """Moves ``q`` a few steps towards goals [n, 3] with the hand pointing down; ``tilt`` and ``along`` as in ``solve``."""
         for _ in range(steps):
             q = np.clip(q + _move(*self._error(self.at(q), goals, True, tilt, along)), self.lower, self.upper)
         return q
@@ -152,7 +152,8 @@ class Cloud:
     def _error(
         self, poses: Mapping[str, Poses], wanted: Points, down: bool, tilt: float, along: Vec | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What lacks to the goals [n, 3 or 6], and its Jacobian; without ``along`` turns about the approach do not count."""
+        """Computes the error to the goals [n, 3 or 6] and its Jacobian. Without ``along``, turns about the approach do not
+        count."""
         sites, jacobian = self.sites(poses), self.jacobian(poses)
         away = wanted - sites[:, :3, 3]
         if not down:
@@ -170,23 +171,23 @@ class Cloud:
         return np.hstack([away, turn]), np.concatenate([jacobian[:, :3], counts @ jacobian[:, 3:]], axis=1)
 
     def _tilt(self, sites: Poses) -> Values:
-        """How far the hand is from pointing down [n], 0 to 2."""
+        """Tilt of the hand from pointing down [n], from 0 to 2."""
         return 1 - (sites[:, :3, :3] @ self._hand.approach) @ DOWN
 
     def lowest(self, link: str, shape: primitives.Primitive, poses: Mapping[str, Poses] | None = None) -> Values:
-        """Height [n] of the shape's lowest point above the table; in the random poses unless others are given."""
+        """Height [n] of the shape's lowest point above the table, in the given poses or else in the random ones."""
         body = body_of(self._parts, link)
         return shape.lowest((self.poses if poses is None else poses)[body.name][:, 2] @ body.links[link]) + self.height
 
 
 def _move(error: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """A damped step of the joints [n, k]."""
+    """Computes a damped step of the joints [n, k]."""
     transposed = np.moveaxis(jacobian, 1, 2)
     square = jacobian @ transposed + 1e-4 * np.eye(jacobian.shape[1])
     return np.clip((transposed @ np.linalg.solve(square, error[:, :, None]))[:, :, 0], -0.3, 0.3)
 
 
 def _smallest(values: Values, count: int) -> Int[np.ndarray, " count"]:
-    """Where the smallest values are, the least first."""
+    """Indices of the ``count`` smallest values, in ascending order."""
     some = np.argpartition(values, count)[:count]
     return some[np.argsort(values[some])]

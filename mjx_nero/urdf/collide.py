@@ -1,4 +1,4 @@
-"""Which links collide, with what, and by which shape."""
+"""Collision shapes: which links collide, with what, and as which shape."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,25 +10,25 @@ from mjx_nero.urdf.geometry import Look, Looks
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Pose, Tree
 
-SMALL = 0.05  # of the largest collision shape of a body: others below this volume are left out
-FEW = 3  # collisions of a link, up to which each may have a shape of its own
-NEAR = 0.02  # [m] links that stay this far above the table never meet it
-FEW_POINTS = 20  # of a link's surface, that no shape is fitted to
+SMALL = 0.05  # shapes below this share of the volume of their body's largest are left out
+FEW = 3  # most collisions of a link that may each have a shape of their own
+NEAR = 0.02  # [m] links that stay this far above the table never touch it
+FEW_POINTS = 20  # least points of a surface that a shape is fitted to
 _CUBE = {"sphere": 1, "capsule": 2, "box": 8}  # contacts of a shape with a cube; with the table: primitives.CONTACTS
 Vec4 = Float[np.ndarray, "4"]
 Collisions = dict[str, list[tuple[str, primitives.Primitive, int]]]  # link -> (name, shape in its frame, contact bits)
 
 
 def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, cloud: Cloud, notes: Notes) -> Collisions:
-    """Link -> its collision shapes. The gripper's pads meet table and cube, links that get near the table meet that.
+    """Returns each link's collision shapes. Pads collide with table and cube; links that get near the table collide with it.
 
-    The base has none, and the inner links of a gripper have none: the pads get to things first. For the same reason what is
-    around the palm ends where the pads begin; descriptions put hulls there that reach beyond the fingers, to plan with.
+    The base and the inner links of a gripper have none, because the pads touch things first. For the same reason, shapes around
+    the palm end where the pads begin: descriptions often put hulls there that reach beyond the fingers, for planning.
     """
     out: Collisions = {name: [] for name in tree.links}
     for body in parts.values():
         done: list[tuple[primitives.Primitive, Pose]] = []
-        balls: list[Vec4] = []  # about each of them, in the body: centre and radius
+        balls: list[Vec4] = []  # bounding balls in the body: centre and radius
         fitted = {
             link: _shapes(look.surfaces, look.exact)
             for link, look in ((link, looks.of[link]) for link in body.links)
@@ -64,7 +64,7 @@ def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, clo
 
 
 def _shapes(surfaces: list[tuple[Points, float]], exact: list[primitives.Primitive | None]) -> list[primitives.Primitive]:
-    """One shape for all collisions of a link, or one each if that is much tighter and they are few."""
+    """Fits one shape to all collisions of a link, or one to each if they are few and that is much tighter."""
     few = len(surfaces) <= FEW
     each = [e or primitives.best(points, volume) for e, (points, volume) in zip(exact, surfaces, strict=True) if few]
     if len(each) == 1:
@@ -77,10 +77,11 @@ def _shapes(surfaces: list[tuple[Points, float]], exact: list[primitives.Primiti
 def _palm(
     shapes: list[primitives.Primitive], points: Points, site: Pose, hand: Hand, link: str, notes: Notes
 ) -> list[primitives.Primitive]:
-    """The shapes of a link beside the gripper; if one reaches beyond the pads a box around what lies behind them, if any.
+    """Fits the shapes of a link beside the gripper. If one reaches beyond the pads, a box around what lies behind them replaces
+    it.
 
     Args:
-        points: of its surface [n, 3]; ``site``: the grasp point's pose [4, 4], both in the link.
+        points: points of its surface [n, 3]; ``site``: the grasp point's pose [4, 4]. Both are in the link's frame.
     """
     approach = site[:3, :3] @ hand.approach
     middle = approach @ (site[:3, 3] + site[:3, :3] @ hand.grip)
@@ -97,11 +98,11 @@ def _palm(
 
 
 def _hidden(points: Points, at: Pose, done: list[tuple[primitives.Primitive, Pose]], balls: list[Vec4]) -> bool:
-    """Whether 95% of a link's points, the link at ``at`` in its body, lie inside one of the shapes in other links."""
+    """True if 95% of a link's points, with the link at ``at`` in its body, lie inside a shape of another link."""
     if not done:
         return False
     points = points @ at[:3, :3].T + at[:3, 3]
-    # Half of the coordinates lie on either side of their median, so with most of the points it is near the shape, too.
+    # The median lies near a shape that contains most of the points, so a ball test rules most shapes out.
     around = np.array(balls)
     away = np.abs(around[:, :3] - np.median(points, axis=0)).max(1)
     for i in np.flatnonzero(away <= around[:, 3]):
@@ -112,7 +113,7 @@ def _hidden(points: Points, at: Pose, done: list[tuple[primitives.Primitive, Pos
 
 
 def contacts(found: Collisions) -> dict[str, int]:
-    """Most contacts of the robot with the table, and of table, robot and one cube together."""
+    """Counts the robot's greatest possible contacts with the table, and those of table, robot and one cube together."""
     shapes = [(s.kind, bits) for items in found.values() for _, s, bits in items]
     table = sum(primitives.CONTACTS[kind] for kind, bits in shapes if bits & mjcf.TABLE)
     cube = sum(_CUBE[kind] for kind, bits in shapes if bits & mjcf.CUBE)
@@ -120,7 +121,7 @@ def contacts(found: Collisions) -> dict[str, int]:
 
 
 def covered(look: Look, shapes: list[primitives.Primitive]) -> float | None:
-    """Share of the link's surface inside any of its collision shapes; None without either."""
+    """Share of the link's surface inside any of its collision shapes; None if it lacks a surface or shapes."""
     if look.points is None or look.guessed or not shapes:
         return None
     return round(float(np.any([s.contains(look.points) for s in shapes], axis=0).mean()), 4)

@@ -1,4 +1,4 @@
-"""Joints that move together: couplings that a file states outside of ``<mimic>``, and fingers that stay behind."""
+"""Couplings of joints: those that a file states outside of ``<mimic>``, and fingers left behind by their twins."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -8,11 +8,11 @@ from lxml import etree
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Tree, bodies, body_of
 
-DRIVERS = ("ros2_control", "transmission")  # what describes a robot's drives, and may couple its joints
+DRIVERS = ("ros2_control", "transmission")  # elements that describe drives, and may couple joints
 
 
 class _Stated(NamedTuple):
-    """A coupling as a file states it; ``where``: in which element."""
+    """A coupling as a file states it; ``where`` is the element."""
 
     follower: str
     source: str
@@ -22,10 +22,9 @@ class _Stated(NamedTuple):
 
 
 def adopt(root: etree._Element, notes: Notes) -> None:
-    """Gives joints the ``<mimic>`` that a simulator's plugin or a driver's parameters state, in place.
+    """Gives joints, in place, the ``<mimic>`` that a simulator's plugin or a driver's parameters state.
 
-    The URDF's own ``<mimic>`` goes first. A coupling with a joint that is not there, or that would close a loop, is left out with
-    a note.
+    The URDF's own ``<mimic>`` has priority. A coupling with an unknown joint, or one that closes a loop, is left out with a note.
     """
     joints = {(j.get("name") or "").strip(): j for j in root.findall("joint")}
     follows = {name: (j.find("mimic").get("joint") or "").strip() for name, j in joints.items() if j.find("mimic") is not None}
@@ -46,7 +45,8 @@ def adopt(root: etree._Element, notes: Notes) -> None:
 
 
 def _stated(root: etree._Element) -> Iterator[_Stated]:
-    """Gazebo's plugins name a ``joint`` and the ``mimicJoint`` that follows it; ros2_control gives the follower a parameter."""
+    """Yields stated couplings: Gazebo's plugins name a ``joint`` and its follower, and ros2_control gives the follower a
+    parameter."""
     for plugin in root.iterfind("gazebo//plugin"):
         source, follower, multiplier, offset = (
             (plugin.findtext(tag) or "").strip() for tag in ("joint", "mimicJoint", "multiplier", "offset")
@@ -62,7 +62,7 @@ def _stated(root: etree._Element) -> Iterator[_Stated]:
 
 
 def _followed(source: str, follows: dict[str, str]) -> set[str]:
-    """A joint, and those that it follows by way of others."""
+    """Returns a joint and all joints that it follows, directly or not."""
     found: set[str] = set()
     while source and source not in found:
         found.add(source)
@@ -71,11 +71,11 @@ def _followed(source: str, follows: dict[str, str]) -> set[str]:
 
 
 def warn_of_frozen(read: Tree, used: Tree, gripper: tuple[str, ...], notes: Notes) -> None:
-    """Names the fingers that are held still while their twins move: joints of the same kind on the same body.
+    """Warns of fingers that are held still while their twins move: joints of the same kind on the same body.
 
     Args:
-        read, used: the robot before and after what does not belong to arm and gripper was held still.
-        gripper: joints that drive it.
+        read, used: the robot before and after holding still what belongs to neither arm nor gripper.
+        gripper: joints that drive the gripper.
     """
     parts = bodies(read)
 

@@ -1,4 +1,4 @@
-"""What is drawn of a robot: visual geoms, and the mesh files that they need."""
+"""Drawing of a robot: its visual geoms, and the mesh files that they need."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,17 +13,17 @@ from mjx_nero.urdf import meshes, primitives
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Pose, Shape
 
-MAX_FACES = 100_000  # a part; MuJoCo takes 200,000 of an STL
-LEAST_FACES = 1_000  # that a part keeps
-MAX_DRAWN = 300_000  # triangles of all meshes that are drawn, shared by them alike; finer ones cost seconds and show no more
-MAX_PARTS = 8  # colours of one mesh that are kept apart
-MAX_FILES = model_file.MAX_MESHES  # that are drawn
+MAX_FACES = 100_000  # per part; MuJoCo reads up to 200,000 from an STL
+LEAST_FACES = 1_000  # a part keeps at least these
+MAX_DRAWN = 300_000  # triangles of all drawn meshes together; finer ones cost seconds and look the same
+MAX_PARTS = 8  # greatest number of colours of one mesh
+MAX_FILES = model_file.MAX_MESHES  # drawn mesh files
 GREY = (0.75, 0.76, 0.78, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Visual:
-    """A visual geom: of MuJoCo's type ``kind`` and size (a mesh: the name of its file), at ``pose`` in the link [4, 4]."""
+    """A visual geom of MuJoCo's type ``kind`` and size (for a mesh, the name of its file), at ``pose`` in the link [4, 4]."""
 
     kind: str
     size: tuple[float, ...]
@@ -33,14 +33,14 @@ class Visual:
 
 
 class MeshFiles:
-    """Makes visual geoms of shapes, and gathers the mesh files to write: one for each mesh, scale and colour.
+    """Makes visual geoms of shapes, and collects the mesh files to write, one per mesh, scale and colour.
 
     Args:
-        count: meshes that are to be drawn, which share ``MAX_DRAWN`` triangles.
-        spend: counts work that grows with triangles, and refuses too much of it.
+        count: number of meshes to draw, which share ``MAX_DRAWN`` triangles.
+        spend: counts work that grows with triangles, and refuses excess.
 
     Attributes:
-        stl: name -> content of the files.
+        stl: name -> content of a file.
 
     Raises:
         UserError: there are too many files, or they are too large.
@@ -52,7 +52,7 @@ class MeshFiles:
         self._written: dict[tuple, list[tuple[str, tuple[float, ...]]]] = {}
 
     def visuals(self, shape: Shape, stem: str, parts: list[meshes.Part], link: str) -> list[Visual]:
-        """The geoms of a link's shape, whose mesh has the name ``stem`` and these parts."""
+        """Makes the geoms of a link's shape, whose mesh has the name ``stem`` and the given parts."""
         exact = primitives.exact(shape)
         if exact is not None:
             return [Visual(exact.kind, exact.size, exact.pose, shape.rgba or GREY)]
@@ -92,29 +92,29 @@ class MeshFiles:
 
 
 def scaled(mesh: trimesh.Trimesh, scale: tuple[float, ...]) -> trimesh.Trimesh:
-    """A mesh in another scale, along each axis."""
-    faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces  # a mirror turns the triangles inside out
+    """Scales a mesh along each axis."""
+    faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces  # a mirror image turns triangles inside out
     return trimesh.Trimesh(mesh.vertices * np.array(scale), faces, process=False)
 
 
 def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """Vertices moved together on a grid, about the finest that leaves at most so many triangles."""
+    """Merges vertices on about the finest grid that leaves at most ``most`` triangles."""
     lower, extent, cells = mesh.vertices.min(0), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0, 512
     while True:
         grid = np.floor((mesh.vertices - lower) / (extent / cells)).astype(np.int64)
         _, first, group = np.unique(grid @ [1 << 20, 1 << 10, 1], return_index=True, return_inverse=True)
         faces = group[mesh.faces]
         faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
-        if len(faces) > most:  # equal ones
+        if len(faces) > most:  # remove duplicates
             key = (faces[:, 0] * len(first) + faces[:, 1]) * len(first) + faces[:, 2]
             faces = faces[np.unique(key, return_index=True)[1]]
         if len(faces) <= most:
             return trimesh.Trimesh(mesh.vertices[first], faces, process=False)
-        cells = int(cells * min(0.8, np.sqrt(most / len(faces))))  # a surface has as many as the square of the cells
+        cells = int(cells * min(0.8, np.sqrt(most / len(faces))))  # triangles grow with the square of the cells
 
 
 def _loads(stl: bytes) -> bool:
-    """Whether MuJoCo takes the mesh: not, if it is flat."""
+    """True if MuJoCo accepts the mesh; it refuses flat ones."""
     spec = mujoco.MjSpec()
     spec.assets = {"m.stl": stl}
     spec.add_mesh(name="m", file="m.stl")

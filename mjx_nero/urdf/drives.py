@@ -1,4 +1,4 @@
-"""Drives of an imported robot: gains from a file, or worked out from the inertia that each joint moves."""
+"""Drives of an imported robot: gains from a file, or computed from the inertia that each joint moves."""
 
 import dataclasses
 import pathlib
@@ -19,26 +19,26 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint
 
 FREQUENCY = 20.0  # [rad/s] natural frequency of the arm's drives: a tenth of what 100 physics steps a second can follow
-STRETCH = 0.05  # [rad, m] position error at which a drive gives its full effort, at the least
-STUCK = 0.01  # [rad, m] most that dry friction keeps a joint from where it should be
+STRETCH = 0.05  # [rad, m] least position error at which a drive gives its full effort
+STUCK = 0.01  # [rad, m] greatest position error that dry friction may leave
 DT = 1 / 60  # [s] longest physics step of the tasks
-USUAL = 1.5  # [rad/s, m/s] of a joint whose velocity the file leaves open
-SPEED = 2.0  # [rad/s, m/s] position targets move no faster, as beside people
+USUAL = 1.5  # [rad/s, m/s] speed of a joint whose file gives none
+SPEED = 2.0  # [rad/s, m/s] greatest speed of position targets, as is usual near people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
-FORCE = 60.0  # [N] most that a finger gives
-PRESS = 250.0  # [N/kg] and most for the mass of what the gripper can lift: pads sink into it by a millimetre then
-HOLD = 20.0  # [N/kg] and the least: two pads then hold twice the weight of that at a friction of 0.5
-PLACEHOLDER = 1.0  # [N m, N] exporters write it where nobody gave an effort
+FORCE = 60.0  # [N] greatest force of a finger
+PRESS = 250.0  # [N/kg] greatest force per mass of the liftable cube; pads then sink in by a millimetre
+HOLD = 20.0  # [N/kg] least force per mass: two pads then hold twice the weight at a friction of 0.5
+PLACEHOLDER = 1.0  # [N m, N] what exporters write for an unknown effort
 FINGER = 0.3  # [kg] rotor inertia of a sliding finger, or at the end of a turning one (why: assets/nero/nero.xml)
 Rows = dict[str, dict[str, float]]
 
 
 def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
-    """``joint -> {stiffness, damping, effort, speed}``, the last two optional, from a YAML file.
+    """Reads ``joint -> {stiffness, damping, effort, speed}`` from a YAML file; the last two are optional.
 
     Raises:
-        UserError: no such file, no YAML, an unknown joint or column, or a value that is not above 0 (damping: below 0) or is
-            beyond ``robot_file.MAX_NUMBER``.
+        UserError: the file is missing or not YAML, a joint or column is unknown, or a value is not positive (damping: negative)
+            or beyond ``robot_file.MAX_NUMBER``.
     """
     raw = files.read_yaml(path)
     if not isinstance(raw, Mapping) or not raw:
@@ -56,7 +56,7 @@ def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
 
 
 def carried(model: mujoco.MjModel) -> dict[str, float]:
-    """The most inertia [kg m2, kg] that each joint moves, rotors apart, over 64 random poses."""
+    """Greatest inertia that each joint moves over 64 random poses, without rotors [kg m2, kg]."""
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
     model.dof_armature[:] = 0.0
     full, most = np.zeros((model.nv, model.nv)), np.zeros(model.nv)
@@ -69,14 +69,14 @@ def carried(model: mujoco.MjModel) -> dict[str, float]:
 
 
 def armature(joint: Joint, inertia: float, lever: float | None) -> float:
-    """Rotor inertia [kg m2, kg], which URDFs lack.
+    """Chooses a rotor inertia, which URDFs lack [kg m2, kg].
 
-    Of an arm's joint 5% of the inertia that it moves, within 0.01 to 1 kg m2, so that stiff drives stay well conditioned on light
-    wrists; of a gripper's joint ``FINGER`` at the fingers' end.
+    An arm joint gets 5% of the inertia that it moves, within 0.01 to 1 kg m2, so that stiff drives stay well conditioned on light
+    wrists. A gripper joint gets ``FINGER`` at the end of the fingers.
 
     Args:
-        inertia: of ``carried``.
-        lever: of a gripper's joint, the distance of its end from the axis [m].
+        inertia: result of ``carried``.
+        lever: distance from a gripper joint's axis to the finger's end [m]; None for other joints.
     """
     if joint.type == "prismatic":
         return FINGER if lever is not None else float(np.clip(0.05 * inertia, FINGER, 10.0))
@@ -94,14 +94,19 @@ def rows(
     given: Rows,
     notes: Notes,
 ) -> Rows:
-    """Stiffness, damping, effort and speed of every driven joint: as given, else by rule.
+    """Returns stiffness, damping, effort and speed of every driven joint: as given, or else by these rules.
 
-    Effort and speed are the URDF's limits, the latter at most ``SPEED``; an effort of 1 that all joints have, or that hardly
-    moves its joint, is none. An arm's drive has the natural frequency ``FREQUENCY`` with the most inertia that the joint moves,
-    more if the joint's own damping would make it creep or its friction stop it more than ``STUCK`` away, less if it would reach
-    its full effort within ``STRETCH``; a finger's gives its full effort at ``SQUEEZE``: beside what the joints' own friction
-    takes at most ``FORCE`` at its end, and ``PRESS`` for each kilogram of the cube that it can lift, with a warning if that is
-    less than ``HOLD`` for each. Damping is what the joints lack to critical, at the package's longest physics step too.
+    Effort and speed are the URDF's limits, and speed is at most ``SPEED``. An effort of 1 that all joints share, or that hardly
+    moves its joint, counts as missing.
+
+    An arm drive has the natural frequency ``FREQUENCY`` at the greatest inertia that the joint moves. It is stiffer if the
+    joint's damping would make it creep, or its friction would stop it more than ``STUCK`` away, and softer if it would reach full
+    effort within ``STRETCH``.
+
+    A finger's drive gives full effort at ``SQUEEZE``. On top of the joints' friction it gives at most ``FORCE`` at its end, and
+    at most ``PRESS`` per kilogram of the cube it can lift; less than ``HOLD`` per kilogram gets a warning.
+
+    Damping adds what the joints lack to critical, also at the package's longest physics step.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
@@ -127,7 +132,7 @@ def rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Load:
-    """Of a joint and its followers: inertia [kg m2, kg], damping [N m s/rad, N s/m] and dry friction [N m, N]."""
+    """Inertia [kg m2, kg], damping [N m s/rad, N s/m] and dry friction [N m, N] of a joint and its followers."""
 
     inertia: float
     damping: float
@@ -145,7 +150,7 @@ def _load(joint: Joint, parts: Mapping[str, Body], inertia: Mapping[str, float],
 
 
 def _finger(joint: Joint, load: _Load, lever: float, force: float, unsaid: bool, notes: Notes) -> dict[str, float]:
-    """Stiffness, effort and speed of a finger's drive that grips with ``force`` [N] at most at its ``lever`` [m]."""
+    """Computes stiffness, effort and speed of a finger's drive that grips with at most ``force`` [N] at its ``lever`` [m]."""
     wanted = FORCE / 3 * lever + load.friction if unsaid or not joint.effort else joint.effort
     effort = min(wanted, force * lever + load.friction)
     if joint.effort and joint.effort > effort:
@@ -158,9 +163,9 @@ def _finger(joint: Joint, load: _Load, lever: float, force: float, unsaid: bool,
 
 
 def _arm(joint: Joint, load: _Load, unsaid: bool, notes: Notes) -> dict[str, float]:
-    """Stiffness, effort and speed of an arm's drive."""
+    """Computes stiffness, effort and speed of an arm's drive."""
     stiffness = max(FREQUENCY**2 * load.inertia, FREQUENCY / 2 * load.damping, load.friction / STUCK)
-    stiffness = min(stiffness, MAX_NUMBER)  # what robot.yaml may hold
+    stiffness = min(stiffness, MAX_NUMBER)  # the bound of robot.yaml
     effort = joint.effort and min(joint.effort, MAX_NUMBER)
     if effort is None or (effort == PLACEHOLDER and (unsaid or effort / load.inertia < 2.0)):
         kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} is a placeholder: now ")
@@ -173,7 +178,7 @@ def _arm(joint: Joint, load: _Load, unsaid: bool, notes: Notes) -> dict[str, flo
 
 
 def _weak(effort: float, friction: float, lever: float, cube: float) -> str:
-    """What to say of a finger's effort that does not hold ``cube`` [kg] at ``lever`` [m], 1 of a slide."""
+    """Writes the warning about a finger whose effort cannot hold ``cube`` [kg] at ``lever`` [m] (1 for a slide)."""
     grip = max(effort - friction, 0.0) / lever
     return (
         f"effort {effort:.3g} grips with {grip:.2g} N, too little for a cube of {1000 * cube:.3g} g: "

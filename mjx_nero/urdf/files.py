@@ -1,4 +1,4 @@
-"""The files that a URDF names, found within given folders only."""
+"""Files that a URDF names, found only within given folders."""
 
 import functools
 import os
@@ -14,31 +14,32 @@ from mjx_nero.types import UserError
 
 MAX_URDF = 10_000_000  # bytes
 MAX_PACKAGE = 100_000  # bytes of a package.xml
-LEVELS = 5  # that a package's folder lies above the URDF at most
-_DEPTH = 32  # last folders of an absolute path that may be a package
-_PARTS = ("urdf", "robots", "xacro")  # folders of a package that its URDFs lie in
+LEVELS = 5  # greatest number of levels that a package's folder lies above the URDF
+_DEPTH = 32  # how many of an absolute path's last folders may be a package
+_PARTS = ("urdf", "robots", "xacro")  # folders of a package that hold its URDFs
 read = read_bytes
 
 
 class Missing(Exception):
-    """A file that cannot be used; the message says why. The importer goes on without it."""
+    """A file that cannot be used; the message says why. The importer continues without it."""
 
 
 class Absent(Missing):
-    """There is no such file."""
+    """A file that does not exist."""
 
 
 class Roots:
-    """The folders that a URDF may name files in.
+    """The folders in which a URDF may name files.
 
-    These are the URDF's own folder; the package that it lies in, the nearest folder with a ``package.xml`` at most ``LEVELS``
-    above, or without one the folder above, if the URDF lies in a folder called ``urdf``, ``robots`` or ``xacro``; ``packages``;
-    and packages that it names which lie beside it or beside a folder above it: ``NAME/package.xml``. Inside its own folders
-    a package is a folder called so, or that of a ``package.xml`` that says so. A folder of another name serves for none.
+    They are: the URDF's own folder; its package, the nearest folder with a ``package.xml`` at most ``LEVELS`` above (or the
+    parent folder, if there is none and the URDF lies in ``urdf``, ``robots`` or ``xacro``); the given ``packages``; and packages
+    that the URDF names, if ``NAME/package.xml`` lies beside it or beside a folder above.
+
+    Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name.
 
     Args:
         urdf: path of the URDF.
-        packages: name -> folder, for ``package://name/...``.
+        packages: name -> folder for ``package://name/...``.
 
     Raises:
         UserError: a package's folder does not exist.
@@ -61,13 +62,16 @@ class Roots:
         self.folders = [*self._own, *self.packages.values()]
 
     def find(self, name: str, base: pathlib.Path | None = None) -> pathlib.Path:
-        """The file that a URDF calls ``name``: ``package://``, ``model://``, ``file://``, absolute, or relative to ``base``.
+        """Finds the file that a URDF calls ``name``: ``package://``, ``model://``, ``file://``, absolute, or relative to
+        ``base``.
+
+        An absolute path from another machine is searched for in the package that it passes through.
 
         An absolute path of another machine is looked for in the package that it passes through.
 
         Raises:
-            UserError: it lies outside the folders, be it by a symbolic link.
-            Missing: there is no such file.
+            UserError: the file lies outside the folders, even by a symbolic link.
+            Missing: the file does not exist.
         """
         scheme, _, rest = name.replace("\\", "/").rpartition("://")
         scheme = re.split(r"[/:]+", scheme)[-1]  # file://$(find NAME)/... is file://package://NAME/...
@@ -98,10 +102,10 @@ class Roots:
         raise refused or Absent(f"there is no such file{lacking}")
 
     def _places(self, package: str, plain: bool = True) -> list[pathlib.Path]:
-        """The folders that are a package, the nearest to the URDF first; the given one alone, if one is given.
+        """Lists the folders that may be a package, the nearest to the URDF first; only the given one, if one is given.
 
-        Those outside the own folders need a ``package.xml`` and are no links; they join ``folders``. Of those inside, ``plain``
-        ones need none.
+        A folder outside the own folders needs a ``package.xml`` and must not be a link; it joins ``folders``. Inside them,
+        ``plain`` folders need none.
         """
         if package in self.packages:
             return [self.packages[package]]
@@ -122,18 +126,18 @@ class Roots:
         return places
 
     def _foreign(self, path: str) -> Iterator[tuple[pathlib.Path, str]]:
-        """Where the file of an absolute path may lie here: the packages that the path passes through, the outermost first."""
+        """Yields where a file with an absolute path may lie here: the packages that the path passes through, outermost first."""
         if not re.match(r"/|[A-Za-z]:/", path):
             return
         parts = [part for part in path.split("/") if part][-_DEPTH:]
         for i, part in enumerate(parts[:-1]):
-            if part not in _PARTS:  # behind share/ stands a package; elsewhere a folder may be just called so: meshes
+            if part not in _PARTS:  # a folder below share/ is a package; elsewhere a name like meshes proves nothing
                 for place in self._places(part, plain=parts[i - 1 : i] == ["share"]):
                     yield place, "/".join(parts[i + 1 :])
 
     @functools.cached_property
     def _named(self) -> list[tuple[str, pathlib.Path]]:
-        """Name and folder of the packages that the own folders are: by the folder's name, by its ``package.xml``."""
+        """Name and folder of the own folders as packages: by folder name and by ``package.xml``."""
         found = [(folder.name, folder) for folder in self._own]
         for own in dict.fromkeys(self._own):
             file = own / "package.xml"
@@ -142,11 +146,12 @@ class Roots:
         return found
 
     def _inside(self, path: pathlib.Path, name: str) -> pathlib.Path | None:
-        """``path`` without links and ``..`` if it is a regular file within the folders, None if it is none."""
+        """Resolves links and ``..`` in ``path``; returns it if it is a regular file within the folders, None if it is not a
+        file."""
         try:
             real = path.resolve()
             regular = stat.S_ISREG(real.stat().st_mode)
-        except (OSError, RuntimeError, ValueError):  # absent, no permission, a loop of links, too long a name
+        except (OSError, RuntimeError, ValueError):  # absent, forbidden, a loop of links, or too long a name
             real, regular = pathlib.Path(os.path.normpath(path)), False
         if not any(real.is_relative_to(folder) for folder in self.folders):
             raise UserError(f"{name!r} lies outside the URDF's folder: name its folder with --package NAME=DIR, if you trust it")
@@ -154,7 +159,7 @@ class Roots:
 
 
 def package_name(folder: pathlib.Path) -> str:
-    """What the package in a folder is called: as its package.xml says, or as the folder is."""
+    """Name of the package in a folder: from its package.xml, or else the folder's own."""
     try:
         root = parse_xml(read(folder / "package.xml", MAX_PACKAGE), "package.xml")
     except UserError:
@@ -163,6 +168,6 @@ def package_name(folder: pathlib.Path) -> str:
 
 
 def _private() -> tuple[pathlib.Path, ...]:
-    """Folders that are no package, whatever lies in them."""
+    """Folders that never count as packages."""
     home = pathlib.Path.home()
     return (home, *home.parents)

@@ -1,4 +1,4 @@
-"""Which joints are a gripper's, which bodies it grips with, and where its joints are when it is open and when it is closed."""
+"""Fingers: which joints belong to a gripper, which bodies grip, and where the joints are when it is open and closed."""
 
 import dataclasses
 import itertools
@@ -16,10 +16,10 @@ from mjx_nero.urdf.swing import Meeting, Swing, endless, limits, surface
 from mjx_nero.urdf.tree import Body, Pose, Tree, Vec, below, bodies, poses
 
 _NAMES = re.compile(r"grip|finger|jaw|hand|knuckle|claw", re.IGNORECASE)
-MOST_JOINTS = 4  # driven joints of a finger
-JAW = 2.8  # [rad] the only jaw of a gripper opens by no more: a hand that turns further is at the wrist
-STILL = 2e-3  # [m] a joint that changes no distance between fingers by more does not grip
-ALIKE = 0.8  # of what the two fingers part by that part most: a third one parts by more
+MOST_JOINTS = 4  # greatest number of driven joints of a finger
+JAW = 2.8  # [rad] greatest opening of a single jaw; a joint that turns further is a wrist
+STILL = 2e-3  # [m] a joint grips if it changes a distance between fingers by more
+ALIKE = 0.8  # a third finger parts by more than this share of the best pair's
 Chosen = tuple[Tree, tuple[str, ...], str]
 
 
@@ -28,18 +28,18 @@ class Hand:
     """The gripper, or the last link of an arm that has none.
 
     Attributes:
-        joints: that drive it; empty without a gripper.
+        joints: the joints that drive it; empty without a gripper.
         open, close: their positions [rad, m].
-        link: that the fingers move against; ``site`` is given in its frame.
-        fingers: bodies that grip.
+        link: the link that the fingers move against; ``site`` is in its frame.
+        fingers: the bodies that grip.
         site: pose of the grasp point in ``link`` [4, 4].
-        approach, opening: unit vectors in the frame of ``site`` [3]: where the fingers point, along which they open.
-        pads: link -> collision shape in its frame; the fixed jaw of a gripper with one moving jaw is among them.
-        backs: link -> shape of the rest of a finger.
-        inside: bodies that only the gripper's joints move.
-        gap, closed: between the pads when open and when closed [m]; a gap of 0: unknown.
-        pad: size of the first along the approach, across, and along the opening [m].
-        grip: where the middle of a cube is that it grips, from the grasp point, in its frame [m].
+        approach, opening: unit vectors in the frame of ``site`` [3]: where the fingers point, and along what they open.
+        pads: link -> collision shape in its frame, including the fixed jaw of a gripper with one moving jaw.
+        backs: link -> shape of the finger's rest.
+        inside: the bodies that only the gripper's joints move.
+        gap, closed: distance between the pads when open and when closed [m]; a gap of 0 is unknown.
+        pad: size of the first pad along the approach, across, and along the opening [m].
+        grip: middle of a gripped cube, in the grasp point's frame [m].
     """
 
     joints: tuple[str, ...]
@@ -61,15 +61,15 @@ class Hand:
 
 @dataclasses.dataclass(frozen=True)
 class Grip:
-    """The bodies that grip, and how a gripper's joints move them.
+    """The bodies that grip, and how the gripper's joints move them.
 
     Attributes:
-        joints: that drive it; ``open`` and ``close`` their positions [rad, m].
-        fork: body that carries the gripper.
-        link: of the fork, on which the first joint hangs.
-        fingers: bodies that move, those first of which one meets the other most.
-        jaw: link of the fork that the only finger meets; empty if two fingers move.
-        meeting: of the first finger and its counterpart.
+        joints: the joints that drive it, with their positions ``open`` and ``close`` [rad, m].
+        fork: the body that carries the gripper.
+        link: the fork's link that carries the first joint.
+        fingers: the moving bodies, the pair that meets best first.
+        jaw: the fork's link that a single finger meets; empty if two fingers move.
+        meeting: the meeting of the first finger and its counterpart.
     """
 
     joints: tuple[str, ...]
@@ -83,17 +83,17 @@ class Grip:
 
 
 def choose(tree: Tree, looks: Mapping[str, Look], gripper: Sequence[str] | None, notes: Notes) -> Chosen:
-    """The robot with arm and gripper alone moving, the joints that drive the gripper, and the body on which it hangs.
+    """Returns the robot with only arm and gripper moving, the gripper's joints, and the body that carries it.
 
-    The gripper is what hangs on the body that ends the arm: joints that change the distance between fingers, driven or by
-    ``mimic``; or the last joint, if its name or its link's speaks of a gripper. Others there, a spinning horn for show or the
-    many joints of a human hand, are held still.
+    The gripper hangs on the body that ends the arm. It consists of joints that change the distance between fingers, driven or by
+    ``mimic``; or of the last joint, if its name or its link's suggests a gripper. Other joints there, such as a decorative horn
+    or the many joints of a human hand, are held still.
 
     Args:
-        gripper: joints that drive it, in place of the guess; empty for none.
+        gripper: the joints that drive it, instead of a guess; empty: no gripper.
 
     Raises:
-        UserError: ``gripper`` names what is not there.
+        UserError: ``gripper`` names an unknown joint.
     """
     parts = bodies(tree)
     limb = chain.limb(parts)
@@ -108,15 +108,15 @@ def choose(tree: Tree, looks: Mapping[str, Look], gripper: Sequence[str] | None,
 
 
 def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], closed: Mapping[str, float], notes: Notes) -> Grip:
-    """Which bodies grip: the two that part most and come nearest as the joints move, and others that do so as well as they.
+    """Finds the bodies that grip: the two that part most and come nearest as the joints move, and others that do so equally well.
 
-    Bodies without shapes, as the frame of a tip, are none of them.
+    Bodies without shapes, such as the frame of a tip, do not count.
 
     Args:
-        open, closed: positions of some joints, in place of the guess [rad, m].
+        open, closed: positions of some joints, instead of a guess [rad, m].
 
     Raises:
-        UserError: ``open`` or ``closed`` names another joint than the gripper's, or they are the same.
+        UserError: ``open`` or ``closed`` names a joint outside the gripper, or both are the same.
     """
     for flag, given in (("--open", open), ("--closed", closed)):
         for name in given:
@@ -154,7 +154,7 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
 
 
 def _fingers(swing: Swing, meetings: Sequence[Meeting]) -> tuple[str, ...]:
-    """The two bodies that meet first, and of each other branch of the gripper the best, if that meets as well."""
+    """Returns the two bodies of the best meeting, and the best body of each other branch that meets as well."""
     worth: dict[str, float] = {}
     for meeting in meetings:
         for name in meeting.names if not meeting.fixed else ():
@@ -169,14 +169,14 @@ def _fingers(swing: Swing, meetings: Sequence[Meeting]) -> tuple[str, ...]:
 
 
 def _branch(swing: Swing, name: str) -> str:
-    """The body next to the fork on which a finger hangs."""
+    """Returns the body next to the fork on which a finger hangs."""
     while swing.parts[name].parent in swing.inside:
         name = swing.parts[name].parent
     return name
 
 
 def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Look], notes: Notes) -> tuple[tuple[str, ...], str]:
-    """Driven joints of the gripper, and the body on which it hangs."""
+    """Guesses the driven joints of the gripper, and the body that carries it."""
     branches = [_driven(parts, below(parts, b.name)) for b in parts.values() if b.parent == end and b.joint]
     if branches and parts[end].parent:
         if max(map(len, branches)) > MOST_JOINTS:
@@ -186,7 +186,7 @@ def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Loo
         return tuple(_gripping(parts, end, [j for branch in branches for j in branch], looks)), end
     here, above = end, parts[end].parent
     last = parts[here].joint
-    while last and last.mimic and above:  # what follows another joint is driven by that one
+    while last and last.mimic and above:  # a follower is driven by the joint above
         here, above = above, parts[above].parent
         last = parts[here].joint
     if above and parts[above].joint and last and (_NAMES.search(last.name) or _NAMES.search(last.child)):
@@ -203,7 +203,7 @@ def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Loo
 
 
 def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mapping[str, Look]) -> list[str]:
-    """Those of the joints that change the distance between two fingers; of endless ones none, if others do."""
+    """Selects the joints that change the distance between two fingers; endless joints only if no others do."""
     by_name = {b.joint.name: b.joint for b in parts.values() if b.joint}
     inside = below(parts, end)[1:]
     leaves = [n for n in inside if not any(parts[m].parent == n for m in inside)]
@@ -238,6 +238,6 @@ def _driven(parts: dict[str, Body], names: Sequence[str]) -> list[str]:
 
 
 def _spot(body: Body, looks: Mapping[str, Look]) -> Vec:
-    """A point that stands for a finger: the mean of its surface, or its centre of mass."""
+    """Returns a point that represents a finger: the mean of its surface, or its centre of mass."""
     points = surface(body.links, looks)
     return body.mass.com if points is None else points.mean(0)

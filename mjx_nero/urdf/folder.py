@@ -1,4 +1,4 @@
-"""The model folder: written whole or not at all."""
+"""The model folder of an import, written whole or not at all."""
 
 import contextlib
 import dataclasses
@@ -19,16 +19,16 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf.report import Report
 
 _REPORT = "report.json"
-_NAMES = re.compile(r"model\.xml|robot\.yaml|report\.json|meshes/[^/]+\.stl")  # all that an import writes
+_NAMES = re.compile(r"model\.xml|robot\.yaml|report\.json|meshes/[^/]+\.stl")  # everything that an import writes
 _MAX_REPORT = 50_000_000  # bytes
 _MAX_FILE = 1_000_000_000  # bytes
 
 
 def check(out: pathlib.Path, force: bool) -> None:
-    """Whether the folder may be made: there is none, it is empty, or with ``force`` it holds what an import has written alone.
+    """Checks that the folder may be made: it is absent or empty, or, with ``force``, it holds only what an import wrote.
 
     Raises:
-        UserError: it may not; the line names the first file that is not an import's, or was changed since.
+        UserError: it may not; the message names the first file that no import wrote, or that has changed since.
     """
     try:
         if out.is_symlink() or out.exists() and not out.is_dir():
@@ -53,7 +53,7 @@ def check(out: pathlib.Path, force: bool) -> None:
 
 
 def _entries(out: pathlib.Path) -> Iterator[str]:
-    """All that lies in the folder but its ``meshes``; links are not followed."""
+    """Lists everything in the folder except ``meshes`` itself; links are not followed."""
     for entry in os.scandir(out):
         if entry.name == "meshes" and entry.is_dir(follow_symlinks=False):
             yield from (f"meshes/{inner.name}" for inner in os.scandir(entry.path))
@@ -62,7 +62,7 @@ def _entries(out: pathlib.Path) -> Iterator[str]:
 
 
 def _written(out: pathlib.Path) -> dict[str, str]:
-    """File -> hash, as the report of the import says that made the folder; empty if there is none that says so."""
+    """Returns file -> hash from the report of the import that made the folder; empty without such a report."""
     try:
         listed = json.loads(files.read_bytes(out / _REPORT, _MAX_REPORT))["files"]
         return {name: str(value) for name, value in listed.items() if _NAMES.fullmatch(name)} | {_REPORT: ""}
@@ -75,10 +75,10 @@ def _hash(content: bytes) -> str:
 
 
 def write(out: pathlib.Path, text: str, stl: Mapping[str, bytes], robot: RobotCfg, report: Report, force: bool) -> None:
-    """Makes the folder beside its place, hidden, and moves it there once MuJoCo has taken the model.
+    """Makes the folder under a hidden name beside its place, and moves it there once MuJoCo has accepted the model.
 
     Raises:
-        UserError: it cannot be written, or MuJoCo refuses the model.
+        UserError: the folder cannot be written, or MuJoCo refuses the model.
     """
     made = out.parent / f".{out.name[:200]}.{uuid.uuid4().hex[:8]}"
     absent = [folder for folder in (out.parent, *out.parent.parents) if not os.path.exists(folder)]
@@ -102,22 +102,22 @@ def write(out: pathlib.Path, text: str, stl: Mapping[str, bytes], robot: RobotCf
         with contextlib.suppress(OSError, ValueError):
             if made.exists():
                 shutil.rmtree(made, ignore_errors=True)
-            for folder in absent:  # those that it made, innermost first, if they are still empty
+            for folder in absent:  # parents made here, innermost first, if they are still empty
                 folder.rmdir()
 
 
 def record(out: pathlib.Path, name: str, content: Any) -> None:
-    """Adds an entry to the report of an import, or replaces it; the rest stays.
+    """Adds or replaces an entry of an import's report.
 
     Raises:
-        UserError: there is no report, or it cannot be written.
+        UserError: the report is missing or cannot be written.
     """
     held = files.read_json(out / _REPORT, _MAX_REPORT)
     files.write_json(out / _REPORT, {**held, name: content})
 
 
 def _move(made: pathlib.Path, out: pathlib.Path, force: bool) -> None:
-    """``made`` takes the place of ``out``, of which nothing but an earlier import's files is deleted."""
+    """Moves ``made`` to ``out``, deleting only an earlier import's files there."""
     check(out, force)
     if not out.exists():
         made.rename(out)

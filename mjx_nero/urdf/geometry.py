@@ -1,4 +1,4 @@
-"""Shapes of the links: what is drawn, and the surfaces that collision shapes are fitted to."""
+"""Shapes of the links: visual geoms, and the surfaces that collision shapes are fitted to."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Shape, Tree, Vec
 
 MAX_SHAPES = 4_000  # visuals and collisions of a robot
-MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once for every scale
+MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once per scale
 MAX_SECONDS = 60.0  # [s] of processor time
 MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
 STAND_IN = (0.9, 0.6, 0.2, 1.0)
@@ -22,9 +22,9 @@ STAND_IN = (0.9, 0.6, 0.2, 1.0)
 
 @dataclasses.dataclass
 class Look:
-    """Of one link: visual geoms, and the surface to fit, in the link's frame: points [n, 3] and volume [m3] of each collision.
+    """Shapes of one link: visual geoms, and points [n, 3] and volume [m3] of each collision surface, in the link's frame.
 
-    ``exact`` are those collisions that are primitives already. ``guessed``: a stand-in, for want of meshes.
+    ``exact`` holds the collisions that are primitives already. ``guessed`` marks a stand-in for missing meshes.
     """
 
     drawn: list[drawing.Visual]
@@ -38,10 +38,10 @@ class Look:
 
 
 class Work:
-    """Counts the triangles that were worked on, and the time since it was made.
+    """Counts processed triangles, and the time since it was made.
 
     Attributes:
-        triangles: so far.
+        triangles: triangles so far.
     """
 
     def __init__(self) -> None:
@@ -51,20 +51,20 @@ class Work:
         """Counts work that grows with triangles.
 
         Raises:
-            UserError: that was too much.
+            UserError: the limit is exceeded.
         """
         self.triangles += sum(len(mesh.faces) for mesh, _ in parts)
         seconds = time.process_time() - self._started
         if self.triangles > MAX_WORK or seconds > MAX_SECONDS:
             spent = f"{self.triangles:,} triangles in {seconds:.0f} s"
             raise UserError(
-                f"its meshes, a time for each scale, come to {spent}: {MAX_WORK:,} in {MAX_SECONDS:g} s are the most; "
+                f"its meshes, counted once per scale, took {spent}: the limit is {MAX_WORK:,} in {MAX_SECONDS:g} s; "
                 "use simpler ones"
             )
 
 
 class Looks:
-    """Loads the meshes of all links: what is drawn of each, and the surfaces that collision shapes are fitted to.
+    """Loads the meshes of all links: their visual geoms, and the surfaces for collision shapes.
 
     Attributes:
         of: link -> its ``Look``.
@@ -83,9 +83,9 @@ class Looks:
         drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
         self._files = drawing.MeshFiles(len(drawn), self._work.spend, notes)
         self.spans: dict[tuple[str, tuple[float, ...]], float] = {}
-        self._absent: dict[str, str] = {}  # name of a mesh -> where it was looked for
+        self._absent: dict[str, str] = {}  # name of a mesh -> where it was searched for
         seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
-        self._beside = {n for links in seen for n in links}  # links whose body has looks: what has none of its own is hidden
+        self._beside = {n for links in seen for n in links}  # links of bodies with visuals: a link without its own is hidden
         self.of = {name: self._look(link) for name, link in tree.links.items()}
         if self._absent:
             notes.add("warning", "robot", tree.name, _told(self._absent))
@@ -97,15 +97,18 @@ class Looks:
 
     @property
     def stl(self) -> dict[str, bytes]:
-        """Name -> content of the mesh files of the model."""
+        """Name -> content of the model's mesh files."""
         return self._files.stl
 
     def _look(self, link: Link) -> Look:
-        """A link's shapes. Without a visual the collision's mesh is drawn, unless the link is fixed to one with a visual; without
-        a collision the visual's is fitted."""
+        """Loads a link's shapes.
+
+        Without a visual, the collision mesh is drawn, unless the link is fixed to one with a visual. Without a collision, the
+        visual is fitted.
+        """
         loaded: dict[str, list[tuple[Shape, str, list[meshes.Part]]]] = {"visual": [], "collision": []}
         failed: dict[str, list[str]] = {"visual": [], "collision": []}
-        kind = "note"  # of files that are absent one warning tells, of all together
+        kind = "note"  # absent files share one warning
         for tag, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for shape in shapes:
                 try:
@@ -139,7 +142,7 @@ class Looks:
         return Look(drawn, surfaces, [primitives.exact(shape) for shape, _, _ in fitted])
 
     def _surface(self, shape: Shape, parts: list[meshes.Part], count: int) -> tuple[Points, float]:
-        """Points on the shape in the link's frame [count, 3], and the volume of its convex hull [m3]."""
+        """Samples points on the shape in the link's frame [count, 3], and computes the volume of its convex hull [m3]."""
         key = (shape.kind, shape.file, shape.size, count)
         if key not in self._sampled:
             self._work.spend(parts)
@@ -159,7 +162,7 @@ class Looks:
 
 
 def stand_in(name: str, tree: Tree, notes: Notes) -> Look:
-    """A capsule from the link's origin to the next joint, or about twice as far as its centre of mass; or a ball.
+    """Makes a capsule from the link's origin to the next joint, or to twice its centre of mass; or a ball.
 
     Its radius follows from the mass at 1500 kg/m3, within 15 to 60 mm.
     """
@@ -185,7 +188,7 @@ def stand_in(name: str, tree: Tree, notes: Notes) -> Look:
 
 @functools.lru_cache(maxsize=100)
 def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
-    """The surface of a URDF's box, sphere, capsule or cylinder."""
+    """Makes the surface of a URDF's box, sphere, capsule or cylinder."""
     if kind == "box":
         return trimesh.creation.box(size)
     if kind == "sphere":
@@ -197,7 +200,7 @@ def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
 
 
 def _told(absent: Mapping[str, str]) -> str:
-    """One line on meshes that are not there."""
+    """Writes one line about missing meshes."""
     names, reasons = list(absent), list(dict.fromkeys(absent.values()))
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     lines = "; ".join(reasons[:3]) + ", ..." * (len(reasons) > 3)
@@ -213,14 +216,14 @@ def _mesh(shape: primitives.Primitive) -> trimesh.Trimesh:
 
 
 def _along(z: Vec) -> Matrix:
-    """Some frame [3, 3] whose last column is the unit vector ``z``."""
+    """Makes a frame [3, 3] whose last column is the unit vector ``z``."""
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
 
 
 def _volume(shape: Shape) -> float | None:
-    """Of a primitive [m3]."""
+    """Volume of a primitive [m3]; None for other shapes."""
     exact = primitives.exact(shape)
     if exact is not None:
         return exact.volume

@@ -1,4 +1,4 @@
-"""Where the robot grasps, where its hand points, and the pads that it grips with: guessed, or as the user says."""
+"""The hand: where the robot grasps, where the hand points, and the pads that grip. All are guessed, or given by the user."""
 
 import dataclasses
 import re
@@ -19,19 +19,19 @@ from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Poses, Tree, Values, 
 from mjx_nero.urdf.tree import poses as body_poses
 
 _TIPS = re.compile(r"tcp|(^|[_/])ee(_|$)|end_?effector|grasp|gripper_frame|hand_tip", re.IGNORECASE)
-_TOOLS = (  # of an arm without gripper, the best name first
+_TOOLS = (  # tool names of an arm without gripper, the best first
     re.compile(r"tcp", re.IGNORECASE),
     re.compile(r"tool", re.IGNORECASE),
     re.compile(r"(^|[_/])ee(_|$)|(^|[_/])eef(_|$)|end_?effector|grasp", re.IGNORECASE),
     re.compile(r"flange", re.IGNORECASE),
 )
 _SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realsense|vision|_ft(_|$)", re.IGNORECASE)
-NEAR = 0.06  # [m] a named frame this far from where the fingers meet is their grasp point; the flange's is further away
-TOOL_AXIS = 50.0  # [degrees] a tool's frame has an axis along which it works: the one within this of where the fingers point
-ON_AXIS = 5e-3  # [m] a tool this near to the last joint's axis is turned by it, not carried around
-SHARES, NUDGE = 41, 0.02  # places of the way from closed to open, and how much of it tells where the fingers are going
-ASIDE = 4e-3  # [m] from a cube to the fixed jaw as the hand comes down: no arm is more exact than a few millimetres
-ROUNDS = 3  # of fitting pads where the cube is held, whose size follows from the pads
+NEAR = 0.06  # [m] a named frame this near to where the fingers meet is their grasp point; the flange's is farther away
+TOOL_AXIS = 50.0  # [degrees] the working axis of a tool's frame is the one within this of where the fingers point
+ON_AXIS = 5e-3  # [m] the last joint turns a tool this near to its axis, and carries others around
+SHARES, NUDGE = 41, 0.02  # samples between closed and open; share that tells where the fingers are going
+ASIDE = 4e-3  # [m] gap between cube and fixed jaw as the hand comes down, as arms are exact to a few millimetres
+ROUNDS = 3  # of fitting pads to a held cube, whose size follows from the pads
 
 
 def find(
@@ -44,20 +44,19 @@ def find(
     open: Mapping[str, float] | None = None,
     closed: Mapping[str, float] | None = None,
 ) -> Hand:
-    """The hand: how the fingers open, and where they grasp.
+    """Finds how the fingers open, and where they grasp.
 
-    Closed is where the fingers' shapes are nearest, open where they have parted. The grasp point lies amid the pads where those
-    hold the cube that the gripper is given, or is the frame nearest to that point whose name says so (``tcp``, ``ee_...``,
-    ``grasp``, ...); without gripper it is the tool's frame by name (``tcp``, ``tool0``, ``end_effector``, ``ee_...``), or the
-    last link. It is no camera's frame.
+    Closed is where the fingers' shapes are nearest; open is where they have parted. The grasp point is the middle of the pads
+    that hold the cube, or a named frame near it (``tcp``, ``ee_...``, ``grasp``, ...). Without a gripper it is the tool's named
+    frame (``tcp``, ``tool0``, ``end_effector``, ``ee_...``), or the last link. It is never a camera's frame.
 
     Args:
         chosen: joints and fork of ``fingers.choose``.
-        ee: ``LINK`` or ``LINK:x,y,z``: the grasp point, in place of the guess.
-        open, closed: positions of some of the gripper's joints [rad, m], in place of the guess.
+        ee: ``LINK`` or ``LINK:x,y,z``: the grasp point, instead of a guess.
+        open, closed: positions of some of the gripper's joints [rad, m], instead of a guess.
 
     Raises:
-        UserError: ``ee``, ``open`` or ``closed`` names what is not there.
+        UserError: ``ee``, ``open`` or ``closed`` names something unknown.
     """
     joints, fork = tuple(chosen[0]), chosen[1]
     if not joints:
@@ -87,10 +86,10 @@ class _Held:
     """A gripper that holds its cube, in the frame of ``Grip.link``.
 
     Attributes:
-        frame: columns approach, opening, and across both [3, 3].
+        frame: the columns are approach, opening, and across both [3, 3].
         site: the middle of the pads [3].
-        share: of the way from closed to open.
-        gaps: between the pads when closed and when open [m].
+        share: position between closed (0) and open (1).
+        gaps: distances between the pads when closed and when open [m].
     """
 
     frame: Matrix
@@ -106,13 +105,13 @@ class _Gripper:
     def __init__(self, swing: Swing, looks: Mapping[str, Look], grip: Grip):
         self.swing, self.looks, self.grip, self.parts = swing, looks, grip, swing.parts
         self._at_link = self.parts[grip.fork].links[grip.link]
-        # Without shapes there is no pose that holds a cube; fingers that curl by joints of their own do not keep step on the way.
+        # No pose holds a cube without shapes, or with fingers that curl by joints of their own.
         self._known = not swing.blind and len(grip.joints) <= len(grip.fingers)
         self._shares = np.linspace(0, 1, SHARES)
         self._way = self.poses(self._shares)
 
     def poses(self, shares: Values) -> dict[str, Poses]:
-        """Of the bodies that move, and of the fork's links [n, 4, 4]."""
+        """Poses of the moving bodies and of the fork's links [n, 4, 4]."""
         ends = zip(self.grip.joints, self.grip.close, self.grip.open, strict=True)
         found = self.swing.poses({j: close + shares * (open - close) for j, close, open in ends})
         base = np.linalg.inv(self._at_link)
@@ -120,10 +119,10 @@ class _Gripper:
         return links | {n: base @ found[n] for n in self.swing.inside}
 
     def held(self, ahead: Vec | None = None) -> _Held:
-        """With the pads fitted where they hold the cube that fits them, or closed, where that pose is not known.
+        """Fits the pads where they hold the cube that fits them; or closed, if that pose is unknown.
 
         Args:
-            ahead: where the fingers point [3], in place of the guess.
+            ahead: where the fingers point [3], instead of a guess.
         """
         share = 0.0
         if self._known:
@@ -147,12 +146,12 @@ class _Gripper:
         return pads.gap(fit.pads, {n: self._way[n][k] for n in fit.pads}, sides)
 
     def _frame(self, share: float, ahead: Vec | None) -> Matrix:
-        """Where the fingers point there, how they open, and across both."""
+        """Builds the frame of the fingers there: where they point, how they open, and across both."""
         spots = self._spots(share)
         moved = spots[:, 1] - spots[:, 0]
-        sides = [way - np.delete(moved, k, 0).mean(0) for k, way in enumerate(moved)]  # of three fingers one against the others
+        sides = [way - np.delete(moved, k, 0).mean(0) for k, way in enumerate(moved)]  # of three fingers, one against two
         way = max(sides, key=lambda v: float(np.linalg.norm(v)) + 1e-9)
-        if self.grip.jaw and not self.swing.blind:  # from face to face: the bisector of jaws that hold something points ahead
+        if self.grip.jaw and not self.swing.blind:  # from face to face: the bisector of holding jaws points ahead
             way = (spots[0] - spots[1]).mean(0)
         pivot, axis = self._hinge(share)
         opening = snapped(_unit(way - axis * (axis @ way), np.array([0.0, 1.0, 0.0])))
@@ -165,7 +164,7 @@ class _Gripper:
         return np.column_stack([ahead, opening, np.cross(ahead, opening)])
 
     def _spots(self, share: float) -> Float[np.ndarray, "fingers 2 3"]:
-        """Where the faces of the fingers are that meet, the fixed jaw's last: a little before and after."""
+        """Positions of the meeting faces of the fingers, the fixed jaw's last, shortly before and after."""
         at, (one, two) = self.poses(self._around(share)), self.grip.meeting.spots
         met = dict(zip(self.grip.meeting.names, (one, two), strict=True))
         if self.grip.jaw:
@@ -177,7 +176,7 @@ class _Gripper:
         return np.clip([share - NUDGE, share + NUDGE], 0, 1) if self._known or self.swing.blind else np.array([0.0, 1.0])
 
     def _hinge(self, share: float) -> tuple[Vec, Vec]:
-        """Where the joint turns that turns the first finger, and its axis; zeros if none does."""
+        """Position and axis of the joint that turns the first finger; zeros if none does."""
         name, pivot, axis = self.grip.meeting.names[0], np.zeros(3), np.zeros(3)
         there = self.poses(np.array([share]))
         while name in self.swing.inside:
@@ -188,13 +187,13 @@ class _Gripper:
         return pivot, axis
 
     def _wrist(self) -> Vec:
-        """Where the joint before the last one is."""
+        """Position of the joint before the last one."""
         world, fork = body_poses(self.parts, {}), self.grip.fork
         base, above = np.linalg.inv(world[fork][0] @ self._at_link), self.parts[fork].parent
         return base[:3, :3] @ world[above][0][:3, 3] + base[:3, 3] if above else base[:3, 3]
 
     def _fingers(self, share: float, frame: Matrix) -> tuple[list[tuple[pads.Finger, Body]], pads.Finger | None]:
-        """The fingers that move, and the fixed jaw of one that is alone."""
+        """Returns the moving fingers, and the fixed jaw of a single one."""
         there, around = self.poses(np.array([share, 0.0])), self.poses(self._around(share))
         moving = []
         for name in self.grip.fingers:
@@ -211,7 +210,7 @@ class _Gripper:
         return moving, pads.Finger(self.grip.jaw, points, pose, pose, -moving[0][0].outward)
 
     def hand(self, held: _Held) -> Hand:
-        """As it is, the grasp point amid its pads."""
+        """Builds the hand, with the grasp point in the middle of its pads."""
         grip, frame = self.grip, held.frame
         extents = self._extents(held)
         closed, gap = (round(float(v), 4) for v in held.gaps)
@@ -221,7 +220,7 @@ class _Gripper:
             close=grip.close,
             link=grip.link,
             fingers=grip.fingers,
-            site=primitives.pose(np.eye(3), np.round(held.site, 6) + 0.0),  # [m]: what is guessed has no more digits
+            site=primitives.pose(np.eye(3), np.round(held.site, 6) + 0.0),  # [m] a guess deserves no more digits
             approach=frame[:, 0],
             opening=frame[:, 1],
             pads=held.pads.pads,
@@ -231,14 +230,14 @@ class _Gripper:
             closed=closed,
             pad=extents,
         )
-        if grip.jaw:  # room between the cube and the fixed jaw: the other one pushes it there
+        if grip.jaw:  # leaves room to the fixed jaw: the moving jaw pushes the cube there
             edge = grasp.edge(hand.gap, extents, closed)
             aside = min(ASIDE, max(0.0, hand.gap - edge) / 4) + (edge / 2 if self.swing.blind else 0.0)
             hand.grip = np.round(frame[:, 1] * self._fingers(held.share, frame)[0][0][0].outward * aside, 4) + 0.0
         return hand
 
     def _extents(self, held: _Held) -> tuple[float, float, float]:
-        """Of a pad, as long as the fingers reach anywhere between open and the cube, beyond the grasp point."""
+        """Size of a pad, as long as the fingers reach beyond the grasp point anywhere between open and the cube."""
         along, across, between = pads.extents(held.pads.held[0], held.frame)
         way = self._shares >= held.share
         row = np.append(-held.frame[:, 0], 0.0)
@@ -247,9 +246,9 @@ class _Gripper:
         return round(max(along, 2 * float(reach)), 4), across, between
 
     def hand_at(self, held: _Held, link: str, at: Vec) -> Hand:
-        """With the grasp point in the frame of a named link, which has an axis that tells where the fingers point.
+        """Builds the hand with the grasp point in the frame of a named link, one of whose axes tells where the fingers point.
 
-        Pads that stand in for missing meshes are moved there: the frame knows more than they.
+        Pads that stand in for missing meshes are moved there, because the frame is more reliable.
         """
         there = self._in_link(link, held.share)
         held = self.held(there[:3, :3] @ snapped(there[:3, :3].T @ held.frame[:, 0], TOOL_AXIS))
@@ -271,7 +270,7 @@ class _Gripper:
         )
 
     def _in_link(self, link: str, share: float) -> Pose:
-        """Pose of any link of the robot in ``Grip.link`` [4, 4]."""
+        """Pose of any link of the robot in the frame of ``Grip.link`` [4, 4]."""
         ends = zip(self.grip.joints, self.grip.close, self.grip.open, strict=True)
         world = body_poses(self.parts, {j: np.array([close + share * (open - close)]) for j, close, open in ends})
         fork, body = self.grip.fork, body_of(self.parts, link)
@@ -279,19 +278,19 @@ class _Gripper:
 
 
 def _placed_at(poses: Poses, spot: Vec) -> Points:
-    """A point of a body in each of its poses."""
+    """Positions of a body's point in each of its poses."""
     return poses[:, :3, :3] @ spot + poses[:, :3, 3]
 
 
 def _shifted(pad: primitives.Primitive, pose: Pose, by: Vec) -> primitives.Primitive:
-    """A pad of a body that has the ``pose``, moved."""
+    """Moves a pad of a body at ``pose``."""
     there = pose @ pad.pose
     there[:3, 3] += by
     return dataclasses.replace(pad, pose=np.linalg.inv(pose) @ there)
 
 
 def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
-    """What was guessed of the gripper, and what is lacking."""
+    """Notes what was guessed about the gripper, and what is missing."""
     grip, blind = gripper.grip, gripper.swing.blind
     for finger in grip.fingers:
         text = f"a box pad on the distal {100 * pads.DISTAL:.0f}%, along the opening; the rest meets the table only"
@@ -319,7 +318,10 @@ def _tell(gripper: _Gripper, hand: Hand, name: str, notes: Notes) -> None:
 
 
 def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) -> Hand:
-    """Without a gripper: a tool that points along the last joint's axis, outwards, if it lies on that axis; else away from it."""
+    """Builds the hand of an arm without a gripper.
+
+    Its tool points outwards along the last joint's axis if it lies on that axis, and otherwise away from it.
+    """
     body = body_of(parts, link)
     frame = body.links[link] @ primitives.pose(np.eye(3), at)
     direction = frame[:3, 3]
@@ -327,7 +329,7 @@ def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) 
         axis = body.joint.axis
         if np.linalg.norm(np.cross(frame[:3, 3], axis)) < ON_AXIS:
             along = float((frame[:3, 3] - np.linalg.inv(body.frame)[:3, 3]) @ axis)  # from the joint before
-            if abs(along) < ON_AXIS:  # a bare wrist: to where its link lies
+            if abs(along) < ON_AXIS:  # a bare wrist points to where its link lies
                 points = surface(body.links, looks)
                 along = 1.0 if points is None else float((points.max(0) + points.min(0)) @ axis) or 1.0
             direction = axis * np.sign(along)
@@ -351,9 +353,9 @@ def bare(parts: dict[str, Body], looks: Mapping[str, Look], link: str, at: Vec) 
 
 
 def _tool(parts: dict[str, Body]) -> str:
-    """The tool's frame of an arm without gripper: of the names on its last body the best, of equals the outermost.
+    """Chooses the tool's frame of an arm without gripper: the best name on its last body, the outermost of equals.
 
-    If no name tells, it is one on the last joint's axis, where flanges are.
+    Without a telling name, it is a link on the last joint's axis, where flanges are.
     """
     last = parts[max(parts, key=lambda n: depth(parts, n))]
     links = [n for n in last.links if not _SENSORS.search(n)] or list(last.links)
@@ -367,7 +369,7 @@ def _tool(parts: dict[str, Body]) -> str:
 
 
 def _named(parts: dict[str, Body], link: str, at: Vec) -> str | None:
-    """The named frame nearest to where the fingers meet, ``at`` in ``link``, if it is not far from there."""
+    """Finds the named frame nearest to where the fingers meet (``at`` in ``link``), if one is near."""
     body = body_of(parts, link)
     centre = (body.links[link] @ np.append(at, 1.0))[:3]
     away = {
@@ -393,7 +395,7 @@ def _placed(tree: Tree, ee: str) -> tuple[str, Vec]:
 
 
 def _ahead(tip: Vec, opening: Vec, wrist: Vec) -> Vec:
-    """Where the fingers point, across the opening: from the origin to their ``tip``, but never back to the ``wrist``."""
+    """Chooses where the fingers point, across the opening: from the origin to their ``tip``, but never back to the ``wrist``."""
     fallback = np.array([0.0, 0.0, 1.0]) if abs(opening[2]) < 0.7 else np.array([1.0, 0.0, 0.0])
     approach = snapped(_unit(tip - opening * (tip @ opening), fallback - opening * (fallback @ opening)))
     approach = _unit(approach - opening * (approach @ opening), approach)
@@ -406,7 +408,7 @@ def _unit(vector: Vec, otherwise: Vec) -> Vec:
 
 
 def snapped(vector: Vec, within: float = 25.0) -> Vec:
-    """The nearest axis of the frame, if that is within so many degrees."""
+    """Returns the nearest axis of the frame, if it is within ``within`` degrees."""
     nearest = np.argmax(np.abs(vector))
     if abs(vector[nearest]) < np.cos(np.radians(within)):
         return vector

@@ -16,29 +16,29 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
 from mjx_nero.urdf.workspace import Box
 
-STARTS = 48  # descents to the middle of the workspace
-CALM = 0.5  # [m/rad] of its starts
-CLEAR = 0.01  # [m] above the table
-MARGIN = 0.15  # of a joint's range: further from its limits is no better
-AGILE = 0.15  # smallest singular value of the Jacobian (lengths in arm's lengths) that is as good as any
-HIGH = 0.15  # of the reach: further above the table is no better
-POINTS = 60  # of a link's surface, that are tested for lying within another link
-RANDOM = 200  # poses: links that touch in all of them are shaped so
-TRAVEL = 0.1  # [m] above its lowest height the hand comes to a place of ``pick``
-ACROSS, DOWNWARD, STEPS = 12, 5, 4  # points of the way there, and steps of inverse kinematics for each
-NEAR = 0.005  # [m] from its end it has got there
-OVER = 0.2  # [m] above its lowest height the hand is at most over the middle of ``pick``
-NEARER = 0.1  # of ``pick``: a home that spares half a turn of the hand may reach so much less
+STARTS = 48  # number of descents to the middle of the workspace
+CALM = 0.5  # [m/rad] ``calm`` of those descents
+CLEAR = 0.01  # [m] least height above the table
+MARGIN = 0.15  # share of a joint's range beyond which distance from its limits no longer counts
+AGILE = 0.15  # least singular value of the Jacobian (in arm lengths) beyond which more no longer counts
+HIGH = 0.15  # share of the reach beyond which height above the table no longer counts
+POINTS = 60  # points of a link's surface that are tested for lying inside another link
+RANDOM = 200  # random poses: links that touch in all of them always do
+TRAVEL = 0.1  # [m] height above the bottom of ``pick`` at which the hand travels
+ACROSS, DOWNWARD, STEPS = 12, 5, 4  # points of the path across and down, and steps of inverse kinematics at each
+NEAR = 0.005  # [m] tolerance of arriving
+OVER = 0.2  # [m] greatest height of the hand above the bottom of ``pick``, over its middle
+NEARER = 0.1  # share of ``pick`` that a home may give up to spare the hand half a turn
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """A robot whose home is looked for.
+    """A robot whose home pose is searched for.
 
     Attributes:
-        start: joint -> position where no better is found [rad, m].
-        given: joints whose position is the user's.
-        shapes: link, shape in its frame, whether it meets the table.
+        start: joint -> fallback position [rad, m].
+        given: joint -> position from the user.
+        shapes: link, shape in its frame, and whether it collides with the table.
     """
 
     parts: dict[str, Body]
@@ -51,22 +51,25 @@ class Search:
 
     @property
     def low(self) -> list[tuple[str, Primitive]]:
-        """The shapes that meet the table."""
+        """The shapes that collide with the table."""
         return [(link, shape) for link, shape, meets in self.shapes if meets]
 
     @property
     def free(self) -> tuple[str, ...]:
-        """The joints that may be anywhere."""
+        """The joints that the search may move."""
         return tuple(j for j in self.start if j not in self.given and j not in self.hand.joints)
 
     def pose(self, q: Float[np.ndarray, " k"]) -> dict[str, float]:
-        """Joint -> position [rad, m] of a candidate; the joints that are not free stay at ``start``."""
+        """Returns joint -> position [rad, m] of a candidate; joints that are not free stay at ``start``."""
         arm = zip(self.cloud.arm, q, strict=True)
         return {**self.start, **{j: float(v) + 0.0 for j, v in arm if j in self.free}}
 
     def amid(self, box: Box | None, down: bool, tilt: float = 0.0) -> Float[np.ndarray, "n k"]:
-        """The poses that inverse kinematics finds with the grasp point amid a box, hand down or leaning by up to ``tilt``, its
-        links clear of the table and of one another; those that are farthest from joint limits and singularities first."""
+        """Finds poses with the grasp point in the middle of a box, hand down or leaning by up to ``tilt``, links clear of the
+        table and of one another.
+
+        Poses farthest from joint limits and singularities come first.
+        """
         cloud = self.cloud
         if box is None or not self.free:
             return np.zeros((0, len(cloud.arm)))
@@ -84,12 +87,13 @@ class Search:
 
 
 def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str, notes: Notes) -> tuple[dict[str, float], Quat]:
-    """Joint -> home position [rad, m], of the candidates one from which the hand gets to the most of ``place.pick``; and how the
-    hand is turned there, wxyz: of two ways that do equally well the one that is nearer at home, as a hand has better to do than
-    to turn by half a turn first.
+    """Returns joint -> home position [rad, m], and the turn of the hand there (wxyz).
 
-    Where none of those amid the workspace leads to all of ``pick`` there are others over its middle. Without a candidate it is
-    ``start``; if a shape is below the table there, the nearest of the random poses in which none is.
+    The home is the candidate from which the hand reaches the most of ``place.pick``. Of two turns that do equally well, the
+    nearer one wins, because turning the hand by half a turn costs time.
+
+    If no candidate in the middle of the workspace leads to all of ``pick``, others over its middle are tried. Without any
+    candidate the home is ``start``; or, if a shape is below the table there, the nearest random pose in which none is.
     """
     poses, best, way = amid, 0, 0
     if place.pick is not None:
@@ -109,7 +113,7 @@ def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str
 
 
 def _values(search: Search, q: Float[np.ndarray, "n k"], place: Place) -> Float[np.ndarray, "n w"]:
-    """How good each of the poses is to start from, for each way to turn the hand: 1 and more leads to all of ``pick``."""
+    """Rates each pose as a start, for each way to turn the hand. 1 and more leads to all of ``pick``."""
     out = np.zeros((len(q), len(place.ways)))
     if len(q) and place.pick is not None:
         across = search.cloud.sites(search.cloud.at(q))[:, 1, :3]
@@ -122,8 +126,11 @@ def _values(search: Search, q: Float[np.ndarray, "n k"], place: Place) -> Float[
 def _reached(
     q: Float[np.ndarray, "n k"], cloud: Cloud, low: list[tuple[str, Primitive]], pick: Box, along: Vec | None, tilt: float
 ) -> Values:
-    """To what share of the corners and the middle of ``pick`` each pose leads, by a way that a controller without a plan
-    takes: around the base at the height of its travel, then straight down. No shape may go below the table."""
+    """Share of the corners and the middle of ``pick`` that each pose leads to.
+
+    The path is one that a controller without a planner takes: around the base at travel height, then straight down. No shape may
+    go below the table.
+    """
     x, y, (bottom, top) = pick
     places = np.array([*itertools.product(x, y), (np.mean(x), np.mean(y))])
     at = np.repeat(q, len(places), axis=0)
@@ -166,14 +173,14 @@ def _clear(search: Search, name: str, notes: Notes) -> dict[str, float]:
 
 
 def _unwound(q: Float[np.ndarray, "n k"], cloud: Cloud) -> Float[np.ndarray, "n k"]:
-    """Joints that have room for a whole turn as near to 0 as they get."""
+    """Moves joints with room for a whole turn as near to 0 as possible."""
     turned = q - 2 * np.pi * np.round(q / (2 * np.pi))
     room = cloud.upper - cloud.lower >= 2 * np.pi - 1e-6
     return np.where(room & (turned >= cloud.lower) & (turned <= cloud.upper), turned, q)
 
 
 def _comfort(cloud: Cloud, q: Float[np.ndarray, "n k"], poses: Mapping[str, Poses], above: Values) -> Values:
-    """How good a pose is to start from: limits, singularities and table far, joints turned little, links high."""
+    """Rates poses as starts: far from limits, singularities and the table, joints turned little, links high."""
     spare = np.minimum(q - cloud.lower, cloud.upper - q) / (cloud.upper - cloud.lower)
     spare = np.where(cloud.endless, 1.0, spare).min(1)
     reach = float(np.quantile(np.linalg.norm(cloud.site[1:, :3, 3] - cloud.shoulder, axis=1), 0.99))
@@ -193,9 +200,9 @@ def _touching(
     poses: Mapping[str, Poses],
     shapes: list[tuple[str, Primitive, bool]],
 ) -> Bool[np.ndarray, " n"]:
-    """Whether links that are no neighbours lie within one another, by points of one in a shape of the other.
+    """True where links that are not neighbours lie inside one another, judged by points of one in a shape of the other.
 
-    Pairs that do so in every random pose, as the links of a gripper's linkage, say nothing of a pose and are left out.
+    Pairs that do so in every random pose, such as the links of a gripper's linkage, are ignored.
     """
     n = len(next(iter(poses.values())))
     poses = {name: np.concatenate([p, cloud.poses[name][1 : RANDOM + 1]]) for name, p in poses.items()}
@@ -210,7 +217,7 @@ def _touching(
         body = body_of(parts, link)
         inverse = np.linalg.inv(poses[body.name] @ body.links[link])
         for other, points in surfaces.items():
-            if _apart(parts, other, body.name) <= 2:  # what their joints' limits take care of
+            if _apart(parts, other, body.name) <= 2:  # joint limits keep these apart
                 continue
             local = inverse @ poses[other]
             places = points @ np.moveaxis(local[:, :3, :3], 1, 2) + local[:, None, :3, 3]
@@ -221,7 +228,7 @@ def _touching(
 
 
 def _apart(parts: dict[str, Body], a: str, b: str) -> int:
-    """How many joints lie between two bodies."""
+    """Number of joints between two bodies."""
     return len(set(_line(parts, a)) ^ set(_line(parts, b)))
 
 

@@ -1,4 +1,4 @@
-"""A URDF to a model folder: ``model.xml``, ``meshes/``, ``robot.yaml`` and ``report.json``."""
+"""Imports a URDF to a model folder: ``model.xml``, ``meshes/``, ``robot.yaml`` and ``report.json``."""
 
 import dataclasses
 import pathlib
@@ -26,7 +26,7 @@ from mjx_nero.urdf.tree import poses as body_poses
 from mjx_nero.urdf.units import METRES, Units, check_lengths
 
 
-# Long: the stages of an import, one after another.
+# Long: it lists the stages of an import, in order.
 def import_urdf(
     path: pathlib.Path | str,
     out: pathlib.Path | str,
@@ -45,31 +45,29 @@ def import_urdf(
     strict: bool = False,
     force: bool = False,
 ) -> Report:
-    """Makes a model folder of a URDF (or xacro file), for ``mjx_nero.make(..., robot=out)``.
+    """Makes a model folder from a URDF or xacro file, for ``mjx_nero.make(..., robot=out)``.
 
-    All stages stand here, in their order: that makes it long.
-
-    The folder appears whole or not at all. Meshes are read from the URDF's own folder (``files.Roots`` says which others) and
-    from ``packages``, from nowhere else. In place of a missing mesh the link's other one is drawn or fitted, or a stand-in, with
-    a warning.
+    The folder appears whole or not at all. Meshes are read only from the URDF's own folders (see ``files.Roots``) and from
+    ``packages``. A missing mesh is replaced by the link's other one or by a stand-in, with a warning.
 
     Args:
-        path: URDF of a robot that stands on a fixed base.
-        out: folder to make; empty, absent, or with ``force`` an earlier import.
-        packages: name -> folder of ``package://name/...``.
-        gains: YAML file, joint -> stiffness, damping and at will effort and speed; the rest is worked out (``drives.rows``).
-        args: values of a xacro file's arguments, in place of their defaults.
-        chain: ``BASE:TIP``, links, of a robot that is more than an arm; what is not between them is held still.
-        fix: joint -> position to hold it at [rad, m]; None: the one nearest to 0.
-        gripper: joints that drive the gripper, in place of the guess (``fingers.choose``); empty for none.
-        ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], in place of the guess.
-        open, closed: positions of the gripper's joints [rad, m], in place of the guess (``swing.Swing.ends``).
-        home: positions of some joints [rad, m], in place of the guess (``home.home``).
-        units: of the URDF, if they are not metres and radians; what is given here is in these.
-        strict: warnings become an error.
+        path: URDF of a robot on a fixed base.
+        out: folder to make; it must be absent or empty, or, with ``force``, hold an earlier import.
+        packages: name -> folder for ``package://name/...``.
+        gains: YAML file, joint -> stiffness, damping and optionally effort and speed. Other joints get computed ones
+            (``drives.rows``).
+        args: values of a xacro file's arguments.
+        chain: ``BASE:TIP``, two links of a robot that is more than an arm. Joints outside are held still.
+        fix: joint -> position to hold it at [rad, m]; None: the position nearest to 0.
+        gripper: joints that drive the gripper, instead of a guess (``fingers.choose``); empty: no gripper.
+        ee: ``LINK`` or ``LINK:x,y,z``, the grasp point [m], instead of a guess.
+        open, closed: positions of the gripper's joints [rad, m], instead of a guess (``swing.Swing.ends``).
+        home: positions of some joints [rad, m], instead of a guess (``home.home``).
+        units: units of the URDF, if not metres and radians. Arguments here are always in metres and radians.
+        strict: turn warnings into an error.
 
     Raises:
-        UserError: the input cannot be used; one line that says what is wrong and what to do.
+        UserError: the input cannot be used; the message says why and what to do.
     """
     path, out = pathlib.Path(path), pathlib.Path(out)
     folder.check(out, force)
@@ -120,7 +118,7 @@ def import_urdf(
 
 
 def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
-    """With what shapes tell: tensors where the URDF has none, masses where no link, or none of a moving body, has any."""
+    """Fills in what shapes tell: missing tensors, and masses where no link, or no link of a moving body, has one."""
     seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
     masses = {n: link.mass for n, link in tree.links.items()}
     shown = {n: points if looks.of[n].drawn else None for n, points in seen.items()}
@@ -140,7 +138,7 @@ def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
 
 
 class _Model:
-    """What ``model.xml`` is written from."""
+    """The data that ``model.xml`` is written from."""
 
     def __init__(
         self,
@@ -171,7 +169,7 @@ class _Model:
 
 
 def _drives(made: _Model, gains: pathlib.Path | None, notes: Notes) -> tuple[dict[str, float], drives.Rows]:
-    """Rotor inertia [kg m2, kg] of every joint, and stiffness, damping, effort and speed of the driven ones."""
+    """Computes the rotor inertia of every joint [kg m2, kg], and stiffness, damping, effort and speed of the driven ones."""
     bare = made.xml(dict.fromkeys(made.tree.links, []), dict.fromkeys(made.joints, 0.0))
     moved = drives.carried(_compiled(bare))
     levers = _levers(made.parts, made.hand)
@@ -222,7 +220,7 @@ def _compiled(text: str) -> mujoco.MjModel:
 
 
 def _levers(parts: dict[str, Body], hand: Hand) -> dict[str, float]:
-    """Of the gripper's joints: how far from its axis a joint moves the fingers' pads [m]; of slides 1."""
+    """Distance from a gripper joint's axis to the pads that it moves [m]; 1 for slides."""
     inside = [parts[n] for n in hand.inside]
     at = {n: p[0] for n, p in body_poses(parts, {j: np.array([v]) for j, v in zip(hand.joints, hand.close, strict=True)}).items()}
     ends = [at[f] @ np.append(hand.pads[f].pose[:3, 3], 1.0) for f in hand.fingers]

@@ -1,4 +1,4 @@
-"""Masses and inertia tensors as a URDF gives them, made physical."""
+"""Masses and inertia tensors of a URDF, made physical."""
 
 import numpy as np
 import yourdfpy
@@ -7,22 +7,21 @@ from mjx_nero.urdf import primitives
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Mass, Matrix, Points, Vec
 
-PLACEHOLDER = 1e-4  # [kg] lighter links are placeholders: exporters write 1e-6 or 1e-9 for parts that nobody weighed
-LIGHTEST = 1e-3  # [kg] what a moving body is given at least: little enough to leave a robot's mass alone
-LIGHTEST_RADIUS = 0.01  # [m] ... spread like a ball of this size at least
+PLACEHOLDER = 1e-4  # [kg] lighter links are placeholders: exporters write 1e-6 or 1e-9 for unknown masses
+LIGHTEST = 1e-3  # [kg] least mass of a moving body, negligible beside the robot's
+LIGHTEST_RADIUS = 0.01  # [m] least radius of the ball that it is spread over
 DENSITY = 1000.0  # [kg/m3]
 MAX_MASS = 1e6  # [kg]
-ABSURD = 100.0  # times the most inertia that a link of its shape and mass can have: exporters write 1 where nobody gave it
-HEAVY = 0.1  # [kg m2] less than that does little harm
-EXACT, ROUNDED = 1e-6, 0.02  # of the largest second moment: what floats lose, and what figures rounded to two digits can
+ABSURD = 100.0  # a placeholder exceeds by this factor what shape and mass allow: exporters write 1 if it is unknown
+HEAVY = 0.1  # [kg m2] smaller placeholders do little harm
+EXACT, ROUNDED = 1e-6, 0.02  # shares of the largest second moment lost to floats, and to rounding to two digits
 
 
 def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
-    """Mass and tensor of a link, in the link's frame, with the tensor turned from the inertial frame to the link's.
+    """Returns a link's mass and tensor in the link's frame; the tensor is turned from the inertial frame.
 
-    What is no number, negative or beyond reason becomes 0. Moments of inertia that only have the wrong sign get the right one.
-    What no mass distribution can have (one of the second moments ``tr(I)/2 - I`` is negative) stays for ``filled`` if it is
-    more than rounding.
+    Values that are not numbers, negative or unreasonable become 0. Moments with only a wrong sign are corrected. A tensor that no
+    mass distribution has (a second moment ``tr(I)/2 - I`` is negative) is left to ``filled``, unless rounding explains it.
     """
     origin = np.eye(4) if inertial.origin is None else inertial.origin
     mass = 0.0 if inertial.mass is None else float(inertial.mass)
@@ -45,10 +44,11 @@ def checked(inertial: yourdfpy.Inertial, name: str, notes: Notes) -> Mass:
 
 
 def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
-    """``mass`` of a link; with the tensor of a box around its shape's ``points`` [n, 3], or of a ball, if its own is zero or such
-    as no body has (without a shape, the nearest that one can have), or ``absurd``.
+    """Returns the link's ``mass`` with a usable tensor.
 
-    Also notes what is suspicious and leaves it alone: a placeholder's mass, mass that would have to lie outside the shape.
+    If the tensor is zero, impossible or ``absurd``, it becomes that of a box around the shape's ``points`` [n, 3], or of a ball.
+    Without a shape, an impossible tensor becomes the nearest possible one. Suspicious values are noted but kept: a placeholder
+    mass, or mass that would have to lie outside the shape.
     """
     if mass.mass == 0:
         return mass
@@ -81,7 +81,7 @@ def filled(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
 
 
 def guessed(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
-    """Of a link of a moving body that weighs nothing, where others have masses: as ``weighed``, if that is more."""
+    """Gives a weightless link of a moving body, in a robot with masses, the mass of ``weighed``, if that is more."""
     out = weighed(mass, points)
     if out.mass <= max(mass.mass, PLACEHOLDER):
         return mass
@@ -92,14 +92,14 @@ def guessed(mass: Mass, points: Points | None, name: str, notes: Notes) -> Mass:
 
 
 def weighed(mass: Mass, points: Points | None) -> Mass:
-    """Of a link whose mass nobody says: that of the convex hull of its shape's ``points`` [n, 3], as heavy as water."""
+    """Gives a link without known mass the mass of its convex hull filled with water; ``points``: its surface [n, 3]."""
     if points is None:
         return mass
     return Mass(DENSITY * primitives.hull(points), points.mean(0), np.zeros((3, 3)))
 
 
 def body_mass(body: Body, notes: Notes) -> Mass:
-    """Of a moving body: at least ``LIGHTEST``, and a tensor that MuJoCo takes."""
+    """Returns the mass of a moving body: at least ``LIGHTEST``, with a tensor that MuJoCo accepts."""
     mass, com, tensor = body.mass.mass, body.mass.com, body.mass.inertia
     if mass < LIGHTEST:
         notes.add("repaired", "link", body.name, f"moves with {mass:g} kg: given {LIGHTEST:g} kg; weigh it")
@@ -107,7 +107,7 @@ def body_mass(body: Body, notes: Notes) -> Mass:
         if np.linalg.eigvalsh(tensor)[0] < _ball(mass, LIGHTEST_RADIUS)[0, 0]:
             tensor = _ball(mass, LIGHTEST_RADIUS)
     smallest = _ball(mass, 1e-3)
-    if np.linalg.eigvalsh(tensor)[0] < smallest[0, 0]:  # a rod without thickness, or a point
+    if np.linalg.eigvalsh(tensor)[0] < smallest[0, 0]:  # a thin rod, or a point
         tensor = tensor + smallest
     return Mass(mass, com, tensor)
 
@@ -117,14 +117,15 @@ def _ball(mass: float, radius: float) -> Matrix:
 
 
 def absurd(mass: Mass, points: Points | None) -> bool:
-    """Whether the inertia is a placeholder: ``HEAVY``, and ``ABSURD`` for its mass within its shape's ``points`` [n, 3]."""
+    """True if the inertia is a placeholder: at least ``HEAVY``, and ``ABSURD`` for its mass within its shape's ``points`` [n,
+    3]."""
     if points is None or mass.mass < PLACEHOLDER or _lack(mass.inertia) > ROUNDED:
         return False
     return float(np.linalg.eigvalsh(mass.inertia)[-1]) >= HEAVY and _excess(mass, points)[0] > ABSURD
 
 
 def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
-    """Notes what is odd about a mass within its shape's ``points``."""
+    """Notes oddities of a mass within its shape's ``points``."""
     ratio, outside = _excess(mass, points)
     if outside:
         notes.add("note", "link", name, "the centre of mass lies outside the link's shape (kept)")
@@ -134,10 +135,10 @@ def _compare(mass: Mass, points: Points, name: str, notes: Notes) -> None:
 
 
 def _excess(mass: Mass, points: Points) -> tuple[float, bool]:
-    """How many times the most that fits the shape the inertia is, and whether the centre of mass lies outside.
+    """Returns the inertia as a multiple of the most that fits the shape, and whether the centre of mass lies outside.
 
-    Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis; of a centre
-    outside, mass times the square of its distance from the far end.
+    Mass within lower .. upper has a second moment of at most mass (upper - com) (com - lower) along each axis. If the centre lies
+    outside, the bound is mass times the squared distance from the far end.
     """
     lower, upper = points.min(0), points.max(0)
     slack = 0.02 * np.ptp(points, axis=0).max()
@@ -149,7 +150,7 @@ def _excess(mass: Mass, points: Points) -> tuple[float, bool]:
 
 
 def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
-    """With positive moments of inertia, if they make it one that a body can have: all signs turned, or those of negative ones."""
+    """Makes the moments of inertia positive, if that makes them possible, by turning all signs or only the negative ones."""
     diagonal = np.diag(tensor)
     if not (diagonal < 0).any():
         return tensor
@@ -162,7 +163,7 @@ def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
 
 
 def _lack(tensor: Matrix) -> float:
-    """What the least second moment lacks to 0, as a share of the largest; infinite where none is positive, 0 of no tensor."""
+    """Share of the largest second moment that the least one lacks to 0; infinite if none is positive, 0 for a zero tensor."""
     values = np.linalg.eigvalsh(tensor)
     moments = values.sum() / 2 - values
     if moments.max() <= 0:
@@ -171,7 +172,7 @@ def _lack(tensor: Matrix) -> float:
 
 
 def _nearest(tensor: Matrix) -> Matrix:
-    """With second moments of at least 1% of the largest."""
+    """Raises all second moments to at least 1% of the largest."""
     values, axes = np.linalg.eigh(tensor)
     moments = values.sum() / 2 - values
     moments = np.maximum(moments, 0.01 * moments.max())

@@ -1,4 +1,4 @@
-"""Meshes that a URDF names: read with limits, parsed without following references, as triangles in metres."""
+"""Meshes that a URDF names: read with limits, parsed without following references, returned as triangles in metres."""
 
 import io
 import logging
@@ -16,18 +16,18 @@ from mjx_nero.urdf.files import Missing, Roots
 
 KINDS = {"stl": 100_000_000, "obj": 40_000_000, "dae": 30_000_000}  # bytes
 MAX_BYTES = 300_000_000  # all meshes of a robot together
-MAX_TRIANGLES = 1_000_000  # of a mesh
-MAX_ALL = 4_000_000  # triangles, all meshes together
-MAX_NUMBERS = 8_000_000  # in the text of an OBJ
-MAX_INDICES = 4_000_000  # in that of a DAE
+MAX_TRIANGLES = 1_000_000  # per mesh
+MAX_ALL = 4_000_000  # triangles of all meshes together
+MAX_NUMBERS = 8_000_000  # numbers in an OBJ file
+MAX_INDICES = 4_000_000  # indices in a DAE file
 MAX_PLACED = 10_000  # how often a DAE file may place its geometries
 
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot read is reported here
-Part = tuple[trimesh.Trimesh, tuple[float, ...] | None]  # with its colour
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # failures are reported by this package
+Part = tuple[trimesh.Trimesh, tuple[float, ...] | None]  # mesh and colour
 
 
 class Meshes:
-    """Meshes of a URDF: each is read once, in metres as its file says, unscaled."""
+    """Loads the meshes of a URDF, each once, unscaled, in metres by the file's own unit."""
 
     def __init__(self, roots: Roots):
         self._roots = roots
@@ -35,11 +35,11 @@ class Meshes:
         self._bytes = self._triangles = 0
 
     def load(self, name: str) -> tuple[str, list[Part]]:
-        """A name for files made of it, and its parts by colour.
+        """Returns a name for derived files, and the mesh's parts by colour.
 
         Raises:
-            UserError: the file lies outside the folders or is too large, or all meshes together are.
-            Missing: there is none, or it holds no mesh, or one of too many triangles.
+            UserError: the file lies outside the folders, or it or all meshes together are too large.
+            Missing: the file is absent, holds no mesh, or has too many triangles.
         """
         path = self._roots.find(name)
         if path not in self._read:
@@ -70,7 +70,7 @@ class Meshes:
 def _parse(content: bytes, kind: str) -> list[Part]:
     check = {"stl": _check_stl, "obj": _plain_obj, "dae": _check_dae}[kind]
     content = check(content)
-    try:  # from bytes and without a resolver: materials and textures in other files are not opened
+    try:  # from bytes and without a resolver, so that no other file is opened for materials or textures
         options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, **options)
@@ -91,11 +91,11 @@ def _parse(content: bytes, kind: str) -> list[Part]:
 
 
 def _solid(mesh: trimesh.Trimesh, unit: float) -> trimesh.Trimesh | None:
-    """The triangles between points in space that are less than 1000 km away, in metres; None if there are none."""
+    """Keeps the triangles whose points are finite and less than 1000 km away, in metres; None if there are none."""
     vertices, faces = np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(faces):
         return None
-    good = np.asarray((np.abs(vertices) < 1e6).all(axis=1))  # not NaN either
+    good = np.asarray((np.abs(vertices) < 1e6).all(axis=1))  # excludes NaN
     faces = faces[((faces >= 0) & (faces < len(vertices))).all(1)]
     faces = faces[good[faces].all(1)]
     if not len(faces):
@@ -111,14 +111,14 @@ def _check_count(triangles: int) -> None:
 
 
 def _check_stl(content: bytes) -> bytes:
-    """Both kinds are told by their size: a binary one has 50 bytes a triangle behind 84."""
+    """Counts triangles. Its size tells a binary file: 84 bytes plus 50 per triangle."""
     binary = len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
     _check_count((len(content) - 84) // 50 if binary else content.count(b"endfacet"))
     return content
 
 
 def _plain_obj(content: bytes) -> bytes:
-    """The lines that name points and faces alone: no groups, materials, textures and normals, of which nothing is used."""
+    """Keeps only lines of points and faces. Groups, materials, textures and normals are not used."""
     lines = re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), re.MULTILINE)
     _check_count(sum(line.lstrip().startswith(b"f") for line in lines))
     plain = re.sub(rb"/[^ \t\n]*", b"", b"\n".join(lines)) + b"\n"
@@ -142,7 +142,8 @@ def _check_dae(content: bytes) -> bytes:
 
 
 def _placed(root: etree._Element) -> int:
-    """How often a COLLADA scene places geometries: nodes may place one another, doubling with every level, or in a circle."""
+    """Counts how often a COLLADA scene places geometries. Nodes may place one another, doubling at every level, or in a
+    circle."""
     nodes = {node.get("id"): node for node in root.iter("{*}node") if node.get("id")}
     known: dict[str, int] = {}
 
@@ -161,7 +162,7 @@ def _placed(root: etree._Element) -> int:
 
 
 def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of all triangles, without colours."""
+    """Merges all triangles to one mesh without colours."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets[:-1], strict=True)])
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), faces, process=False)

@@ -1,4 +1,4 @@
-"""``model.xml``: the robot as an MJCF, in the conventions of the package's own models."""
+"""Writes ``model.xml``: the robot as an MJCF, in the conventions of the package's own models."""
 
 from collections.abc import Iterable, Mapping
 
@@ -11,7 +11,7 @@ from mjx_nero.urdf.drawing import Visual
 from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
 
 TABLE, CUBE = 1, 2  # contact bits of the scenes
-_PAD = {  # as in assets/nero/nero.xml, which says why
+_PAD = {  # the values of assets/nero/nero.xml, which gives the reasons
     "condim": "4",
     "priority": "1",
     "friction": "1 0.02 0.001",
@@ -31,18 +31,18 @@ def document(
     armature: Mapping[str, float],
     rest: Mapping[str, float],
 ) -> str:
-    """The XML text.
+    """Returns the XML text.
 
     Args:
-        title: of the model.
-        parts: bodies, parents first; joints and links keep their names, and links that were merged remain as sites.
-        masses: body -> mass in its frame.
-        drawn: link -> visual geoms in its frame.
-        collisions: link -> (name, shape in its frame, contact bits that it answers to).
-        site: name of the grasp point, link, and pose in that [4, 4].
+        title: the model's name.
+        parts: bodies, parents first. Joints and links keep their names; merged links remain as sites.
+        masses: body -> mass in the body's frame.
+        drawn: link -> visual geoms in the link's frame.
+        collisions: link -> (name, shape in the link's frame, contact bits).
+        site: name of the grasp point, its link, and its pose there [4, 4].
         armature: joint -> rotor inertia [kg m2 or kg].
-        rest: joint -> position in the home pose [rad, m]. Joints that follow others have it as their reference, so that they
-            start where their source's home puts them.
+        rest: joint -> position in the home pose [rad, m]. It is the reference of followers, so that they start where their
+            source's home puts them.
     """
     root = etree.Element("mujoco", model=title)
     root.append(etree.Comment(_HEAD))
@@ -52,7 +52,7 @@ def document(
         etree.SubElement(asset, "mesh", name=mesh, file=f"{mesh}.stl")
     elements = {"": etree.SubElement(root, "worldbody")}
     for body in parts.values():
-        # MuJoCo displaces a joint from its reference: the body's frame is given there, and poses stay the URDF's.
+        # MuJoCo displaces a joint from its reference, so the body's frame is given there, and poses stay the URDF's.
         frame = body.frame
         if body.joint and body.joint.mimic:
             frame = frame @ body.joint.motion(np.array([rest[body.joint.name]]))[0]
@@ -84,7 +84,7 @@ def _inertial(element: etree._Element, mass: Mass) -> None:
         return
     moments, axes = np.linalg.eigh(mass.inertia)
     axes = axes * np.sign(np.linalg.det(axes))
-    # Rounding leaves the largest moment of a flat body a hair above the sum of the others, which MuJoCo refuses.
+    # Rounding may put the largest moment of a flat body just above the sum of the others, which MuJoCo refuses.
     moments[2] = min(moments[2], moments[0] + moments[1])
     place = _pose(primitives.pose(axes, mass.com))
     figures = {"mass": repr(float(mass.mass)), "diaginertia": _text(moments), "pos": "0 0 0", **place}
@@ -101,7 +101,7 @@ def _mimic(element: etree._Element, joint: Joint, rest: Mapping[str, float]) -> 
     assert joint.mimic is not None
     source, multiplier, offset = joint.mimic
     both = {"joint1": joint.name} | ({"joint2": source} if source else {})
-    terms = (offset - rest[joint.name], multiplier if source else 0.0, 0.0, 0.0, 0.0)  # between references; a source's is 0
+    terms = (offset - rest[joint.name], multiplier if source else 0.0, 0.0, 0.0, 0.0)  # relative to references; a source's is 0
     etree.SubElement(element, "joint", **both, polycoef=_text(terms), solref="0.02 1", solimp="0.95 0.99 0.001")
 
 
@@ -126,7 +126,7 @@ def _drawn(element: etree._Element, item: Visual, at: Pose) -> None:
 
 
 def _pose(pose: Pose) -> dict[str, str]:
-    """``pos`` and ``quat``, left out where they are zero."""
+    """Writes ``pos`` and ``quat``, omitted where they are zero."""
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).reshape(-1))
     out = {} if not pose[:3, 3].any() else {"pos": _text(pose[:3, 3])}
@@ -134,5 +134,5 @@ def _pose(pose: Pose) -> dict[str, str]:
 
 
 def _text(numbers: Iterable[float]) -> str:
-    """All digits: poses agree with the URDF's."""
+    """Writes all digits, so that poses equal the URDF's."""
     return " ".join(repr(float(v)) for v in numbers)

@@ -1,4 +1,4 @@
-"""The boxes that grip: fitted to the fingers where they hold the cube that the gripper is given."""
+"""Pads: the boxes that grip, fitted to the fingers where they hold the gripper's cube."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,21 +11,21 @@ from mjx_nero.urdf.primitives import Primitive
 from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Vec
 
 DISTAL = 0.4  # share of a finger's length, from the tip, that grips
-PAD = (0.02, 0.02, 0.006)  # [m] along approach, across, thickness: of fingers whose meshes are missing
-FEW = 20  # points, that no box is fitted to
-THICK, MARGIN = 0.01, 0.005  # [m] a fixed jaw's pad is at least as thick as one; beside the other's pad it is as much wider
+PAD = (0.02, 0.02, 0.006)  # [m] along approach, across, and thickness, for fingers without meshes
+FEW = 20  # least points that a box is fitted to
+THICK, MARGIN = 0.01, 0.005  # [m] least thickness of a fixed jaw's pad; how much wider than the other pad it may be
 
 
 @dataclasses.dataclass(frozen=True)
 class Finger:
-    """A finger where it holds the cube.
+    """A finger that holds the cube.
 
     Attributes:
-        name: of its body, or of the link that is the fixed jaw.
-        points: of its surface [n, 3], in the link that the gripper's frame is given in; None: unknown.
-        pose: of the body or link there [4, 4].
-        shut: of the body where the gripper is closed [4, 4].
-        outward: to which side along the opening it moves away, 1 or -1; of a fixed jaw the side that it is on.
+        name: name of its body, or of the link that is the fixed jaw.
+        points: points of its surface [n, 3], in the link of the gripper's frame; None: unknown.
+        pose: pose of the body or link there [4, 4].
+        shut: pose of the body when the gripper is closed [4, 4].
+        outward: side along the opening to which it moves away, 1 or -1; a fixed jaw's own side.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Finger:
 
 @dataclasses.dataclass(frozen=True)
 class Pads:
-    """``pads`` and ``backs`` of a hand: name -> shape in its frame; and the pads where the cube is held."""
+    """Pads and backs of a hand (name -> shape in its frame), and the pads where the cube is held."""
 
     pads: dict[str, Primitive]
     backs: dict[str, Primitive]
@@ -45,9 +45,9 @@ class Pads:
 
 
 def fitted(moving: list[tuple[Finger, Body]], fixed: Finger | None, frame: Matrix) -> Pads:
-    """A box around the distal part of each finger, along the columns of ``frame`` [3, 3] (approach, opening, across).
+    """Fits a box to the distal part of each finger, along the columns of ``frame`` [3, 3] (approach, opening, across).
 
-    The fixed jaw's is fitted to what faces the moving one's pad; without a mesh it is that pad's like, where the two touch.
+    The fixed jaw's pad is fitted to what faces the moving one's. Without a mesh it is a copy of that pad, where the two touch.
     """
     out = Pads({}, {}, [])
     lengths = [np.ptp(finger.points @ frame[:, 0]) for finger, _ in moving if finger.points is not None]
@@ -71,34 +71,34 @@ def _add(out: Pads, finger: Finger, pad: Primitive) -> None:
 
 
 def _split(out: Pads, finger: Finger, points: Points, end: Bool[np.ndarray, " n"], frame: Matrix) -> None:
-    """A pad for the part that grips, a shape for what lies behind it."""
+    """Adds a pad for the part that grips, and a shape for what lies behind it."""
     box = primitives.box(points[end], frame)
     _add(out, finger, primitives.measured(box, points[end], primitives.hull(points[end])))
     behind = points[points @ frame[:, 0] < (points[end] @ frame[:, 0]).min()]
     if len(behind) >= FEW:
         back = primitives.best(behind, primitives.hull(behind), boxes=False)
-        if _reach(back, frame) > _reach(box, frame):  # a ball about a palm
+        if _reach(back, frame) > _reach(box, frame):  # such as a ball about a palm
             back = primitives.measured(primitives.box(behind, frame), behind, primitives.hull(behind))
         out.backs[finger.name] = dataclasses.replace(back, pose=np.linalg.inv(finger.pose) @ back.pose)
 
 
 def _reach(shape: Primitive, frame: Matrix) -> float:
-    """How far it reaches along the approach [m]."""
+    """Reach of the shape along the approach [m]."""
     return -float(shape.lowest(np.append(-frame[:, 0], 0.0)[None])[0])
 
 
 def _distal(points: Points, frame: Matrix, length: float) -> Bool[np.ndarray, " n"]:
-    """Which of the points [n] are in the part that grips; all, if hardly any are."""
+    """Selects the points [n] of the part that grips; all, if hardly any are."""
     along = points @ frame[:, 0]
     chosen = along >= np.quantile(along, 0.999) - DISTAL * length
     return chosen if FEW <= chosen.sum() <= len(points) - FEW else np.ones(len(points), bool)
 
 
 def _facing(jaw: Finger, finger: Finger, out: Pads, frame: Matrix) -> Bool[np.ndarray, " n"]:
-    """Which of the fixed jaw's points [n] face the moving one's pad: no wider, as thick, and not before the face that it meets.
+    """Selects the fixed jaw's points [n] that face the moving pad: no wider, as thick, and not in front of its face.
 
-    Along the approach they go from where that pad begins when it holds the cube to where it ends when it has closed, or, if the
-    jaw ends before, to its end.
+    Along the approach they span from where that pad begins when it holds the cube to where it ends when closed, or to the jaw's
+    own end.
     """
     assert jaw.points is not None
     held = out.held[0]
@@ -119,7 +119,7 @@ def _facing(jaw: Finger, finger: Finger, out: Pads, frame: Matrix) -> Bool[np.nd
 
 
 def _blind(finger: Finger, body: Body, frame: Matrix) -> Primitive:
-    """The pad of a finger without a mesh: at its frame, of a jaw that turns about its end."""
+    """Makes the pad of a finger without a mesh: at its frame, or about the end of a turning jaw."""
     turns = body.joint is not None and body.joint.type != "prismatic"
     origin = (finger.pose @ np.append(2 * body.mass.com * turns, 1.0))[:3]
     half = np.array([PAD[0], PAD[2], PAD[1]]) / 2
@@ -128,15 +128,14 @@ def _blind(finger: Finger, body: Body, frame: Matrix) -> Primitive:
 
 
 def _like(pad: Primitive, jaw: Finger, frame: Matrix) -> Primitive:
-    """A pad like the moving jaw's, beside it on the fixed one's side."""
+    """Copies the moving jaw's pad to the fixed one's side."""
     pose = pad.pose.copy()
     pose[:3, 3] += frame[:, 1] * jaw.outward * 2 * float(np.abs(frame[:, 1] @ pose[:3, :3]) @ np.array(pad.size))
     return dataclasses.replace(pad, pose=pose)
 
 
 def middle(boxes: list[Primitive], frame: Matrix) -> Vec:
-    """Amid the pads, in the axes of ``frame``: amid what they share along the approach, along the opening between the faces that
-    look at each other."""
+    """Middle of the pads, in the axes of ``frame``: of their overlap along the approach, and between their facing sides."""
     centres = np.array([b.pose[:3, 3] @ frame for b in boxes])
     half = np.array([np.abs(frame[:, 1] @ b.pose[:3, :3]) @ np.array(b.size) for b in boxes])
     reach = np.array([np.abs(frame[:, 0] @ b.pose[:3, :3]) @ np.array(b.size) for b in boxes])
@@ -156,7 +155,7 @@ def extents(box: Primitive, frame: Matrix) -> tuple[float, float, float]:
 
 
 def gap(pads: Mapping[str, Primitive], poses: Mapping[str, Pose], sides: Mapping[str, float]) -> float:
-    """The least distance between pads on different sides of the opening [m], their bodies at ``poses`` [4, 4]."""
+    """Least distance between pads on different sides of the opening [m], with bodies at ``poses`` [4, 4]."""
     placed = {n: dataclasses.replace(pad, pose=poses[n] @ pad.pose) for n, pad in pads.items()}
     pairs = [(a, b) for a in placed for b in placed if sides[a] > sides[b]]
     return min((primitives.distance(placed[a], placed[b]) for a, b in pairs), default=0.0)

@@ -1,4 +1,4 @@
-"""Primitive shapes around meshes. Collisions of meshes are slow in MJX, and a capsule costs two contacts with the table."""
+"""Primitive shapes fitted around meshes. Mesh collisions are slow in MJX; a capsule costs only two contacts with the table."""
 
 import dataclasses
 import functools
@@ -13,10 +13,10 @@ from scipy import spatial
 from mjx_nero.urdf.tree import Matrix, Points, Pose, Shape, Values, Vec
 
 SAMPLES = 3000
-GRID = 9  # points along an edge of a box, that its distance from another is measured at
-OUTSIDE = 0.02  # share of the surface that may stick out: a bolt's head shall not make the whole shape thicker
-CONTACTS = {"sphere": 1, "capsule": 2, "box": 4}  # with a plane
-_PENALTY = {"sphere": 1.0, "capsule": 1.0, "box": 1.3}  # at about equal volume the one with fewer contacts
+GRID = 9  # points along an edge of a box, for measuring its distance from another
+OUTSIDE = 0.02  # share of the surface that may stick out, so that no bolt's head thickens the whole shape
+CONTACTS = {"sphere": 1, "capsule": 2, "box": 4}  # contacts with a plane
+_PENALTY = {"sphere": 1.0, "capsule": 1.0, "box": 1.3}  # at similar volume, prefer fewer contacts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Primitive:
 
     Attributes:
         kind: ``sphere``, ``capsule`` or ``box``.
-        size: as in MJCF: (radius,), (radius, half length of the cylinder along z) or half extents [m].
-        pose: in the link [4, 4].
-        covered: share of the mesh's surface that lies inside it.
-        fill: volume of the mesh's convex hull over the shape's.
+        size: MJCF's size: (radius,), (radius, half length of the cylinder along z) or half extents [m].
+        pose: pose in the link [4, 4].
+        covered: share of the mesh's surface inside it.
+        fill: volume of the mesh's convex hull divided by the shape's.
     """
 
     kind: str
@@ -39,7 +39,7 @@ class Primitive:
 
     @property
     def volume(self) -> float:
-        """[m3]"""
+        """Volume [m3]."""
         if self.kind == "box":
             return 8 * math.prod(self.size)
         r, half = self.size[0], self.size[1] if self.kind == "capsule" else 0.0
@@ -47,11 +47,11 @@ class Primitive:
 
     @property
     def radius(self) -> float:
-        """Of the ball about its centre that holds it [m]."""
+        """Radius of the bounding ball about its centre [m]."""
         return math.hypot(*self.size) if self.kind == "box" else sum(self.size)
 
     def contains(self, points: Points) -> Bool[np.ndarray, " n"]:
-        """Whether each of the points [n, 3] lies inside or on it [n]."""
+        """True for each of the points [n, 3] inside or on it."""
         p = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         if self.kind == "box":
             return (np.abs(p) <= np.array(self.size) + 1e-9).all(1)
@@ -69,7 +69,7 @@ class Primitive:
 
 
 def sample(mesh: trimesh.Trimesh, count: int = SAMPLES) -> Points:
-    """Points [count, 3] spread evenly over the surface; the same ones for the same mesh."""
+    """Samples points [count, 3] evenly over the surface; always the same ones for the same mesh."""
     rng = np.random.default_rng(0)
     triangles = np.asarray(mesh.triangles, float)
     areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
@@ -82,12 +82,12 @@ def sample(mesh: trimesh.Trimesh, count: int = SAMPLES) -> Points:
 
 
 def best(points: Points, volume: float, boxes: bool = True) -> Primitive:
-    """The smallest of sphere, capsules and boxes along the link's and the points' principal axes.
+    """Fits the smallest of sphere, capsules and boxes along the link's and the points' principal axes.
 
     Args:
-        points: on the surface [n, 3]; all but ``OUTSIDE`` of them end up inside.
-        volume: of their convex hull [m3].
-        boxes: False leaves boxes out, which cost the most contacts.
+        points: points on the surface [n, 3]; all but the share ``OUTSIDE`` end up inside.
+        volume: volume of their convex hull [m3].
+        boxes: allow boxes, which cost the most contacts.
     """
     frames = [np.eye(3), _principal(points)]
     turned = [frame[:, [(k + 1) % 3, (k + 2) % 3, k]] for frame in frames for k in range(3)]
@@ -97,13 +97,13 @@ def best(points: Points, volume: float, boxes: bool = True) -> Primitive:
 
 
 def measured(shape: Primitive, points: Points, volume: float) -> Primitive:
-    """``shape`` with its coverage of the points and of the volume that they enclose."""
+    """Adds to ``shape`` its coverage of the points and of the volume that they enclose."""
     covered = float(shape.contains(points).mean())
     return dataclasses.replace(shape, covered=round(covered, 4), fill=round(volume / shape.volume, 4))
 
 
 def box(points: Points, frame: Matrix, outside: float = OUTSIDE) -> Primitive:
-    """The box along the columns of ``frame`` [3, 3] that leaves the share ``outside`` of the points out."""
+    """Fits a box along the columns of ``frame`` [3, 3] that leaves the share ``outside`` of the points out."""
     p = points @ frame
     lower, upper = np.quantile(p, [outside / 6, 1 - outside / 6], axis=0)
     half = np.maximum((upper - lower) / 2, 5e-4)
@@ -111,14 +111,14 @@ def box(points: Points, frame: Matrix, outside: float = OUTSIDE) -> Primitive:
 
 
 def pose(turn: Matrix, at: Vec) -> Pose:
-    """The frame with columns ``turn`` [3, 3] at ``at`` [3], as [4, 4]."""
+    """Builds the pose [4, 4] with columns ``turn`` [3, 3] at ``at`` [3]."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn, at
     return out
 
 
 def distance(a: Primitive, b: Primitive) -> float:
-    """How far two boxes are apart [m], 0 if they overlap: of points on a grid over either's faces from the other."""
+    """Distance between two boxes [m], 0 if they overlap, measured from a grid of points on each one's faces."""
     away = []
     for one, other in ((a, b), (b, a)):
         points = _grid() * np.array(one.size) @ one.pose[:3, :3].T + one.pose[:3, 3]
@@ -136,7 +136,7 @@ def _grid() -> Points:
 
 
 def hull(points: Points) -> float:
-    """Volume of the convex hull [m3]; 0 of what is flat."""
+    """Volume of the convex hull [m3]; 0 if flat."""
     try:
         return float(spatial.ConvexHull(points).volume)
     except spatial.QhullError:
@@ -150,7 +150,7 @@ def _sphere(points: Points) -> Primitive:
 
 
 def _capsule(points: Points, frame: Matrix) -> Primitive:
-    """Along the last column of ``frame``."""
+    """Fits a capsule along the last column of ``frame``."""
     p = points @ frame
     centre = (p.min(0) + p.max(0)) / 2
     p -= centre
@@ -167,7 +167,7 @@ def _principal(points: Points) -> Matrix:
 
 
 def exact(shape: Shape) -> Primitive | None:
-    """A URDF's box, sphere or capsule as MuJoCo has it; None for other shapes."""
+    """Converts a URDF's box, sphere or capsule; None for other shapes."""
     if shape.kind == "box":
         return Primitive("box", tuple(s / 2 for s in shape.size), shape.origin)
     if shape.kind == "capsule":

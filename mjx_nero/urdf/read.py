@@ -1,4 +1,4 @@
-"""URDF text to a checked ``Tree``: what is wrong is repaired with a note, or is an error that says what to do."""
+"""Reads URDF text to a checked ``Tree``. Faults are repaired with a note, or raise an error that says what to do."""
 
 import dataclasses
 import io
@@ -32,10 +32,10 @@ def read(
     *,
     units: units_of.Units = units_of.METRES,
 ) -> tuple[Tree, Pose]:
-    """The robot that the file describes, and where its root stands in the world [4, 4].
+    """Returns the robot that the file describes, and the pose of its root in the world [4, 4].
 
-    An empty root link ``world`` with one fixed joint is that joint's pose; it is left out of the tree.
-    ``units`` says what its numbers are in, if not in metres and radians.
+    An empty root link ``world`` with one fixed joint becomes that pose and leaves the tree. ``units`` states the units, if not
+    metres and radians.
 
     Raises:
         UserError: the file is missing, too large, malformed, or describes no tree of links with fixed, revolute, continuous and
@@ -60,7 +60,7 @@ def read(
             load_meshes=False,
             filename_handler=yourdfpy.filename_handler_null,
         )
-    except Exception as error:  # what the checks above let through fails in yourdfpy in ways of its own
+    except Exception as error:  # yourdfpy fails in its own ways on what passed the checks above
         raise UserError(f"{path} cannot be read as a URDF: {type(error).__name__}: {' '.join(str(error).split())}") from None
     units_of.applied(urdf.robot, units)
     tree, mount = _tree(urdf.robot, notes)
@@ -85,7 +85,7 @@ def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
 
 
 def _unmounted(robot: yourdfpy.Robot, notes: Notes) -> Pose:
-    """Takes the link ``world`` and its joint out of ``robot``, if that is all that they are; the pose of the link below."""
+    """Removes the link ``world`` and its joint from ``robot``, if they are nothing more; returns the pose of the link below."""
     world = next((link for link in robot.links if link.name == "world"), None)
     below = [j for j in robot.joints if j.parent == "world"]
     heavy = world is not None and world.inertial is not None and bool(world.inertial.mass)
@@ -106,7 +106,7 @@ def _names(robot: yourdfpy.Robot) -> dict[str, list[str]]:
 
 
 def _free_names(kind: str, names: list[str], notes: Notes) -> dict[str, str]:
-    """Name -> name in the model: another only if scenes use that name."""
+    """Returns name -> name in the model, which differs only if scenes use that name."""
     out = {}
     for name in names:
         out[name] = name
@@ -118,7 +118,7 @@ def _free_names(kind: str, names: list[str], notes: Notes) -> dict[str, str]:
 
 
 def _ordered(links: list[str], joints: list[Joint]) -> tuple[list[Joint], str]:
-    """Joints, parents first, and the root link."""
+    """Orders joints, parents first, and finds the root link."""
     parent_of: dict[str, Joint] = {}
     for joint in joints:
         for link in (joint.parent, joint.child):
@@ -163,7 +163,7 @@ def _joint(joint: yourdfpy.Joint, rename: dict[str, dict[str, str]], notes: Note
     if abs(length - 1) > 1e-6:
         notes.add("repaired", "joint", name, f"the axis had length {length:g}, now 1")
     kind = "revolute" if _bounded(joint) else joint.type
-    lower, upper = (0.0, 0.0) if joint.mimic else _limits(joint, name, notes)  # a follower's are its driver's
+    lower, upper = (0.0, 0.0) if joint.mimic else _limits(joint, name, notes)  # a follower takes its driver's
     effort, velocity = (_positive(joint.limit, field, name, notes) for field in ("effort", "velocity"))
     losses = {}
     for field in ("damping", "friction"):
@@ -186,7 +186,7 @@ def _positive(limit: yourdfpy.urdf.Limit | None, field: str, name: str, notes: N
 
 
 def _bounded(joint: yourdfpy.Joint) -> bool:
-    """Whether a continuous joint gives usable limits all the same, of less than a turn either way."""
+    """True if a continuous joint still gives usable limits, of less than a turn either way."""
     if joint.type != "continuous" or joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
         return False
     return joint.limit.lower < joint.limit.upper and max(abs(joint.limit.lower), abs(joint.limit.upper)) < math.tau
@@ -218,7 +218,7 @@ def _limits(joint: yourdfpy.Joint, name: str, notes: Notes) -> tuple[float, floa
 
 
 def _with_mimics(joints: list[Joint], robot: yourdfpy.Robot, rename: dict[str, str], notes: Notes) -> list[Joint]:
-    """Joints with ``mimic`` followed to the joint that is driven."""
+    """Follows ``mimic`` of joints to the joint that is driven."""
     by_name = {j.name: j for j in joints}
     raw = {rename[j.name]: j.mimic for j in robot.joints if j.mimic is not None and by_name[rename[j.name]].moves}
     out = []
@@ -255,7 +255,7 @@ def _with_mimics(joints: list[Joint], robot: yourdfpy.Robot, rename: dict[str, s
 
 
 def _following(joint: Joint, source: Joint | None, by: tuple[float, float]) -> Joint:
-    """A follower between the limits that its driver's put to it: its own would stop the driver half way."""
+    """Gives a follower the limits that follow from its driver's; its own would stop the driver half way."""
     multiplier, offset = by
     ends = (multiplier * end + offset for end in ((source.lower, source.upper) if source else (0.0, 0.0)))
     lower, upper = sorted(ends)

@@ -1,4 +1,4 @@
-"""Where the gripper can grasp on the table, and where it can hold what it has grasped: by inverse kinematics."""
+"""Regions where the gripper can grasp on the table and where it can hold an object, found by inverse kinematics."""
 
 import dataclasses
 import itertools
@@ -16,33 +16,33 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Points, Poses, Values, Vec
 from mjx_nero.urdf.workspace import Box
 
-CELLS = 16  # of the reach
-NEAR, ASIDE = 0.25, 0.3125  # of the reach: the nearest before the shoulder, the farthest to its side
-LONG, WIDE = 0.25, 0.4  # of the reach: the largest region, ahead and aside
-SPARE = 0.02  # of the reach: the hand gets so much further than the region to all sides, where there is such a region
-OVER = 0.06  # [m] above the cube's grasp the hand still points down, to come down on it
-TALL = 0.4  # of the reach: the highest above the table that anything is held
-WIDTH = 0.15  # of the reach: a hand leans further where its region is narrower, if that helps
-LEANS = tuple(np.radians((15, 30, 45)))  # of a hand that cannot point down: as little as will do
-HELD = np.radians(60)  # of one that holds something
-DESCENTS, STARTS = 8, 12  # of the inverse kinematics, for a cell and for a point of a region
-TURNS = 5  # joints of an arm that can turn its hand at will while that points down
+CELLS = 16  # cells along the reach
+NEAR, ASIDE = 0.25, 0.3125  # shares of the reach: least distance ahead of the shoulder, greatest to its side
+LONG, WIDE = 0.25, 0.4  # shares of the reach: greatest size of a region, ahead and aside
+SPARE = 0.02  # share of the reach by which the hand reaches beyond the region, if one such exists
+OVER = 0.06  # [m] height above the grasp at which the hand still points down, to approach from above
+TALL = 0.4  # share of the reach: greatest height above the table for holding
+WIDTH = 0.15  # share of the reach: a hand with a narrower region tries to lean further
+LEANS = tuple(np.radians((15, 30, 45)))  # leans of a hand that cannot point down, the least first
+HELD = np.radians(60)  # greatest lean while holding
+DESCENTS, STARTS = 8, 12  # descents per cell, and per point of a region
+TURNS = 5  # least joints of an arm that can turn its hand freely while the hand points down
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4)
 Quat = tuple[float, float, float, float]
-Way = tuple[Vec | None, Quat]  # to turn a hand
-Shapes = list[tuple[str, Primitive]]  # that meet the table, with their links
+Way = tuple[Vec | None, Quat]  # a way to turn the hand
+Shapes = list[tuple[str, Primitive]]  # link and shape, for shapes that collide with the table
 
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where the gripper can grasp and hold, and how its hand is turned there.
+    """The regions for grasping and holding, and how the hand is turned there.
 
     Attributes:
-        pick, hold: boxes as in ``RobotCfg``; None where there are none.
-        lean: how far the hand leans [rad], 0 where it points down.
-        turns: whether it can be turned there so that its fingers open along y.
-        ways: how the hand may be turned about the vertical, the usual way first: the direction of the grasp point's frame [3]
-            that then lies along y, None where the turn does not count, and the orientation ``RobotCfg.down``.
+        pick, hold: the boxes of ``RobotCfg``; None if there are none.
+        lean: the hand's angle from pointing down [rad].
+        turns: the hand can be turned there so that its fingers open along y.
+        ways: ways to turn the hand about the vertical, the usual one first. Each is a direction in the grasp point's frame [3]
+            that lies along y (None: any turn will do), and the orientation ``RobotCfg.down``.
     """
 
     pick: Box | None
@@ -54,11 +54,11 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Reaching:
-    """Inverse kinematics that keeps above the table.
+    """Inverse kinematics that stays above the table.
 
     Attributes:
-        shapes: what must not get below it.
-        shun, tilt, along: as ``Cloud.solve`` takes them.
+        shapes: the shapes that must stay above it.
+        shun, tilt, along: arguments of ``Cloud.solve``.
     """
 
     cloud: Cloud
@@ -68,7 +68,7 @@ class Reaching:
     along: Vec | None = None
 
     def __call__(self, goals: Points, starts: int) -> Bool[np.ndarray, " g"]:
-        """Which of the goals [g, 3] the grasp point gets to."""
+        """True for each of the goals [g, 3] that the grasp point reaches."""
         if not len(goals):
             return np.zeros(0, bool)
         q = self.cloud.solve(goals, True, starts, tilt=self.tilt, along=self.along, shun=self.shun)
@@ -77,31 +77,32 @@ class Reaching:
         return there.any(1)
 
     def everywhere(self, box: Box) -> bool:
-        """Whether it gets to the corners of a box and to the points midway."""
+        """True if it reaches the corners of a box and the points midway."""
         return bool(self(np.array(list(itertools.product(*(dict.fromkeys((a, (a + b) / 2, b)) for a, b in box)))), STARTS).all())
 
 
 def _above(cloud: Cloud, shapes: Shapes, poses: Mapping[str, Poses]) -> Bool[np.ndarray, " n"]:
-    """In which of the poses no shape is below the table."""
+    """True for each pose in which no shape is below the table."""
     heights = [cloud.lowest(link, shape, poses) for link, shape in shapes]
     return np.min(heights, axis=0) > 0 if heights else np.ones(len(next(iter(poses.values()))), bool)
 
 
 def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes, name: str, notes: Notes) -> Place:
-    """The boxes ``pick`` and ``hold`` of ``RobotCfg``, and how the hand is turned there.
+    """Finds the boxes ``pick`` and ``hold`` of ``RobotCfg``, and how the hand is turned there.
 
-    The table before the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach; those count to
-    which inverse kinematics gets with the hand pointing down, its fingers opening along y, at the height of a grasp and
-    ``OVER`` it, and with nothing below the table. Where there are none either way round the hand may be turned any way about
-    the vertical, and where there are none of those either, lean by up to one of ``LEANS``. The rectangle of such cells is taken
-    whose area, weighted by nearness to the middle of what is before the shoulder, is largest, up to ``LONG`` times ``WIDE``; then
-    inverse kinematics has to get to 27 points of it, corners among them, or it is made smaller. What is held may be brought as
-    far up from there as the arm gets with the hand within ``HELD`` of down.
+    The table in front of the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach. A cell counts
+    if inverse kinematics reaches it with the hand pointing down and its fingers opening along y, at the height of a grasp and
+    ``OVER`` it, with nothing below the table. If there are no such cells either way round, any turn about the vertical will do;
+    if there are still none, the hand may lean by one of ``LEANS``.
+
+    ``pick`` is the rectangle of such cells, up to ``LONG`` by ``WIDE``, with the largest area weighted by nearness to the middle
+    in front of the shoulder. It shrinks until inverse kinematics reaches 27 of its points, including the corners. ``hold`` rises
+    from there as far as the arm reaches with the hand within ``HELD`` of down.
 
     Args:
-        work: the workspace; it says on which side the work is.
+        work: the workspace, which tells the side of the work.
         down: orientation of the grasp point with the hand pointing down, wxyz.
-        shapes: what must not get below the table.
+        shapes: the shapes that must stay above the table.
     """
     along, turned = opening(down), _half_turn(down)
     either: tuple[Way, ...] = (along, down), (-along, turned)
@@ -135,18 +136,18 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
 
 
 def _width(box: Box) -> float:
-    """The shorter side of a region on the table [m]."""
+    """Length of the shorter side of a region on the table [m]."""
     return min(upper - lower for lower, upper in box[:2])
 
 
 def _half_turn(down: Quat) -> Quat:
-    """Half a turn on about the vertical."""
+    """Turns an orientation by half a turn about the vertical."""
     w, x, y, z = down
     return -z + 0.0, -y + 0.0, x, w
 
 
 def opening(down: Quat) -> Vec:
-    """The direction of the grasp point's frame that lies along y where the hand is turned so."""
+    """Direction in the grasp point's frame that lies along y when the hand has the orientation ``down``."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, np.array(down))
     return turn.reshape(3, 3).T @ np.array([0.0, 1.0, 0.0])
@@ -175,7 +176,7 @@ def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
     for height in (low, low + OVER):
         grid[:, :, 2] = height
         met[met] = reaching(grid[met], DESCENTS)
-    # What a few descents left out amid the others; all of the region is looked at again.
+    # Fills gaps that the few descents left; the whole region is checked again below.
     beside = np.pad(met.astype(int), 1)
     met |= beside[2:, 1:-1] + beside[:-2, 1:-1] + beside[1:-1, 2:] + beside[1:-1, :-2] >= 3
     found = _largest(met, ahead / reach, aside / reach)
@@ -192,13 +193,13 @@ def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
 
 
 def _grown(box: Box, by: float) -> Box:
-    """The box, larger by so much to each side [m]: an arm that is stretched out at its edge would not keep to a way there."""
+    """Grows the box by ``by`` on each side [m], because an arm stretched out at its edge would not keep to a path there."""
     x, y, z = box
     return (x[0] - by, x[1] + by), (y[0] - by, y[1] + by), z
 
 
 def _hold(reaching: Reaching, pick: Box, reach: float) -> Box:
-    """Above ``pick``, as high as it gets; at its own top where that is nowhere."""
+    """Finds the box above ``pick``, as high as the arm reaches; at the top of ``pick`` if nowhere."""
     low = pick[2][0] + max(0.05, 0.1 * reach)
     for shrink in SHRINKS:
         box = (*_about(np.array(pick[:2]), shrink), (_rounded(low), _rounded(low)))
@@ -208,7 +209,7 @@ def _hold(reaching: Reaching, pick: Box, reach: float) -> Box:
 
 
 def _raised(reaching: Reaching, box: Box, most: float, step: float) -> Box:
-    """The box, higher by up to ``most``, as long as every layer is reached everywhere."""
+    """Raises the box by up to ``most``, as long as every layer is reached everywhere."""
     x, y, (low, high) = box
     while high + step <= low + most and reaching.everywhere((x, y, (high + step, high + step))):
         high += step
@@ -218,7 +219,7 @@ def _raised(reaching: Reaching, box: Box, most: float, step: float) -> Box:
 def _largest(
     met: Bool[np.ndarray, "a b"], ahead: Float[np.ndarray, " a"], aside: Float[np.ndarray, " b"]
 ) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Of the rectangles of cells that are met, at least two cells either way, the best: first and last of both axes."""
+    """Finds the best rectangle of reachable cells, at least two cells either way: first and last index on both axes."""
     total = np.pad(met.astype(int), ((1, 0), (1, 0))).cumsum(0).cumsum(1)
 
     def spans(places: Values, most: float) -> list[tuple[int, int]]:
@@ -235,7 +236,7 @@ def _largest(
 
 
 def _about(ends: Float[np.ndarray, "2 2"], shrink: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The rectangle, smaller about its centre."""
+    """Shrinks the rectangle about its centre."""
     x, y = ((_rounded(m - h), _rounded(m + h)) for m, h in zip(ends.mean(1), shrink * np.ptp(ends, axis=1) / 2, strict=True))
     return x, y
 

@@ -1,4 +1,4 @@
-"""What the importer tells its user: a note for everything that it changed, guessed or could not use."""
+"""The importer's report to its user: a note about everything that it changed, guessed or could not use."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ KINDS = ("warning", "repaired", "guessed", "note")
 
 @dataclasses.dataclass(frozen=True)
 class Note:
-    """``kind``: one of ``KINDS``. ``where``: ``link``, ``joint`` or ``robot``, then the name."""
+    """One note. ``kind`` is one of ``KINDS``; ``where`` is ``link``, ``joint`` or ``robot``, and ``name`` its name."""
 
     kind: str
     where: str
@@ -22,7 +22,7 @@ class Note:
 
 
 class Notes(list[Note]):
-    """Notes in the order in which they came up, each once."""
+    """Notes in order, each once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,15 +40,15 @@ class Notes(list[Note]):
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What an import did; ``report.json`` holds the same, and later what the self-test found (``folder.record``).
+    """The results of an import. ``report.json`` holds the same, and later the results of the self-test (``folder.record``).
 
     Attributes:
         folder: the model folder.
-        robot: config, as ``robot.yaml`` has it.
-        links: name -> what was read of it, its body in the model and its collision shapes with their coverage.
-        joints: name -> what was read of it and what the model has.
-        mass: of the model [kg]; ``mass_read``: sum over the URDF's links.
-        contacts: most contacts that the robot can make with the table, and with the table and one cube.
+        robot: the config in ``robot.yaml``.
+        links: name -> data of the link, its body in the model, and its collision shapes with their coverage.
+        joints: name -> data of the joint, in the URDF and in the model.
+        mass: mass of the model [kg]; ``mass_read``: sum over the URDF's links.
+        contacts: greatest number of contacts with the table, and with the table and one cube.
     """
 
     source: str
@@ -63,14 +63,14 @@ class Report:
 
     @property
     def warnings(self) -> list[str]:
-        """One line each: what could not be used, and what stands in for it."""
+        """One line each about what could not be used, and what replaces it."""
         return [f"{n.where} {n.name}: {n.text}" for n in self.notes if n.kind == "warning"]
 
     def json(self, files: Mapping[str, str]) -> str:
-        """The content of ``report.json``.
+        """Returns the content of ``report.json``.
 
         Args:
-            files: name -> hash of the others in its folder.
+            files: name -> hash of the folder's other files.
         """
         content = {
             "files": dict(files),

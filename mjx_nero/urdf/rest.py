@@ -1,4 +1,4 @@
-"""How the robot stands: on the table, or on the floor beside it; or how it hangs."""
+"""The stand of the robot: on the table, on the floor beside it, or hanging."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,27 +10,28 @@ from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Pose, body_of
 
-SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal, which stands on the floor beside the table
-UPRIGHT = 0.99  # least cosine of a base's tilt that may stand on the table as well
-TILTED = 0.5  # ... and of one that stands at all
-HANGS = (0.3, 0.9)  # of the arm's length: so high is the shoulder of one that hangs above the table
-TALL = 0.6  # [m] a shoulder higher than this above the floor, and than ...
-SHARE = 0.4  # ... this share of the arm's length, is a robot's that stands on the floor
-BELOW = 0.3  # of the arm's length: the table then lies so far below the shoulder
+SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal on the floor beside the table
+UPRIGHT = 0.99  # least cosine of a base's tilt on the table
+TILTED = 0.5  # ... and of a base that stands at all
+HANGS = (0.3, 0.9)  # range of a hanging arm's shoulder height above the table, in arm lengths
+TALL = 0.6  # [m] a robot stands on the floor if its shoulder is higher than this ...
+SHARE = 0.4  # ... and than this share of the arm's length
+BELOW = 0.3  # depth of the table below the shoulder in that case, in arm lengths
 
 
 @dataclasses.dataclass(frozen=True)
 class Stand:
-    """Where the base is mounted [4, 4], the table being at height 0, and the height of the floor that it stands on [m]."""
+    """Pose of the mount [4, 4], with the table at height 0, and the height of the floor that the robot stands on [m]."""
 
     mount: Pose
     floor: float
 
 
 def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: Pose, name: str, notes: Notes) -> Stand:
-    """On the table; a pedestal, or what is as tall as a person, on the floor beside it; or hung, as the URDF mounts it.
+    """Places the robot: on the table, on the floor beside it if it is a pedestal or as tall as a person, or hanging as the URDF
+    mounts it.
 
-    A pedestal's top, where the arm begins, is at the table's height. What hangs does so where the table is in its reach.
+    The top of a pedestal, where the arm begins, is at the table's height. A hanging robot hangs where the table is within reach.
     """
     base = next(iter(parts.values()))
     points = [(look.points @ at[:3, :3].T + at[:3, 3]) for link, at in base.links.items() if (look := _seen(looks[link]))]
@@ -57,11 +58,11 @@ def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: 
 
 
 def _hung(mount: Pose, shoulder: float, length: float, name: str, notes: Notes) -> Stand:
-    """A base that is tilted so far that it can only hang; lower or higher, if the arm would not work over the table.
+    """Hangs a base that is too tilted to stand, lower or higher if the arm would not reach the table.
 
     Args:
-        shoulder: how much higher than the mount the first joint is [m].
-        length: of the arm [m].
+        shoulder: height of the first joint above the mount [m].
+        length: length of the arm [m].
     """
     height = float(mount[2, 3]) + shoulder
     fits = HANGS[0] * length <= height <= HANGS[1] * length
@@ -74,7 +75,7 @@ def _hung(mount: Pose, shoulder: float, length: float, name: str, notes: Notes) 
 
 
 def _chain(parts: dict[str, Body], hand: Hand) -> list[Body]:
-    """The bodies from the base to the hand, without the slides that a lift begins with."""
+    """Lists the bodies from the base to the hand, without the slides of a lift at the start."""
     chain: list[Body] = []
     at = body_of(parts, hand.link)
     while at.joint is not None:
@@ -86,13 +87,13 @@ def _chain(parts: dict[str, Body], hand: Hand) -> list[Body]:
 
 
 def _foot(base: Body, chain: list[Body]) -> Pose:
-    """The frame of the base's link that carries the arm [4, 4]."""
+    """Frame of the base's link that carries the arm [4, 4]."""
     joint = chain[0].joint if chain else None
     return base.links.get(joint.parent if joint else base.name, np.eye(4))
 
 
 def _at(mount: Pose, height: float) -> Pose:
-    """The mount at another height [m]."""
+    """Moves the mount to another height [m]."""
     out = mount.copy()
     out[2, 3] = height
     return out

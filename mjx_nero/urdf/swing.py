@@ -1,4 +1,4 @@
-"""A gripper moved through its range: which of its shapes meet, where, and how far they are apart."""
+"""Moves a gripper through its range: which of its shapes meet, where, and how far apart they are."""
 
 import dataclasses
 import itertools
@@ -12,27 +12,27 @@ from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.tree import Body, Joint, Points, Poses, Tree, Values, Vec, below
 from mjx_nero.urdf.tree import poses as body_poses
 
-FOLLOWED, KEPT = 250, 2000  # points of a shape that are followed, and that others are near to
+FOLLOWED, KEPT = 250, 2000  # points of a shape that are moved, and points that they are compared with
 STEPS, TURN = 13, 73  # positions of a swing, and of a whole turn
-FACE = 0.2  # of what a shape's points differ by in parting from another: the face with which it meets that differs by no more
-BESIDE = 0.7  # what a moving shape's meeting a fixed one is worth: two that move are fingers, if they meet alike
-INNER = 0.25  # of the way: shapes that are farther apart at the end than somewhere before have met there
-STILL = 1e-6  # [m, 1] bodies whose poses differ by less do not move against one another
-TOUCH = 5e-3  # [m] shapes as near as that touch: points on a surface are a few millimetres apart
-WIDE = 0.01  # [m] and shapes that part by less never met
-AT_ZERO, NEAR_ZERO = 0.1, 1.2  # [rad] an endless jaw closes within this of its zero: what it meets farther round is the arm
+FACE = 0.2  # a shape's face parts within this share of the range over its points
+BESIDE = 0.7  # worth of meeting a fixed shape: two moving shapes that meet equally well are preferred
+INNER = 0.25  # share of the range by which shapes must part again to have met on the way
+STILL = 1e-6  # [m, 1] least change of pose that counts as motion
+TOUCH = 5e-3  # [m] distance at which shapes touch, as sampled points are millimetres apart
+WIDE = 0.01  # [m] shapes that part by less never met
+AT_ZERO, NEAR_ZERO = 0.1, 1.2  # [rad] an endless jaw closes this near to zero; farther round it meets the arm
 Positions = Mapping[str, Values]
 
 
 @dataclasses.dataclass(frozen=True)
 class Meeting:
-    """Two shapes of a gripper over a swing.
+    """Two shapes of a gripper over its swing.
 
     Attributes:
-        names: a moving body, and another one or a link that the gripper hangs on.
+        names: a moving body, and another one or a link that carries the gripper.
         fixed: the second is such a link.
-        apart: how far the faces are apart with which they meet [n]; of points that stand for shapes, farther than when nearest.
-        spots: the middles of these faces, in the frames of the two; of a fixed one in the fork's.
+        apart: distance between the meeting faces [n]; for points in place of shapes, beyond their least distance.
+        spots: the middles of these faces, each in its body's frame; a fixed one in the fork's.
     """
 
     names: tuple[str, str]
@@ -42,22 +42,22 @@ class Meeting:
 
     @property
     def worth(self) -> float:
-        """How far the two part, less what is left between them when they are nearest [m]; -inf of a finger that never comes near
-        what is fixed."""
+        """Distance by which the two part, minus their least distance [m]; -inf for a finger that never comes near a fixed
+        shape."""
         parted = float(np.ptp(self.apart) - self.apart.min())
         return parted if not self.fixed else BESIDE * parted if parted > 0 else -np.inf
 
 
 class Swing:
-    """The bodies that a gripper's joints move, and what they hang on.
+    """The bodies that a gripper's joints move, and the body that carries them.
 
     Attributes:
-        inside: the bodies that move.
-        link: of the fork, on which the first joint hangs.
-        shapes: of those that have any their surfaces, in their frames [n, 3]; a single point each, if none has.
-        fixed: likewise of the links of the fork, in its frame.
-        blind: no shape is known.
-        assumed: joints without limits, of which ``ends`` found nothing that they meet, and took a quarter turn.
+        inside: the moving bodies.
+        link: the fork's link that carries the first joint.
+        shapes: surfaces of moving bodies in their frames [n, 3]; a single point each if none has a surface.
+        fixed: surfaces of the fork's links, in the fork's frame.
+        blind: True if no shape is known.
+        assumed: joints without limits that meet nothing, for which ``ends`` assumed a quarter turn.
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], looks: Mapping[str, Look], joints: Sequence[str], fork: str):
@@ -80,14 +80,14 @@ class Swing:
         self._trees = {n: spatial.cKDTree(points) for n, points in {**self.fixed, **self.shapes}.items()}
 
     def poses(self, q: Positions) -> dict[str, Poses]:
-        """Of the bodies that move, and of the fork, in the fork's frame [n, 4, 4]."""
+        """Poses of the moving bodies and of the fork, in the fork's frame [n, 4, 4]."""
         count = len(next(iter(q.values())))
         world = body_poses(self.parts, dict(q), count)
         base = np.linalg.inv(world[self.fork])
         return {n: base @ world[n] for n in (self.fork, *self.inside)}
 
     def meetings(self, q: Positions) -> list[Meeting]:
-        """All pairs of shapes that move against one another, the one first that is most likely to grip."""
+        """All pairs of shapes that move against each other, the likeliest grip first."""
         poses = self.poses(q)
         inverse = {n: np.linalg.inv(pose) for n, pose in poses.items()}
         pairs = [(a, b, False) for a, b in itertools.combinations(self.shapes, 2)]
@@ -103,7 +103,7 @@ class Swing:
         return sorted(found, key=lambda m: -m.worth)
 
     def _face(self, points: Points, poses: Float[np.ndarray, "s 4 4"], other: str) -> tuple[Float[np.ndarray, " s"], Vec]:
-        """How far the face with which it meets ``other`` is from that in each of the poses [s], and the middle of that face."""
+        """Distance of the face that meets ``other`` in each of the poses [s], and the middle of that face."""
         some = _some(points, FOLLOWED)
         moved = some @ np.moveaxis(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
         away = self._trees[other].query(moved.reshape(-1, 3))[0].reshape(len(poses), -1)
@@ -115,13 +115,13 @@ class Swing:
     def ends(
         self, joints: Sequence[str], open: Mapping[str, float], closed: Mapping[str, float]
     ) -> tuple[dict[str, float], dict[str, float]]:
-        """Where each of the joints is when the gripper is closed, and when it is open [rad, m].
+        """Finds the positions of the joints when the gripper is closed, and when it is open [rad, m].
 
-        Each joint goes from the end at which shapes meet to the one at which they are farther apart; then all go together, and
-        if the shapes meet on the way, or are farthest apart there, that is where the gripper is closed, or open.
+        Each joint goes from the end at which shapes meet to the one at which they are farther apart. Then all go together; if the
+        shapes meet on the way, or are farthest apart there, the gripper is closed, or open, there.
 
         Args:
-            open, closed: what is known already.
+            open, closed: positions that are known already.
         """
         rest = {j: np.zeros(1) if endless(self.joints[j]) else np.array([np.mean(limits(self.joints[j]))]) for j in joints}
         ways = {j: self._way(j, rest) for j in joints}
@@ -135,12 +135,12 @@ class Swing:
         return {j: float(start[j]) for j in joints}, {j: float(end[j]) for j in joints}
 
     def between(self, closed: Mapping[str, float], open: Mapping[str, float]) -> list[Meeting]:
-        """The ``meetings`` on the straight way from closed to open."""
+        """Returns the ``meetings`` on the straight path from closed to open."""
         shares = np.linspace(0, 1, STEPS)
         return self.meetings({j: closed[j] + shares * (open[j] - closed[j]) for j in closed})
 
     def _way(self, name: str, rest: Positions) -> tuple[float, float]:
-        """Where the joint is, alone, when shapes meet, and when they are apart."""
+        """Returns the joint's position when shapes meet, and when they are apart, if it moves alone."""
         joint = self.joints[name]
         if endless(joint):
             ends = self.jaw(name, rest)
@@ -153,9 +153,9 @@ class Swing:
         return (lower, upper) if apart.argmin() <= apart.argmax() else (upper, lower)
 
     def jaw(self, name: str, rest: Positions) -> tuple[float, float] | None:
-        """Where a joint without limits closes, and where it is open: within a quarter turn of that; None where nothing meets.
+        """Returns where a joint without limits closes and opens, at most a quarter turn apart; None if nothing meets.
 
-        It closes where its shape first meets another on the way from zero, or at zero; it opens the other way.
+        It closes where its shape first meets another on the way from zero, or at zero. It opens the other way.
         """
         q = np.linspace(-np.pi, np.pi, TURN)
         for meeting in self.meetings({**{j: np.repeat(v, TURN) for j, v in rest.items()}, name: q}):
@@ -173,7 +173,7 @@ class Swing:
 
 
 def _turned(apart: Values) -> tuple[int, int]:
-    """Of a swing its closed and its open end, by how far the shapes are apart on the way."""
+    """Returns the closed and the open end of a swing, by the distance of the shapes on the way."""
     low, high = int(apart.argmin()), int(apart.argmax())
     ends = (0, len(apart) - 1) if low <= high else (len(apart) - 1, 0)
     way = INNER * float(np.ptp(apart))
@@ -181,17 +181,17 @@ def _turned(apart: Values) -> tuple[int, int]:
 
 
 def endless(joint: Joint) -> bool:
-    """Whether it turns without limits, or has room for more than a turn."""
+    """True if the joint turns without limits, or by more than a turn."""
     return joint.type == "continuous" or joint.type == "revolute" and joint.upper - joint.lower > 2 * np.pi + 1e-6
 
 
 def limits(joint: Joint) -> tuple[float, float]:
-    """Of a gripper's joint; a quarter turn either way of an endless one."""
+    """Limits of a gripper's joint; a quarter turn either way if it is endless."""
     return (-np.pi / 2, np.pi / 2) if endless(joint) else (joint.lower, joint.upper)
 
 
 def surface(links: Mapping[str, np.ndarray], looks: Mapping[str, Look]) -> Points | None:
-    """Points [n, 3] of links at their poses [4, 4]; stand-ins do not count."""
+    """Points [n, 3] of links at their poses [4, 4], without stand-ins."""
     found = []
     for name, at in links.items():
         points = looks[name].points
@@ -201,12 +201,12 @@ def surface(links: Mapping[str, np.ndarray], looks: Mapping[str, Look]) -> Point
 
 
 def _moved(parts: dict[str, Body], joints: Sequence[str]) -> list[str]:
-    """The bodies that the joints and their followers move."""
+    """Lists the bodies that the joints and their followers move."""
     driven = [b.name for b in parts.values() if b.joint and (b.joint.name in joints or (b.joint.mimic or ("",))[0] in joints)]
     moved = {n for name in driven for n in below(parts, name)}
     return [n for n in parts if n in moved]
 
 
 def _some(points: Points, most: int = KEPT) -> Float[np.ndarray, "k 3"]:
-    """As many of them, evenly: those of several links in turns."""
+    """Thins points evenly to at most ``most``."""
     return points[:: -(-len(points) // most)]

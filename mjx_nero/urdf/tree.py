@@ -1,4 +1,4 @@
-"""The robot of a URDF as plain values: links, joints, shapes; what the other modules of the importer pass around."""
+"""The robot of a URDF as plain values: links, joints and shapes, which the importer's other modules pass around."""
 
 import dataclasses
 
@@ -21,9 +21,9 @@ class Shape:
 
     Attributes:
         kind: ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``mesh``.
-        size: full extents, (radius,) or (radius, length without a capsule's ends) [m]; of a mesh the scale along x, y and z.
+        size: full extents, (radius,) or (radius, length without a capsule's ends) [m]; for a mesh, its scale along x, y and z.
         origin: pose in the link [4, 4].
-        file: of a mesh, as the URDF names it.
+        file: a mesh's file, as the URDF names it.
         rgba: colour, if the URDF gives one.
     """
 
@@ -36,20 +36,20 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Mass:
-    """Mass [kg], centre of mass [m] and inertia tensor about it [kg m2], along the axes of the frame that it is given in."""
+    """Mass [kg], centre of mass [m] and inertia tensor about it [kg m2], in some frame."""
 
     mass: float
     com: Vec
     inertia: Matrix
 
     def moved(self, pose: Pose) -> "Mass":
-        """The same in the frame in which this one's frame has the ``pose`` [4, 4]."""
+        """Returns the same mass in the frame where its own frame has the ``pose`` [4, 4]."""
         turn = pose[:3, :3]
         return Mass(self.mass, turn @ self.com + pose[:3, 3], turn @ self.inertia @ turn.T)
 
 
 def together(parts: list[Mass]) -> Mass:
-    """Rigidly joined: masses add, tensors by Steiner's theorem."""
+    """Joins masses rigidly: masses add, tensors follow Steiner's theorem."""
     total = sum(p.mass for p in parts)
     com = sum((p.mass * p.com for p in parts), np.zeros(3)) / total if total > 0 else np.zeros(3)
     inertia = np.zeros((3, 3))
@@ -69,11 +69,11 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint; limits are finite unless it is continuous, the axis is of unit length in the child's frame.
+    """A joint. Limits are finite unless it is continuous; the axis has unit length, in the child's frame.
 
     Attributes:
-        mimic: ``(source joint, multiplier, offset)``; the source is no mimic itself. An empty source means held at ``offset``.
-        effort, velocity: as read; None where the URDF has none that is usable.
+        mimic: ``(source joint, multiplier, offset)``. The source is not a mimic itself; an empty source means held at ``offset``.
+        effort, velocity: the URDF's limits; None if it has no usable one.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Joint:
         return self.type in MOVING
 
     def motion(self, q: Values) -> Poses:
-        """The child's displacement [n, 4, 4] at positions ``q`` [n] (rad or m)."""
+        """Displacement of the child [n, 4, 4] at positions ``q`` [n] (rad or m)."""
         out = np.tile(np.eye(4), (len(q), 1, 1))
         if self.type == "prismatic":
             out[:, :3, 3] = q[:, None] * self.axis
@@ -119,11 +119,11 @@ class Tree:
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """Links that do not move against one another: a body of the model, named after the first of them.
+    """Links that do not move against each other: one body of the model, named after the first of them.
 
     Attributes:
-        joint: what moves it; None of the base.
-        parent: name of the body that it hangs on.
+        joint: the joint that moves it; None for the base.
+        parent: name of the body that carries it.
         frame: pose in the parent at joint position 0 [4, 4].
         links: name -> pose in this body [4, 4].
     """
@@ -137,7 +137,7 @@ class Body:
 
 
 def bodies(tree: Tree) -> dict[str, Body]:
-    """Merges what fixed joints hold together. Parents come before children."""
+    """Merges links that fixed joints hold together. Parents come before children."""
     home: dict[str, tuple[str, Pose]] = {tree.root: (tree.root, np.eye(4))}
     members: dict[str, dict[str, Pose]] = {tree.root: {tree.root: np.eye(4)}}
     moved: dict[str, tuple[Joint | None, str, Pose]] = {tree.root: (None, "", np.eye(4))}
@@ -158,7 +158,7 @@ def bodies(tree: Tree) -> dict[str, Body]:
 
 
 def below(parts: dict[str, Body], name: str) -> list[str]:
-    """A body and those that it carries."""
+    """Lists a body and those that it carries."""
     found = [name]
     for other in parts.values():
         if other.parent in found:
@@ -167,17 +167,17 @@ def below(parts: dict[str, Body], name: str) -> list[str]:
 
 
 def body_of(parts: dict[str, Body], link: str) -> Body:
-    """The body that a link belongs to."""
+    """Finds the body that a link belongs to."""
     return next(b for b in parts.values() if link in b.links)
 
 
 def depth(parts: dict[str, Body], name: str) -> int:
-    """How many bodies lead to this one, itself among them."""
+    """Number of bodies from the base to this one, including both."""
     return 1 + depth(parts, parts[name].parent) if parts[name].parent else 0
 
 
 def positions(parts: dict[str, Body], driven: dict[str, Values], n: int) -> dict[str, Values]:
-    """Positions [n] of all joints: those given, 0 of the others, and what mimics follow from them."""
+    """Positions [n] of all joints: those given, 0 for the others, and what mimics follow from them."""
     joints = [b.joint for b in parts.values() if b.joint]
     q = {j.name: driven.get(j.name, np.zeros(n)) for j in joints}
     for j in joints:
@@ -188,7 +188,7 @@ def positions(parts: dict[str, Body], driven: dict[str, Values], n: int) -> dict
 
 
 def poses(parts: dict[str, Body], driven: dict[str, Values], n: int = 1) -> dict[str, Poses]:
-    """Poses [n, 4, 4] of the bodies in the base's frame at joint positions [n]; joints that are not given are at 0."""
+    """Poses [n, 4, 4] of the bodies in the base's frame at joint positions [n]; joints not given are at 0."""
     q = positions(parts, driven, n)
     out: dict[str, Poses] = {}
     for name, body in parts.items():

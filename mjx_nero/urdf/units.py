@@ -1,4 +1,4 @@
-"""Units of a URDF: metres and radians. What looks like others is told, with the flag that reads them."""
+"""Units of a URDF: metres and radians. Numbers that suggest others raise a message that names the right flag."""
 
 import dataclasses
 import math
@@ -12,23 +12,23 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Tree
 
-MAX_TURNS = 4  # limits of a hinge beyond that look like degrees
-MAX_SPAN = 10.0  # [m] of a mesh and its link's origin, and ...
-MAX_SPANS = 50.0  # ... of the longest joint offset: one beyond both is in millimetres
-LEAST, MOST = 0.02, 10.0  # [m] from the base to the end of an arm, along its joints
-SERIES = 3  # moving joints, from which on a robot within LEAST is no toy
+MAX_TURNS = 4  # a hinge's limits beyond this look like degrees
+MAX_SPAN = 10.0  # [m] a mesh with its link's origin that spans more than this, and ...
+MAX_SPANS = 50.0  # ... more than this many of the longest joint offset, is in millimetres
+LEAST, MOST = 0.02, 10.0  # [m] plausible lengths of an arm along its joints
+SERIES = 3  # least moving joints that make a robot shorter than LEAST implausible
 HINGES = ("revolute", "continuous")
 Spans = Mapping[tuple[str, tuple[float, ...]], float]  # file and scale of a mesh -> its largest extent [m]
 
 
 @dataclasses.dataclass(frozen=True)
 class Units:
-    """How to read a URDF.
+    """The units of a URDF.
 
     Attributes:
         degrees: limits and velocities of hinges are in degrees, not radians.
-        scale: factor of all lengths but the meshes': of origins, shapes and slides. None: 1, if what comes of it is possible.
-        mesh_scale: factor of the meshes, besides their own. None: likewise.
+        scale: factor of all lengths except the meshes': origins, shapes and slides. None: 1, if the result is plausible.
+        mesh_scale: factor of the meshes, on top of their own. None: 1, if the result is plausible.
     """
 
     degrees: bool = False
@@ -40,7 +40,7 @@ METRES = Units()
 
 
 def applied(robot: yourdfpy.Robot, units: Units) -> None:
-    """Turns what yourdfpy has read into metres and radians, in place."""
+    """Converts yourdfpy's numbers to metres and radians, in place."""
     if units.degrees:
         for limit in (j.limit for j in robot.joints if j.type in HINGES and j.limit is not None):
             _multiply(limit, math.pi / 180, "lower", "upper", "velocity")
@@ -95,7 +95,7 @@ def suspect_degrees(tree: Tree, notes: Notes) -> None:
 
 
 def check_lengths(tree: Tree, spans: Spans, units: Units) -> None:
-    """Whether the robot is of a possible size. A factor that the user gave is not questioned.
+    """Checks that the robot has a plausible size. Factors from the user are not questioned.
 
     Raises:
         UserError: its arm is longer than ``MOST`` or shorter than ``LEAST``, or its largest mesh looks to be in millimetres.
@@ -119,13 +119,13 @@ def check_lengths(tree: Tree, spans: Spans, units: Units) -> None:
 
 
 def _possible(tree: Tree, reach: float, span: float) -> bool:
-    """Joints may well be at one place: all of them, or those of a robot that has few."""
+    """True if the arm's length is plausible. All joints of a robot, or those of a simple one, may be at one place."""
     toy = sum(j.moves for j in tree.joints.values()) < SERIES and not 0 < span < LEAST
     return reach <= MOST and (toy or reach == 0 or reach >= LEAST)
 
 
 def _reach(tree: Tree) -> float:
-    """Along the joints from the base to the link that is farthest away [m], slides drawn out."""
+    """Greatest distance along the joints from the base to a link, with slides extended [m]."""
     far = {tree.root: 0.0}
     for joint in tree.joints.values():
         slide = max(abs(joint.lower), abs(joint.upper)) if joint.type == "prismatic" else 0.0

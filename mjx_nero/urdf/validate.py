@@ -1,4 +1,4 @@
-"""The XML of a URDF, checked before anything is made of it: names, references within a joint, numbers."""
+"""Checks the XML of a URDF before use: names, references within a joint, and numbers."""
 
 from collections import Counter
 
@@ -9,7 +9,7 @@ from mjx_nero.urdf.report import Notes
 
 MAX_ELEMENTS = 5_000  # links and joints
 MAX_NUMBER = 1e6  # [m, kg]
-MAX_NAME = 150  # characters: scenes and models add to it
+MAX_NAME = 150  # characters; scenes and models append to names
 CAPSULE = "capsule"
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
 # tag -> attribute -> how many numbers it holds; None: 1 or 3
@@ -35,14 +35,14 @@ _NEEDED = {
     "sphere": ("radius",),
     "mesh": ("filename",),
 }
-_REPAIRED = ("mass", "inertia", "limit", "dynamics", "color")  # where numbers that are not finite are not the end
+_REPAIRED = ("mass", "inertia", "limit", "dynamics", "color")  # elements whose non-finite numbers are repaired
 
 
 def check(root: etree._Element, notes: Notes) -> None:
-    """Checks in place, drops what the importer does not use, and puts numbers into one notation.
+    """Checks the XML in place, drops what the importer does not use, and normalises numbers.
 
     Raises:
-        UserError: a link or joint without a name or with another's, a joint without links, numbers that are none.
+        UserError: a name is missing or repeated, a joint lacks links, or a number is malformed.
     """
     etree.strip_tags(root, etree.Comment)
     etree.strip_elements(root, etree.ProcessingInstruction, with_tail=False)
@@ -97,7 +97,7 @@ def _unusable(shape: etree._Element) -> str:
 
 
 def _name_capsule(shape: etree._Element) -> None:
-    """Makes a capsule a cylinder whose visual or collision is called ``CAPSULE``: yourdfpy reads no capsules."""
+    """Turns a capsule into a cylinder whose visual or collision is called ``CAPSULE``, because yourdfpy reads no capsules."""
     solid = shape.find("geometry")[0]
     shape.attrib.pop("name", None)
     if solid.tag == CAPSULE:

@@ -1,4 +1,4 @@
-"""Workspace and the downward orientation."""
+"""The workspace, and the orientation of a hand that points down."""
 
 import itertools
 from collections.abc import Mapping
@@ -14,19 +14,20 @@ from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Values, Vec
 
-CELLS = 12  # of the reach
-STARTS, DESCENTS = 8, 3  # of the inverse kinematics, for a point and for a cell
-TABLE = 0.05  # [m] the workspace stays above
+CELLS = 12  # cells along the reach
+STARTS, DESCENTS = 8, 3  # descents per point, and per cell
+TABLE = 0.05  # [m] least height of the workspace above the table
 SIDES = ((0, 1), (1, 1), (1, -1), (0, -1))  # axis and sign
 DOWNWARD = 0.85  # cosine of the tilt of a hand that points down
-TURNED = 0.3  # its opening is nearer to y one way round than the other, if their cosine is more
-FRONT = 2.5  # times as many cells have to be on another side for the workspace to lie there
+TURNED = 0.3  # least cosine between opening and y that decides which way round is nearer
+FRONT = 2.5  # the workspace lies on another side only if that has this many times the cells in front
 Grid = Bool[np.ndarray, "a b c"]
 Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 
 def first_home(parts: Mapping[str, Body], hand: Hand, given: Mapping[str, float]) -> dict[str, float]:
-    """0 where a joint has a tenth of its range to both sides, else the middle; the gripper open; ``given`` goes first.
+    """Guesses a home: 0 for a joint with a tenth of its range on both sides, else the middle; gripper open; ``given`` has
+    priority.
 
     Raises:
         UserError: ``given`` names an unknown joint or a position beyond its limits.
@@ -45,15 +46,14 @@ def first_home(parts: Mapping[str, Body], hand: Hand, given: Mapping[str, float]
 
 
 def workspace(cloud: Cloud, name: str, notes: Notes) -> tuple[Box | None, bool]:
-    """A box that the grasp point gets to everywhere, in the unturned frame; and whether it does so pointing down.
+    """Finds a box that the grasp point reaches everywhere, in the unturned frame, and whether it does so pointing down.
 
-    Space about the shoulder is cut into cells of a twelfth of the reach; those that the grasp point visits, or four of whose six
-    neighbours it visits, count as reachable; then those that inverse kinematics gets to with the hand pointing down. Of all boxes
-    of such cells that lie more than 5 cm above the table, at least a fifth of the reach before the shoulder and are at most half
-    of it wide, the one is taken whose volume, weighted by nearness to the middle of the space in front, is largest; it spans from
-    the centre of its first cell to that of its last. In front means +x, unless there are more than ``FRONT`` times as many
-    reachable cells on another side. Inverse kinematics then has to get to 27 points of it, corners and centre among them, or it
-    is made smaller.
+    The space about the shoulder is cut into cells of a twelfth of the reach. A cell is reachable if the grasp point visits it, or
+    four of its six neighbours. Cells that inverse kinematics reaches with the hand pointing down are preferred. Candidate boxes
+    of such cells lie at least 5 cm above the table and a fifth of the reach in front of the shoulder, and are at most half the
+    reach wide. The best has the largest volume weighted by nearness to the middle of the space in front; it spans from the centre
+    of its first cell to that of its last. In front means +x, unless another side has more than ``FRONT`` times as many reachable
+    cells. The box shrinks until inverse kinematics reaches 27 of its points, including corners and centre.
     """
     origin = cloud.shoulder
     at = cloud.site[1:, :3, 3] - origin
@@ -64,7 +64,7 @@ def workspace(cloud: Cloud, name: str, notes: Notes) -> tuple[Box | None, bool]:
     cell = reach / CELLS
     centre = (np.arange(2 * CELLS) - CELLS + 0.5) * cell
     seen = _visited(at, cell)
-    floor = -cloud.height - origin[2] + TABLE  # the lowest that a box may reach down to, from the shoulder
+    floor = -cloud.height - origin[2] + TABLE  # lowest height of a box, from the shoulder
     room = [(seen & _ahead(centre, reach, floor, side)).sum() * (1 if side else FRONT) for side in range(len(SIDES))]
     side = int(np.argmax(room))
     pointing = _pointing(cloud, centre, reach, floor, side)
@@ -83,7 +83,7 @@ def workspace(cloud: Cloud, name: str, notes: Notes) -> tuple[Box | None, bool]:
 
 
 def _ahead(centre: Values, reach: float, floor: float, side: int) -> Grid:
-    """The cells before the shoulder, on one of the ``SIDES``, above the table."""
+    """Selects the cells in front of the shoulder, on one of the ``SIDES``, above the table."""
     axis, sign = SIDES[side]
     at = np.stack(np.meshgrid(centre, centre, centre, indexing="ij"))
     up = at[2] - floor
@@ -91,7 +91,7 @@ def _ahead(centre: Values, reach: float, floor: float, side: int) -> Grid:
 
 
 def _pointing(cloud: Cloud, centre: Values, reach: float, floor: float, side: int) -> Grid:
-    """Those of the cells before the shoulder that the hand gets to pointing down."""
+    """Selects the cells in front of the shoulder that the hand reaches pointing down."""
     pointing = _ahead(centre, reach, floor, side)
     cells = np.argwhere(pointing)
     if len(cells):
@@ -100,7 +100,7 @@ def _pointing(cloud: Cloud, centre: Values, reach: float, floor: float, side: in
 
 
 def _visited(at: Points, cell: float) -> Grid:
-    """The cells in which points [n, 3] lie, and those that chance left out in their midst."""
+    """Selects the cells in which points [n, 3] lie, and gaps in their midst."""
     index = np.floor(at / cell).astype(int) + CELLS
     seen = np.zeros((2 * CELLS,) * 3, bool)
     inside = ((index >= 0) & (index < 2 * CELLS)).all(1)
@@ -109,14 +109,14 @@ def _visited(at: Points, cell: float) -> Grid:
 
 
 def _around(cells: Grid) -> Int[np.ndarray, "a b c"]:
-    """How many of each cell's six neighbours are set."""
+    """Counts the set cells among each cell's six neighbours."""
     padded = np.pad(cells.astype(int), 1)
     total = sum(np.roll(padded, shift, axis) for axis in range(3) for shift in (-1, 1))
     return np.asarray(total)[1:-1, 1:-1, 1:-1]
 
 
 def _largest(seen: Grid, centre: Values, reach: float, floor: float, side: int) -> Box | None:
-    """Of the boxes of reachable cells on a side the best."""
+    """Finds the best box of reachable cells on a side."""
     axis, sign = SIDES[side]
     total = np.pad(seen.astype(int), ((1, 0),) * 3).cumsum(0).cumsum(1).cumsum(2)  # reachable cells below a corner
     cell = float(centre[1] - centre[0])
@@ -124,7 +124,7 @@ def _largest(seen: Grid, centre: Values, reach: float, floor: float, side: int) 
     spans = [(i, k) for i in range(n) for k in range(i + 1, min(i + n // 4, n - 1) + 1)]
     ranges = []
     for k in range(3):
-        flat = [(i, i) for i in range(n)] if k == 2 else []  # hands that point down do so in a thin layer at times
+        flat = [(i, i) for i in range(n)] if k == 2 else []  # some hands can point down only in a thin layer
         ok = [s for s in spans + flat if k != axis or min(sign * centre[s[0]], sign * centre[s[1]]) >= 0.2 * reach]
         ok = [s for s in ok if k != 2 or centre[s[0]] > floor + cell / 2]
         if not ok:
@@ -142,7 +142,7 @@ def _largest(seen: Grid, centre: Values, reach: float, floor: float, side: int) 
     for k in range(3):
         wanted = wanted * (last[k] + 1 - first[k])
         away = (centre[first[k]] + centre[last[k]]) / 2 - middle[k]
-        width = 0.2 if k == 1 - axis else 0.4  # of the reach; before the shoulder rather than to its side
+        width = 0.2 if k == 1 - axis else 0.4  # shares of the reach; ahead of the shoulder rather than to its side
         score = score * (last[k] - first[k] + 0.5 * (k == 2)) * np.exp(-0.5 * (away / (width * reach)) ** 2)
     score = np.where(found == wanted, score, 0.0)
     i = np.unravel_index(np.argmax(score), score.shape)
@@ -159,7 +159,7 @@ def _shifted(box: Box, by: Vec) -> Box:
 
 
 def _checked(cloud: Cloud, box: Box, down: bool) -> Box | None:
-    """The box, smaller about its centre until inverse kinematics gets to its corners and the points midway."""
+    """Shrinks the box about its centre until inverse kinematics reaches its corners and the points midway."""
     ends = np.array(box)
     grid = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
     corner = np.abs(grid).all(1)
@@ -172,15 +172,15 @@ def _checked(cloud: Cloud, box: Box, down: bool) -> Box | None:
 
 
 def _reached(cloud: Cloud, goals: Points, down: bool, starts: int) -> Bool[np.ndarray, " g"]:
-    """To which of the goals [g, 3] inverse kinematics gets."""
+    """True for each of the goals [g, 3] that inverse kinematics reaches."""
     return ~np.isnan(cloud.solve(goals, down, starts, one=True)[:, :, 0]).all(1)
 
 
 def down(cloud: Cloud, hand: Hand, box: Box | None, home: Mapping[str, float]) -> tuple[float, float, float, float]:
     """Orientation (wxyz) of the grasp point with the approach straight down and the opening along y.
 
-    Two are, half a turn apart: the one that is nearer at home, as a hand has better to do than to turn by half a turn first; if
-    neither is, the one that more random poses in the workspace are near to.
+    Two such orientations exist, half a turn apart. The one nearer at home wins, because turning by half a turn costs time; if
+    neither is near, the one that more random poses in the workspace are near to.
     """
     approach, opening = hand.approach, hand.opening
     if abs(approach @ opening) > 1e-6:

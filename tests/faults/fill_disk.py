@@ -65,7 +65,7 @@ def main() -> None:
         for path in checkpoints.saved(run):
             checkpoint.verify(path)
         after = newest(run)
-        fine = process.returncode == 2 and "Traceback" not in text and after >= before and "go on with" in text
+        fine = process.returncode == 2 and "Traceback" not in text and after >= before and "resume with" in text
         good += fine
         told = f"{i + 1:4} {left:6} bytes left, exit {process.returncode:3} after {took:4.1f} s, steps {before} to {after}"
         print(f"{told}{'' if fine else '  WRONG'}", flush=True)

@@ -80,7 +80,7 @@ def test_a_full_disk(train, at_row, undisturbed, tmp_path, moment):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     *_, line = err.splitlines()
     assert code == 2 and line.startswith("error: cannot write run/") and "File too large: stopped at" in line
-    assert "Make room and go on with: python train.py --restore run" in line
+    assert "Make room and resume with: python train.py --restore run" in line
     if moment > 1:
         assert "the last good checkpoint is run/checkpoints/0000" in line
     assert not list((tmp_path / "run").rglob("*.part*"))
@@ -124,7 +124,7 @@ def test_a_signal_saves_and_nothing_is_lost(train, at_row, undisturbed, tmp_path
     number = getattr(signal, name)
     at_row(4, lambda: os.kill(os.getpid(), number))
     code, out, err = train("--out", "run")
-    assert code == 128 + number and "go on with: python train.py --restore run" in err
+    assert code == 128 + number and "resume with: python train.py --restore run" in err
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["stopped"] == "interrupted"
     stopped = rows(tmp_path / "run")
     code, _, err = train("--restore", "run", steps=0)
@@ -186,8 +186,8 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
     newest.write_bytes(newest.read_bytes()[:-100])
     (newest.parent / f".{newest.stem}.part.safetensors").write_text("half of one")
     code, _, err = train("--restore", "run", "--num-timesteps", STEPS, steps=0)
-    assert code == 0 and f"warning: run/checkpoints/{newest.name} is damaged and passed over" in err
-    assert "run goes on with num_timesteps 640 in place of 384" in err
+    assert code == 0 and f"warning: run/checkpoints/{newest.name} is damaged: using" in err
+    assert "run resumes with num_timesteps 640 in place of 384" in err
     assert last(tmp_path / "run") == undisturbed
     assert not list((tmp_path / "run").rglob("*.part*"))
 
@@ -195,7 +195,7 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
 REFUSED = [
     (
         ["--seed", 4],
-        "--seed is 4, and run is a run with 0: leave it out to go on with that run, or start another with",
+        "--seed is 4, and run is a run with 0: leave the flag out to resume that run, or start another with",
     ),
     (["--env", "nero_reach"], "--env is nero_reach, and run is a run with nero_lift"),
     (["--num-envs", 16], "--num-envs is 16, and run is a run with 8"),
@@ -212,7 +212,7 @@ def test_another_run_is_refused_by_the_name_of_the_flag(call, train, tmp_path):
         assert code == 2 and message in err, err
     assert (tmp_path / "run" / "config.json").read_bytes() == before
     code, _, err = call("train", "--restore", "run", "--seed", 0, "--no-video", "--num-timesteps", 256, "--max-minutes", 5)
-    assert code == 0 and "run goes on with num_timesteps 256 in place of 128, max_minutes 5.0 in place of 0.0" in err
+    assert code == 0 and "run resumes with num_timesteps 256 in place of 128, max_minutes 5.0 in place of 0.0" in err
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["hyperparameters"]["num_timesteps"] == 256 and config["hyperparameters"]["network"]["actor"] == [8]
 
@@ -275,7 +275,7 @@ def test_divergence_goes_back_once(train, monkeypatch, tmp_path):
     assert summary["rewound_at"] == 320 and summary["env_steps"] == STEPS
     diverging(monkeypatch, {5, 8}, lost_loss)
     code, _, err = train("--out", "other", "--on-nan", "rewind")
-    assert code == 2 and "a second time, after a return from 320 steps" in err
+    assert code == 2 and "for the second time, after rewinding from 320 steps" in err
 
 
 # --- one folder, one owner

@@ -51,7 +51,7 @@ def test_a_seed_that_diverges_is_a_row(train, monkeypatch, tmp_path):
 def test_a_signal_ends_them_all_and_says_which_are_left(train, at_row, tmp_path):
     at_row(3, lambda: os.kill(os.getpid(), signal.SIGTERM))
     code, out, err = train("--seeds", "0-2", "--out", "many")
-    assert code == 128 + signal.SIGTERM and "seeds 1,2 were not begun: --seeds 1,2 --out many trains them" in err
+    assert code == 128 + signal.SIGTERM and "seeds 1,2 were not started: --seeds 1,2 --out many trains them" in err
     assert not (tmp_path / "many" / "seed_1").exists() and "interrupted" in out
     assert train("--restore", "many/seed_0")[0] == 0 and train("--seeds", "1,2", "--out", "many")[0] == 0
 
@@ -59,7 +59,7 @@ def test_a_signal_ends_them_all_and_says_which_are_left(train, at_row, tmp_path)
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--seeds", "0-7", "--restore", "run"], "--seeds starts new runs: go on with one of them by --restore RUN/seed_N alone"),
+        (["--seeds", "0-7", "--restore", "run"], "--seeds starts new runs: to resume one, pass only --restore RUN/seed_N"),
         (["--seeds", "0-7", "--out", "run", "--resume", "auto"], "--seeds starts new runs"),
         (["--seeds", "3-1"], "--seeds takes seeds as in 0-7 or 0,3,5, got '3-1'"),
         (["--seeds", "1,,2"], "--seeds takes seeds as in 0-7 or 0,3,5"),

@@ -370,7 +370,7 @@ BUDGETS = {
     "2,000 scales": (functools.partial(bad.mesh, content=bad.solid("stl"), kind="stl", count=2000), "are more than 500 files"),
     "16 million triangles by scales": (
         functools.partial(bad.mesh, content=bad.stl(8000), kind="stl", count=2000),
-        "are the most",
+        "the limit is",
     ),
     "four million triangles": (functools.partial(heavy, files=13), "triangles together, more than 4,000,000"),
     "101 MB": (lambda folder: bad.mesh(folder, bytes(101_000_000), "stl"), "more than 100 MB are not read"),

@@ -19,7 +19,7 @@ TREE = {
     "empty": jnp.zeros((0, 2)),
 }
 META = {"kind": "test", "numbers": [1, 2.5], "nested": {"x": None}}
-DAMAGED = r"is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it anew"
+DAMAGED = r"is not a policy or checkpoint of mjx_nero, or it is damaged: train again or copy it again"
 
 
 @pytest.fixture

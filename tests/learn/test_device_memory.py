@@ -66,7 +66,7 @@ def test_too_many_environments_are_told_how_many_fit(monkeypatch):
 def test_figures_of_the_message(monkeypatch):
     monkeypatch.setattr(device_memory, "_limit", lambda _: 8e9)
     with pytest.raises(
-        UserError, match=r"1000000 environments need about 20.1 GB of memory .* there are 8.0 GB: pass --num-envs 395"
+        UserError, match=r"1000000 environments need about 20.1 GB of memory .* which has 8.0 GB: pass --num-envs 395"
     ):
         device_memory.Pool(8e9, 1e8, 2e4).check(learner(num_envs=1_000_000))
 

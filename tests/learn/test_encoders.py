@@ -11,6 +11,7 @@ from flax import linen
 from kinematic import Kinematic
 
 from mjx_nero import UserError, make
+from mjx_nero.config.registry import Registry
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.ppo import encoders, networks
@@ -76,24 +77,24 @@ def test_files_of_before_have_none():
 
 
 def test_encoders_of_ones_own(monkeypatch):
-    monkeypatch.setattr(encoders, "_ENCODERS", dict(encoders._ENCODERS))
+    monkeypatch.setattr(encoders, "ENCODERS", Registry("encoder", encoders.ENCODERS))
 
     class Mean(linen.Module):
         @linen.compact
         def __call__(self, x):
             return x.mean(axis=(-3, -2))
 
-    encoders.register("mean", lambda shape, cfg: Mean())
+    encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
     _, (_, params) = made(dataclasses.replace(CFG, encoders=(("picture", "mean"),)))
     assert params.policy["params"]["MLP_0"]["hidden_0"]["kernel"].shape == (2 + 9, 16)
-    with pytest.raises(UserError, match="there is an encoder 'mean' already: register it under another name"):
-        encoders.register("mean", lambda shape, cfg: Mean())
+    with pytest.raises(UserError, match="there is an encoder 'mean' already: choose another name"):
+        encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
 
 
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
-        ((("picture", "cnm"),), "no encoder 'cnm'; valid: flat, mlp"),
+        ((("picture", "cnm"),), "unknown encoder 'cnm': choose one of flat, mlp"),
         ((("image", "mlp"),), "network.encoders names image, and terms that stay apart are: joint_pos, picture; an encoder"),
     ],
 )

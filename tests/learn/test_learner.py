@@ -10,6 +10,7 @@ from flax import struct
 from kinematic import Kinematic
 
 from mjx_nero import ManipulationEnv, UserError
+from mjx_nero.config.registry import Registry
 from mjx_nero.learn import learner
 from mjx_nero.learn.learner import Kind
 
@@ -91,9 +92,9 @@ def policy(meta):
 
 @pytest.fixture
 def search(monkeypatch):
-    others = {name: kind for name, kind in learner._KINDS.items() if name != "search"}  # a page of the guides has one, too
-    monkeypatch.setattr(learner, "_KINDS", others)
-    learner.register("search", Kind(make=Search, presets={"default": SearchCfg()}, policy=policy))
+    others = {name: kind for name, kind in learner.KINDS.items() if name != "search"}  # a page of the guides has one, too
+    monkeypatch.setattr(learner, "KINDS", Registry("learner", others))
+    learner.KINDS.add("search", Kind(make=Search, presets={"default": SearchCfg()}, policy=policy))
     monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
 
 
@@ -123,8 +124,8 @@ def test_another_learner_trains_is_resumed_played_and_measured(search, call, tmp
 
 
 def test_names_of_learners(search, call):
-    with pytest.raises(UserError, match="there is a learner 'search' already: register it under another name"):
-        learner.register("search", learner.find("search"))
+    with pytest.raises(UserError, match="there is a learner 'search' already: choose another name"):
+        learner.KINDS.add("search", learner.find("search"))
     with pytest.raises(UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, search"):
         learner.find("pop")
     code, _, err = call("train", "--learner", "search", "--ppo.num_epochs", 3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError
+from mjx_nero.config.registry import Registry
 from mjx_nero.learn import checkpoint, learner
 from mjx_nero.learn.learner import Kind
 from mjx_nero.learn.runs import resume
@@ -32,7 +33,7 @@ WORDS = [
     ({"learner": "search"}, "was made by the learner search: pass --learner"),
     ({"preset": "sim2real", "actions": ["JointVelocity"]}, r"\(preset sim2real\) on other observations or actions"),
     ({"preset": "isaac", "action_size": 7}, r"was trained in nero_lift \(preset isaac\) on other observations or actions"),
-    ({"network": {"actor": [16, 8]}}, r"its networks are others: pass --ppo.network.actor '16,8'$"),
+    ({"network": {"actor": [16, 8]}}, r"because its networks differ: pass --ppo.network.actor '16,8'$"),
 ]
 
 
@@ -46,7 +47,7 @@ def test_what_does_not_fit_is_said_in_words(changes, words):
 def test_what_networks_of_older_versions_lack():
     """They bound no observation; the scale of first weights is of no matter to who brings weights."""
     old, new = {**META, "network": {"actor": [8]}, "kind": "policy"}, {**META["network"], "max_observation": 10.0}
-    with pytest.raises(UserError, match=r"its networks are others: pass --ppo.network.max_observation 0.0$"):
+    with pytest.raises(UserError, match=r"because its networks differ: pass --ppo.network.max_observation 0.0$"):
         resume.check(resume.Source(pathlib.Path("x"), old), {**META, "network": new})
     resume.check(resume.Source(pathlib.Path("x"), old), {**META, "network": {**new, "max_observation": 0.0}})
 
@@ -79,9 +80,9 @@ class Learner:
 @pytest.fixture
 def three(monkeypatch):
     """``Learner`` by the name ``three``."""
-    monkeypatch.setattr(learner, "_KINDS", dict(learner._KINDS))
+    monkeypatch.setattr(learner, "KINDS", Registry("learner", learner.KINDS))
     template = {"w": jax.ShapeDtypeStruct((3,), np.float32)}
-    learner.register("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, lambda params, obs: params)))
+    learner.KINDS.add("three", Kind(make=Learner, presets={}, policy=lambda meta: (template, lambda params, obs: params)))
 
 
 @pytest.mark.parametrize("kind", ["checkpoint", "policy"])
@@ -127,7 +128,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path):
     data[-3] ^= 1  # one bit of one number
     newest.write_bytes(data)
     assert resume.find(tmp_path, said.append).path.name == "000000000100.safetensors"
-    assert said == [f"warning: {newest} is damaged and passed over for the checkpoint before"]
+    assert said == [f"warning: {newest} is damaged: using the checkpoint before it"]
     newest.write_bytes(data[:50])
     assert resume.find(tmp_path, said.append).path.name == "000000000100.safetensors"
     for path in newest.parent.iterdir():

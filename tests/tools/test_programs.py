@@ -275,7 +275,7 @@ def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
     code, out, err = call("train", *sizes, "--num-timesteps", 100_000, "--seed", 3, "--out", "run")
     run = tmp_path / "run"
     assert code == 130
-    assert "go on with: python train.py --restore run" in err
+    assert "resume with: python train.py --restore run" in err
     config = json.loads((run / "config.json").read_text())
     assert (config["env_name"], config["seed"], config["hyperparameters"]["num_envs"]) == ("nero_lift", 3, 64)
     saved = sorted((run / "checkpoints").iterdir())

@@ -14,7 +14,7 @@ _ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper", "nero":
 
 
 def check(kind: str, metadata: Mapping[str, Any]) -> None:
-    """Whether an arm is the robot of a policy.
+    """Checks that an arm is the robot of a policy.
 
     Raises:
         UserError: it is not, or there is no such arm.

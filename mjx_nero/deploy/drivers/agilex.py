@@ -186,7 +186,7 @@ class Agilex:
         self._engaged = True
 
     def read_position(self) -> tuple[float, np.ndarray]:
-        """When the oldest part of it came [s], and where the joints are [rad or m]."""
+        """Returns when its oldest part arrived [s], and where the joints are [rad or m]."""
         frames = [self._frames[frame] for frame in (*self._model.joints, GRIPPED)]
         arm = unpack([data for _, data in frames[:-1]], self._model.count)
         half = struct.unpack(">i", frames[-1][1][:4])[0] * MICROMETRE / 2
@@ -202,7 +202,7 @@ class Agilex:
         return Feedback(when, position, np.array([*speeds, 0.0, 0.0]), None, np.array([*heat, 0.0, 0.0], float))
 
     def _check(self) -> None:
-        """What the arm says of itself.
+        """Checks what the arm reports about itself.
 
         Raises:
             ArmError: something is wrong.

@@ -49,7 +49,7 @@ ERRORS = {1: "voltage", 2: "angle", 4: "overheating", 8: "overcurrent", 32: "ove
 
 
 def checksum(body: bytes) -> int:
-    """Of all bytes between the header and the checksum."""
+    """Computes the checksum of all bytes between the header and the checksum."""
     return ~sum(body) & 0xFF
 
 

@@ -92,7 +92,7 @@ class SoArm:
         self.notes: list[str] = []
 
     def ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the calibration lets the joints do [rad]."""
+        """Returns the ranges that the calibration allows the joints [rad]."""
         return self._radians(self._first), self._radians(self._last)
 
     def _radians(self, raw: np.ndarray) -> np.ndarray:

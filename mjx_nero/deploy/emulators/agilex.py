@@ -24,7 +24,7 @@ PERIOD = 0.005  # [s] between feedbacks
 
 @dataclasses.dataclass
 class BusFaults:
-    """What can go wrong, to be set while it runs.
+    """Faults of the arm, which can be set while it runs.
 
     Attributes:
         cut: nothing is heard, nothing arrives.
@@ -42,7 +42,7 @@ class BusFaults:
 
 
 class Arm:
-    """What the arm makes of frames, and the frames that it sends by itself."""
+    """Answers frames as the arm does, and sends frames by itself."""
 
     def __init__(self, plant: Plant, model: agilex.Model):
         self.plant, self.faults, self.torque_cuts, self._model = plant, BusFaults(), 0, model

@@ -28,7 +28,7 @@ _BYTE = 1e-5  # [s] at 1 Mbaud
 
 @dataclasses.dataclass
 class BusFaults:
-    """What can go wrong on the bus, to be set while it runs.
+    """Faults of the bus, which can be set while it runs.
 
     Attributes:
         cut: nobody answers, nothing arrives.
@@ -106,7 +106,7 @@ class Servos:
         return scale, (first + last) / 2 - self._middle[i] * scale
 
     def refresh(self) -> None:
-        """What the servos measure now."""
+        """Updates what the servos measure."""
         self.plant.advance()
         if self.faults.frozen:
             return

@@ -18,7 +18,7 @@ _LONGEST = 0.5  # [s] that are caught up at once; a program that stood still lon
 
 @dataclasses.dataclass
 class Faults:
-    """What can go wrong, to be set while it runs.
+    """Faults of the plant, which can be set while it runs.
 
     Attributes:
         stalled: joints that stand still, by number.
@@ -121,7 +121,7 @@ class Plant:
         self._tell()
 
     def _set_drives(self) -> None:
-        """Their stiffness and power now."""
+        """Sets the drives' present stiffness and power."""
         m, share = self.model, np.where(self.powered, self.faults.stiffness, 0.0)
         m.actuator_gainprm[self._act, 0], m.actuator_biasprm[self._act, 1] = self._gain * share, self._bias[:, 1] * share
         m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], -self.gears)
@@ -136,11 +136,11 @@ class Plant:
         return self.data.qpos[self.objects[name] :][:3] - self._base
 
     def position(self) -> np.ndarray:
-        """Of the joints, now [rad or m]."""
+        """Present positions of the joints [rad or m]."""
         return self.data.qpos[self._qpos].copy()
 
     def velocity(self) -> np.ndarray:
-        """Of the joints, now [rad/s or m/s]."""
+        """Present velocities of the joints [rad/s or m/s]."""
         return self.data.qvel[self._dof].copy()
 
     def load(self) -> np.ndarray:

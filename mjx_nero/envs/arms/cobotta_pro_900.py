@@ -22,13 +22,13 @@ def rg6_gap(q: Float[Array, "2"]) -> Float[Array, ""]:
 
 
 def rg6_positions(gap: Float[Array, ""]) -> Float[Array, "2"]:
-    """Positions of the two driven joints [rad] that leave ``gap`` [m] between the pads."""
+    """Positions of the two driven joints [rad] at which the pads are ``gap`` [m] apart."""
     q = _CLOSED_ANGLE - jnp.arcsin((gap / 2 + _OFFSET) / _CRANK)
     return jnp.stack([q, -q])
 
 
-# Stiffness and damping: critical damping at home, from measured step responses (assets/cobotta_pro_900/README.md). Speeds: a
-# collaborative half of the published ones. Home: the grasp point at (0.5, 0, 0.28), straight down, fingers opening along y.
+# Stiffness and damping: critical damping at home, from measured step responses (assets/cobotta_pro_900/README.md). Speeds: half
+# of the published ones, for collaboration. Home: the grasp point at (0.5, 0, 0.28), straight down, fingers opening along y.
 ROBOT = COBOTTA_PRO_900 = RobotCfg(
     name="cobotta_pro_900",
     down=(0.0, 0.0, 1.0, 0.0),
@@ -97,7 +97,7 @@ PICK_PLACE = pick_place.PickPlaceSetup(
     travel_height=0.2,
     episode_length_s=20.0,
 )
-# The arm gets everywhere in its workspace with its fingers tilted forward by 30 degrees from straight down.
+# With its fingers tilted forward by 30 degrees from straight down, the arm reaches every point of its workspace.
 REACH = reach.ReachSetup(
     orientation=(reach.STILL, (math.pi * 5 / 6, math.pi * 5 / 6), reach.STILL),
     scene=reach.scene(LIFT.scene),

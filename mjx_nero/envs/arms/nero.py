@@ -9,11 +9,11 @@ from mjx_nero.envs.tasks import follow_target, lift, lift_obstacles, pick_place,
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
-# Drives and home pose: the Isaac Lab recipe for the Nero lift. Its soft limit factor (0.9) is read by no term of the
-# task and would exclude the recipe's own home (joint4 = 2.0), so targets are limited by the joint ranges alone.
+# Drives and home pose follow the Isaac Lab recipe for the Nero lift. No term of the task reads the recipe's soft limit factor
+# (0.9), which would exclude its own home (joint4 = 2.0), so only the joint ranges limit the targets.
 ROBOT = NERO = RobotCfg(
     name="nero",
-    # Half a turn: positive joint4 folds the forearm towards -x of the base, and the work lies at +x (assets/nero/README.md).
+    # Half a turn: positive joint4 folds the forearm towards the base's -x, and the work lies at +x (assets/nero/README.md).
     base_quat=(0.0, 0.0, 0.0, 1.0),
     workspace=((0.3, 0.4), (-0.2, 0.2), (0.2, 0.4)),
     opening=0.1,
@@ -40,7 +40,7 @@ ROBOT = NERO = RobotCfg(
     ),
 )
 
-# The Isaac Lab recipe's numbers; the cube's region is the recipe's start (0.2, 0) plus its offsets.
+# The Isaac Lab recipe's numbers. The cube's region is the recipe's start (0.2, 0) plus its offsets.
 LIFT = lift.LiftSetup(
     scene=SceneCfg(objects={"cube": cube(0.03, mass=0.03)}),
     cube=((0.3, 0.4), (-0.1, 0.2)),
@@ -48,7 +48,7 @@ LIFT = lift.LiftSetup(
 )
 FOLLOW_TARGET = follow_target.FollowTargetSetup(
     frame="ee",
-    center=(0.32, 0.0, 0.17),  # with its wrist's range the arm points straight down up to about z = 0.25
+    center=(0.32, 0.0, 0.17),  # the wrist's range lets the arm point straight down up to about z = 0.25
     spread=(0.02, 0.08, 0.02),
     radius=0.05,
     scene=SceneCfg(objects={}, goal="cube"),
@@ -57,13 +57,13 @@ PICK_PLACE = pick_place.PickPlaceSetup(
     scene=SceneCfg(goal="cube"),
     cube=((0.3, 0.4), (-0.1, 0.0)),
     goal=((0.3, 0.4), (0.08, 0.2)),
-    travel_height=0.15,  # with its wrist's range the arm points straight down up to about z = 0.2 there
+    travel_height=0.15,  # the wrist's range lets the arm point straight down up to about z = 0.2 there
     episode_length_s=20.0,
 )
-# The arm gets everywhere in its workspace with its fingers tilted forward by 30 degrees from straight down.
+# With its fingers tilted forward by 30 degrees from straight down, the arm reaches every point of its workspace.
 REACH = reach.ReachSetup(orientation=((math.pi, math.pi), (-math.pi / 6, -math.pi / 6), reach.STILL))
-# The Isaac Lab recipe's drives for reaching, but for the speed: at its 10 rad/s every change of an action drives the joints into
-# their effort limits, and learning takes several times as long.
+# The Isaac Lab recipe's drives for reaching, except for the speed. At the recipe's 10 rad/s, every change of an action drives the
+# joints into their effort limits, and learning takes several times as long.
 REACH_NERO = dataclasses.replace(
     NERO,
     arm=dataclasses.replace(
@@ -75,7 +75,7 @@ REACH_NERO = dataclasses.replace(
     ),
 )
 
-# Wider apart than the recipe's regions, for what is to stand between.
+# Farther apart than the recipe's regions, to leave room for the obstacle.
 REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
     start=(0.33, -0.2), goal=((0.3, 0.4), (0.14, 0.24), (0.2, 0.35)), top=0.3, scene=LIFT.scene
 )

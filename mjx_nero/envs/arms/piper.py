@@ -9,8 +9,8 @@ from mjx_nero.envs.tasks import lift, reach
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
-# Drives: the Isaac Lab recipe's, but for the speed: at its 10 rad/s every change of an action drives the joints into their effort
-# limits. Home: the grasp point at (0.3, 0, 0.22), 25 degrees from straight down (assets/piper/README.md).
+# Drives: the Isaac Lab recipe's, except for the speed. At the recipe's 10 rad/s, every change of an action drives the joints into
+# their effort limits. Home: the grasp point at (0.3, 0, 0.22), 25 degrees from straight down (assets/piper/README.md).
 ROBOT = PIPER = RobotCfg(
     name="piper",
     down=(0.0, 0.0, 1.0, 0.0),
@@ -36,8 +36,8 @@ LIFT = lift.LiftSetup(  # Nero's regions
     cube=((0.3, 0.4), (-0.1, 0.2)),
     goal=((0.3, 0.35), (-0.2, 0.2), (0.2, 0.35)),
 )
-# The recipe's box, its level gripper, which points along +x, and its home, which does nearly so: from the other one, fingers
-# down, learning ends with the wrist bent the wrong way.
+# The recipe's box, its level gripper along +x, and its home, nearly level too. From the other home, fingers down, learning ends
+# with the wrist bent the wrong way.
 REACH_PIPER = dataclasses.replace(PIPER, arm=dataclasses.replace(PIPER.arm, home=(0.0,) * 6))
 REACH = reach.ReachSetup(
     position=((0.3, 0.4), (0.1, 0.15), (0.3, 0.3)),

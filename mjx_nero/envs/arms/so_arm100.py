@@ -1,4 +1,4 @@
-"""SO-ARM100: five joints, and a jaw that closes on a fixed one. A 3D-printed arm of hobby servos."""
+"""SO-ARM100: a 3D-printed arm of hobby servos, with five joints and a jaw that closes on a fixed one."""
 
 import dataclasses
 from typing import Any
@@ -11,8 +11,8 @@ from mjx_nero.envs.tasks import lift, reach
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
-# The jaws (assets/so_arm100/README.md): angle at which their faces are parallel [rad]; distances of the pivot from the fixed
-# face, of the moving face from the pivot, and of the pads' middle from the pivot along the fixed face [m].
+# The jaws (assets/so_arm100/README.md): the angle at which their faces are parallel [rad]; the distances from the fixed face to
+# the pivot, from the pivot to the moving face, and from the pivot to the pads' middle along the fixed face [m].
 _PARALLEL, _PIVOT, _FACE, _REACH = 0.156, 0.03512, 0.005157, 0.063055
 
 
@@ -23,21 +23,20 @@ def jaw_gap(q: Float[Array, "1"]) -> Float[Array, ""]:
 
 
 def jaw_positions(gap: Float[Array, ""]) -> Float[Array, "1"]:
-    """The jaw's angle [rad] that leaves ``gap`` [m] there."""
+    """The jaw's angle [rad] at which the pads' middles are ``gap`` [m] apart."""
     rest = _PIVOT - gap
     return (_PARALLEL + jnp.arctan2(_REACH, rest) - jnp.arccos(_FACE / jnp.hypot(rest, _REACH)))[None]
 
 
-_RECIPE: dict[str, Any] = {  # of the arm's drives
+_RECIPE: dict[str, Any] = {  # the recipe's arm drives
     "stiffness": (200.0, 170.0, 120.0, 80.0, 50.0),
     "damping": (80.0, 65.0, 45.0, 30.0, 20.0),
     "effort": (1.9,) * 5,
 }
 
-# Mounting and home: the Isaac Lab recipe's. Drives of the arm: the makers' (their MJCF, for the servos' P = 16), which hold a
-# joint to milliradians where the recipe's take half a second to follow, and tremble at steps above 5 ms; the speed is the
-# recipe's. The jaw's drive is the recipe's but for its effort: with 2.5 N m it sinks 1.5 mm into the cube. 1.2 N m hold a cube
-# with 16 N.
+# Mounting, home and speed: the Isaac Lab recipe's. Arm drives: the makers' (their MJCF, for the servos' P = 16). They hold a
+# joint to milliradians where the recipe's take half a second to follow, but they tremble at steps above 5 ms. Jaw drive: the
+# recipe's, except for the effort. At the recipe's 2.5 N m the jaw sinks 1.5 mm into the cube; 1.2 N m hold a cube with 16 N.
 ROBOT = SO_ARM100 = RobotCfg(
     name="so_arm100",
     base_link="base",
@@ -70,13 +69,13 @@ ROBOT = SO_ARM100 = RobotCfg(
     ),
 )
 
-# The recipe's regions. It gives goals in the turned base's frame, where -y is ahead; ours is the unturned one.
+# The recipe's regions. It gives goals in the turned base's frame, where -y is ahead; ours are in the unturned frame.
 SCENE = SceneCfg(table_center=(0.2, 0.0), table_size=(0.8, 0.9), look_at=(0.14, 0.0, 0.13), view_distance=0.8)
 LIFT = lift.LiftSetup(
     scene=SCENE,
     cube=((0.1, 0.3), (-0.2, 0.2)),
     goal=((0.1, 0.3), (-0.1, 0.1), (0.2, 0.35)),
-    grasp_radius=0.02,  # the jaws are narrow: what they hold off their middle slips out at the side
+    grasp_radius=0.02,  # the jaws are narrow: an object off their middle slips out sideways
 )
 REACH = reach.ReachSetup(
     scene=reach.scene(SCENE),
@@ -85,7 +84,7 @@ REACH = reach.ReachSetup(
 
 
 def with_recipe(presets: Presets) -> Presets:
-    """Presets of which ``isaac`` has the recipe's drives."""
+    """Returns the presets, with the recipe's drives in ``isaac``."""
 
     def isaac(robot: RobotCfg) -> EnvCfg:
         arm = dataclasses.replace(robot.arm, **_RECIPE)

@@ -16,8 +16,8 @@ ROBOT = SO_ARM101 = dataclasses.replace(
     arm=dataclasses.replace(SO_ARM100.arm, home=(0.0, 0.0, 0.0, 1.57, 0.0)),
 )
 
-# The recipe keeps the SO-ARM100's goals, which for this unturned arm lie at its right side, and partly beyond its reach (92% of
-# those for lifting, 87% of those for reaching are within). Ours lie ahead, as the SO-ARM100's do.
+# The recipe keeps the SO-ARM100's goals. For this unturned arm they lie to its right, and partly out of reach (92% of the lift
+# goals and 87% of the reach goals are within). Ours lie ahead, as the SO-ARM100's do.
 LIFT = lift.LiftSetup(
     scene=SCENE,
     cube=((0.1, 0.3), (-0.2, 0.2)),

@@ -1,4 +1,4 @@
-"""What ``place`` and ``stack`` have in common: how near is there, what leads there, and who can do it. See ``mdp.towers``."""
+"""The parts that ``place`` and ``stack`` share: tolerances, rewards and the controller. See ``mdp.towers``."""
 
 import dataclasses
 import functools
@@ -16,17 +16,17 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
 
 STILL = 0.005  # [m/s]
-FLAT = 0.005  # [m] how far above or below its place an object may be
-LIFTED = 0.01  # [m] above where it lies
-AWAY = 0.02  # [m] the pads are as far above an object that the hand has left
-CLOSING = 0.5  # [s] the fingers take to close, at least: at a metre a second they throw what they meet
-PRESS = 0.075  # [s] they press before an object is lifted, at least
-# Shares of the ten phases that a control step takes: 305 steps in all, 25 of them to close and 20 to open.
+FLAT = 0.005  # [m] tolerance of an object's height at its place
+LIFTED = 0.01  # [m] height of a lifted object above where it lay
+AWAY = 0.02  # [m] clearance of the pads above an object that the hand has left
+CLOSING = 0.5  # [s] least closing time: fingers at a metre a second throw what they meet
+PRESS = 0.075  # [s] least time the fingers press before an object is lifted
+# Share of each of the ten phases that one control step covers: 305 steps in all, 25 to close and 20 to open.
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
 
 
 def lets_go(acts: dict[str, Term]) -> dict[str, Term]:
-    """With anti-windup for a gripper that lets go at once, before the speed limit, which starts where it leaves the targets."""
+    """Adds anti-windup, so that the gripper lets go at once. It precedes the speed limit, which starts from its targets."""
     others = dict(acts)
     limit = others.pop("speed_limit")
     return {**others, "anti_windup": Term(actions.AntiWindup), "speed_limit": limit}
@@ -34,14 +34,14 @@ def lets_go(acts: dict[str, Term]) -> dict[str, Term]:
 
 @dataclasses.dataclass(frozen=True)
 class Tower:
-    """A tower that a robot builds.
+    """A tower and the robot that builds it.
 
     Attributes:
-        objects: from the bottom up, as in ``mdp.towers``.
-        edge: how high an object is, and how far apart the fingers hold it [m].
-        aside: how far from its place an object may be, along the table, and come straight down (``towers.approached``) [m].
-        angle: from the goal's orientation, likewise [rad].
-        lifted: above where it lies an object is held [m].
+        objects: the objects from the bottom up, as in ``mdp.towers``.
+        edge: an object's height, and its width between the fingers [m].
+        aside: tolerance along the table, and radius within which an object may come straight down (``towers.approached``) [m].
+        angle: tolerance of the angle from the goal's orientation [rad].
+        lifted: height above its resting place from which an object counts as held [m].
     """
 
     robot: RobotCfg
@@ -54,29 +54,29 @@ class Tower:
 
     @property
     def there(self) -> Regions:
-        """Where the robot works."""
+        """The robot's regions."""
         return regions.of(self.robot)
 
     @property
     def held(self) -> dict[str, float]:
-        """An object is held if it is this high, and this near to the grasp point [m]."""
+        """The least height of a held object and its greatest distance from the grasp point [m]."""
         return {"minimal_height": self.edge / 2 + self.lifted, "grasp_radius": regions.near(self.there)}
 
     @property
     def place(self) -> dict[str, towers.Place]:
-        """Where objects belong, and how near is there: what all terms of a tower take."""
+        """The parameter that all terms of a tower share: where objects belong, and with what tolerance."""
         away = round(self.edge / 2 + self.robot.pad[0] / 2 + AWAY, 4)
         within = (self.aside, FLAT, self.angle)
         return {"place": towers.Place(tower=self.objects, rise=self.edge, within=within, clearance=away, **self.held)}
 
     @property
     def done(self) -> dict[str, Any]:
-        """All stand, at rest, and the hand is away."""
+        """Parameters of the finished tower: all objects stand at rest, and the hand is away."""
         return {**self.place, "max_speed": STILL}
 
     @property
     def builder(self) -> RobotCfg:
-        """The robot as its own controller works it: its weight carried by the drives, and fingers as quick as real ones."""
+        """The robot as its own controller runs it: drives that carry its weight, and fingers as quick as real ones."""
         fingers = self.robot.gripper
         slow = (min(v, abs(a - b) / CLOSING) for v, a, b in zip(fingers.speed, fingers.open, fingers.close, strict=True))
         return dataclasses.replace(
@@ -85,27 +85,28 @@ class Tower:
 
     @functools.cached_property
     def slow(self) -> float:
-        """What the fingers need to close beyond the time that ``QUICK`` has for it [s]."""
+        """Closing time that the fingers need beyond the time in ``QUICK`` [s]."""
         return round(max(0.0, grasp.closing_time(self.builder, self.edge) + PRESS - CLOSING), 2)
 
     @property
     def extra(self) -> float:
-        """... and for all objects, to open, too [s]."""
+        """Extra time for closing and opening on all objects [s]."""
         return round(2 * self.slow * (len(self.objects) - 1), 2)
 
     def sim(self) -> SimCfg:
-        """Buffers by count."""
+        """Returns the simulation settings, with contact buffers sized by a count."""
         return contacts.sized(self.robot, self.scene, SimCfg())
 
     def success(self) -> SuccessCfg:
-        """For half a second at the end."""
+        """The tower is built, for half a second at the end."""
         return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
-        """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones.
+        """Rewards reaching, grasping, lifting, aligning, lowering, releasing and leaving; each step keeps the rewards of the ones
+        before.
 
-        The fingers' targets are paid for, from shut on, and a gripper that is told too firmly to hold costs: else nothing that
-        noise tries for a step at a time shows that letting go pays.
+        It rewards opening targets and penalises large gripper actions; otherwise single noisy steps never show that releasing
+        pays.
         """
         place = self.place
         way = {**place, "over": round(0.75 * self.edge, 4), "flat": self.aside}
@@ -128,11 +129,11 @@ class Tower:
         }
 
     def metrics(self) -> dict[str, MetricTerm]:
-        """Of the first object that is to be moved."""
+        """Grasp metrics of the first object to move."""
         return metrics.grasping(object=self.objects[1], **self.held)
 
     def terminations(self) -> dict[str, DoneTerm]:
-        """The time is over, or an object has left the table."""
+        """Ends an episode when the time is over or an object has left the table."""
         table = {"center": self.scene.table_center, "size": self.scene.table_size}
         off = {
             f"{name}_off_table": DoneTerm(terminations.object_off_table, params={**table, "object": name})
@@ -141,18 +142,18 @@ class Tower:
         return {"time_out": DoneTerm(terminations.time_out, time_out=True), **off}
 
     def controllers(self) -> dict[str, dict[str, Any]]:
-        """Pick and place by inverse kinematics, object by object.
+        """Builds the tower by inverse kinematics, object by object.
 
         Raises:
-            UserError: the robot's hand does not point down as high as the tower is.
+            UserError: the robot's hand cannot point down as high as the tower.
         """
         there, (low, high) = self.there, regions.box(self.robot, "pick", "where on the table it can grasp")[2]
         top = low + (len(self.objects) - 1 - (towers.GOAL in self.objects)) * self.edge
         if top + LIFTED > high:
             needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, and pick ends at {high:.3g} m"
             raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
-        # Over a tower it may have to lean: ``pick`` is where it points straight down everywhere.
-        below = max(0.0, -there.offset[2])  # the grasp point is below the middle of what it holds
+        # The hand may have to lean above ``pick``, the region where it can point straight down.
+        below = max(0.0, -there.offset[2])  # how far the grasp point is below the object's middle
         leave = max(there.travel, top + max(self.edge, below + self.place["place"].clearance + LIFTED))
         fields = {
             "tower": self.objects,

@@ -1,6 +1,6 @@
-"""Clutter: of several objects of different shape, lift the one that is commanded and hold it at a commanded point.
+"""Clutter: lift the commanded one of several objects of different shape, and hold it at a commanded point.
 
-Three to six of six objects are on the table; with the preset ``four`` three or four, one of each shape.
+Three to six objects are on the table; with the preset ``four``, three or four objects of four shapes.
 """
 
 import dataclasses
@@ -27,20 +27,20 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.types import TARGET
 
-SIZES = (0.75, 1.15)  # an object's lengths are drawn between these shares of those below
-MASSES = (0.5, 2.0)  # likewise its mass
-DENSITY = 2000.0  # [kg/m3] of stone: what is round and light sinks deep into the pads, which touch it in a point
-LEAST = 3  # objects on the table
+SIZES = (0.75, 1.15)  # range of the factor of an object's lengths
+MASSES = (0.5, 2.0)  # range of the factor of its mass
+DENSITY = 2000.0  # [kg/m3] stone: light round objects sink deep into the pads, which touch them at a point
+LEAST = 3  # fewest objects on the table
 MARGIN = 0.003  # [m] between an open hand and the nearest object
-OPEN = 1.5  # the hand opens so many times as far as the widest object asks for: in clutter it takes no more room than it must
-QUICK = 0.3  # [s] fingers take to close, at least
-FOOT = 0.1  # [m] no object lies nearer to the robot's axis
-LIFTED = 0.005  # [m] an object that is held is that much higher than its largest like lies
-AWAY = 4.0  # [m] from the table's centre: the objects that an episode leaves out
+OPEN = 1.5  # opening of the hand in widths of the widest object: a wider hand would collide with the clutter
+QUICK = 0.3  # [s] least closing time of the fingers
+FOOT = 0.1  # [m] least distance of objects from the robot's axis
+LIFTED = 0.005  # [m] held: at least this far above where the largest object of its shape rests
+AWAY = 4.0  # [m] distance of parked objects from the table's centre
 
-# Shape, lengths in units of the widest object's edge, and how it lies; along x those that are longer than wide.
+# Shape, lengths in units of the widest object's edge, and orientation. Long objects lie along x.
 LYING = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
-ROLLING: dict[str, Any] = {"friction": (1.0, 0.005, 0.002), "condim": 6}  # what is round would roll for ever
+ROLLING: dict[str, Any] = {"friction": (1.0, 0.005, 0.002), "condim": 6}  # round objects would roll forever
 SHAPES: dict[str, dict[str, Any]] = {
     "box": {"shape": "box", "size": (1.0, 1.0, 1.0)},
     "bar": {"shape": "box", "size": (1.3, 0.55, 0.6)},
@@ -53,15 +53,15 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 @dataclasses.dataclass(frozen=True)
 class ClutterSetup:
-    """What differs from robot to robot; lengths in m.
+    """Numbers that differ from robot to robot; lengths in m.
 
     Attributes:
-        scene: with all objects.
-        robot: its hand opens as far as these ask for.
-        there: where it can grasp, and where it can hold.
-        pitch, jitter: of the objects' cells (``events.scatter``).
-        grasp: for the controller that picks up: how low, how far beyond the grasp point (``PickUpCfg``), and how long to close.
-        grasp_radius: how near to the grasp point the object counts as held.
+        scene: the scene with all objects.
+        robot: the robot, with a hand that opens as far as the objects need.
+        there: its regions for grasping and holding.
+        pitch, jitter: spacing of the objects (``events.scatter``).
+        grasp: settings of the pick-up controller (``PickUpCfg``): ``lowest``, ``beyond`` and ``closing``.
+        grasp_radius: greatest distance of a held object from the grasp point.
     """
 
     scene: SceneCfg
@@ -74,7 +74,7 @@ class ClutterSetup:
 
 
 def volume(item: ObjectCfg) -> float:
-    """Of an object [m3]."""
+    """Volume of an object [m3]."""
     first, *rest = item.size
     if item.shape == "box":
         return float(np.prod(item.size))
@@ -83,7 +83,7 @@ def volume(item: ObjectCfg) -> float:
 
 
 def extent(item: ObjectCfg) -> float:
-    """Radius of a circle around an object's outline from above as it lies [m]."""
+    """Radius of a circle around the outline of a lying object, seen from above [m]."""
     first, *rest = item.size
     if item.shape == "box":
         return float(np.linalg.norm(item.size[:2])) / 2
@@ -93,16 +93,16 @@ def extent(item: ObjectCfg) -> float:
 
 
 def across(item: ObjectCfg) -> float:
-    """How wide it is between the pads of a hand that fits it [m]."""
+    """Width of an object between the pads of a well-aligned hand [m]."""
     first, *rest = item.size
     return min(first, *rest[:1]) if item.shape == "box" else 2 * first
 
 
 def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> ClutterSetup:
-    """What follows from the robot's gripper, and from where it can grasp and hold.
+    """Derives the setup from the robot's gripper and regions.
 
     Raises:
-        UserError: as ``regions.of``, or the hand does not close on all of the objects.
+        UserError: the regions are unknown (``regions.of``), or the hand cannot close on all objects.
     """
     there, (thickness, width) = regions.of(robot), (robot.pad[2], robot.pad[1])
     edge = grasp.cube_for(robot).size[0]
@@ -138,18 +138,18 @@ def _object(unit: float, size: tuple[float, ...], **fields) -> ObjectCfg:
 
 
 def default(robot: RobotCfg) -> EnvCfg:
-    """Six objects."""
+    """Three to six of six objects."""
     return _clutter(fitted(robot))
 
 
 def four(robot: RobotCfg) -> EnvCfg:
-    """One of each shape."""
+    """Three or four objects, one of each shape."""
     return _clutter(fitted(robot, ("box", "cylinder", "sphere", "capsule")))
 
 
-# Long: a task is one list, to be read as one.
+# Long: a task is one list, to read as one.
 def _clutter(setup: ClutterSetup) -> EnvCfg:
-    """Lift's rewards for the commanded object; the others may be touched, but not leave the table."""
+    """Lift's rewards for the commanded object. The others may be touched, but must stay on the table."""
     scene, names, commanded = setup.scene, tuple(setup.scene.objects), {"object": TARGET}
     heights = tuple(round(SIZES[1] * item.rest_height + LIFTED, 4) for item in scene.objects.values())
     held = {"minimal_height": heights, "grasp_radius": setup.grasp_radius, **commanded}
@@ -168,10 +168,10 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         "actions": ObservationTerm(observations.last_action),
     }
     return EnvCfg(
-        robot=dataclasses.replace(setup.robot, gravity_compensation=True),  # as a robot's own controller does
+        robot=dataclasses.replace(setup.robot, gravity_compensation=True),  # a robot's own controller does this
         scene=scene,
-        # At the lifts' step of 10 ms what is round and light jumps out of small pads: Nero's scripted expert then lost 30 of 64
-        # objects, at 5 ms and a slower way 5, at 2.5 ms 2.
+        # At lift's step of 10 ms, light round objects jump out of small pads. Nero's scripted expert lost 30 of 64 objects at
+        # 10 ms, 5 at 5 ms with slower motions, and 2 at 2.5 ms.
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4)),
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5),
@@ -233,7 +233,8 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
 
 
 def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
-    """For the controller: which axis of an object lies across the opening of a hand that fits it, and in how many ways."""
+    """Returns, for the controller, which axis of each object lies across the hand's opening, and the number of equivalent
+    turns."""
     lying = {"box": 0, "can": 0, "sphere": 0, "capsule": 2}
     turns = {"box": 2, "can": 0, "sphere": 0, "capsule": 2}
     square = {name for name, item in scene.objects.items() if item.shape == "box" and item.size[0] == item.size[1]}
@@ -244,5 +245,5 @@ def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
 
 
 def presets() -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": default, "four": four}

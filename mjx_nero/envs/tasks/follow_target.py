@@ -1,4 +1,4 @@
-"""Follow target: the end effector keeps to a target cube. The Isaac Sim tutorial's first task."""
+"""Follow target: keep the end effector at a moving target cube. The Isaac Sim tutorial's first task."""
 
 import dataclasses
 import functools
@@ -13,7 +13,8 @@ from mjx_nero.sim.scene import SceneCfg
 
 @dataclasses.dataclass(frozen=True)
 class FollowTargetSetup:
-    """What differs from robot to robot: the frame that follows, and where the target is: a box about ``center`` [m]."""
+    """Numbers that differ from robot to robot: the frame that follows, and the box about ``center`` where targets are drawn
+    [m]."""
 
     frame: str
     center: tuple[float, float, float]
@@ -23,10 +24,10 @@ class FollowTargetSetup:
 
 
 def default(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
-    """The target runs round a vertical circle, four seconds a turn; success is to stay within 2 cm of it."""
+    """The target runs round a vertical circle in four seconds. Success is to stay within 2 cm of it."""
     x, y, z = ((c - s, c + s) for c, s in zip(setup.center, setup.spread, strict=True))
     return EnvCfg(
-        # As a robot's own controller would: a weak drive that sags would never arrive.
+        # A robot's own controller does this. A weak drive that sags would never arrive.
         robot=dataclasses.replace(robot, ee_site=setup.frame, gravity_compensation=True),
         scene=setup.scene,
         episode_length_s=12.0,
@@ -66,7 +67,7 @@ def default(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
 
 
 def static(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
-    """The target stands still; success is to stay within 5 mm of it."""
+    """The target stands still. Success is to stay within 5 mm of it."""
     moving = default(robot, setup)
     return dataclasses.replace(
         moving,
@@ -80,5 +81,5 @@ def static(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
 
 
 def presets(setup: FollowTargetSetup) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": functools.partial(default, setup=setup), "static": functools.partial(static, setup=setup)}

@@ -1,4 +1,7 @@
-"""Lift: pick a cube off the table and hold it at a commanded point. A preset is one list, however long, to be read as one."""
+"""Lift: pick a cube off the table and hold it at a commanded point.
+
+A preset is one list, long or not, and reads as one.
+"""
 
 import dataclasses
 import functools
@@ -22,17 +25,17 @@ from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
-CLOSING = 0.3  # [s] the script's fingers take to close, at least
+CLOSING = 0.3  # [s] least closing time of the script's fingers
 
 
 @dataclasses.dataclass(frozen=True)
 class LiftSetup:
-    """What differs from robot to robot: the cube, where it lies and where it has to go [m], robot root frame.
+    """Numbers that differ from robot to robot: the cube, where it lies, and where it must go [m].
 
     Attributes:
-        cube: ``x`` and ``y`` of the cube at the start of an episode.
-        goal: ``x``, ``y`` and ``z`` of the commanded point.
-        grasp_radius: how near to the grasp point the object counts as held [m].
+        cube: ``x`` and ``y`` of the cube at the start, in the world frame.
+        goal: ``x``, ``y`` and ``z`` of the commanded point, in the robot's root frame.
+        grasp_radius: greatest distance of a held object from the grasp point.
     """
 
     scene: SceneCfg
@@ -42,16 +45,16 @@ class LiftSetup:
 
     @property
     def lifted(self) -> dict[str, float]:
-        """The object's centre above this is off the table [m]: 1 cm above a cube at rest."""
+        """Height of the object's centre above which it is off the table [m]: 1 cm above a resting cube."""
         return {"minimal_height": self.scene.objects["cube"].rest_height + 0.01}
 
     @property
     def held(self) -> dict[str, float]:
-        """... and held, if it is this near to the grasp point [m]."""
+        """Height and greatest distance from the grasp point of a held object [m]."""
         return {**self.lifted, "grasp_radius": self.grasp_radius}
 
     def controllers(self, robot: RobotCfg) -> dict[str, dict[str, Any]]:
-        """The script that picks the cube up."""
+        """Settings of the script that picks the cube up."""
         edge = self.scene.objects["cube"].size[0]
         fields = {
             "lowest": grasp.lowest(robot.pad),
@@ -62,10 +65,10 @@ class LiftSetup:
 
 
 def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The Isaac Lab recipe's MDP, its numbers word for word.
+    """The Isaac Lab recipe's MDP, with the recipe's own numbers.
 
-    Kept to compare with. Its lifting reward is open to a shortcut: a cube knocked into the air scores like a held one.
-    The recipe switches observation corruption on but gives no term a noise range, so there is none to apply.
+    Kept for comparison. Its lifting reward has a loophole: a cube knocked into the air scores like a held one. The recipe
+    switches observation corruption on but gives no term a noise range, so none applies.
     """
     return EnvCfg(
         robot=robot,
@@ -114,7 +117,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
-            # The physics' table has no edge to fall from, so leaving the drawn one counts as the fall.
+            # The simulated table has no edge to fall from, so leaving the drawn table counts as a fall.
             "object_off_table": DoneTerm(
                 terminations.object_off_table,
                 params={"center": setup.scene.table_center, "size": setup.scene.table_size},
@@ -124,7 +127,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
 
 
 def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The preset that learns to grasp: height and tracking count only for a held cube, and relative positions are observed."""
+    """The preset that learns to grasp. Height and tracking count only for a held cube, and relative positions are observed."""
     recipe, held = isaac(robot, setup), setup.held
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
@@ -166,15 +169,15 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
 
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The default with all that differs between a simulated arm and a real one: see ``sim2real``.
+    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``.
 
-    Its gripper has no hysteresis: it has not been trained with it.
+    Its gripper has no hysteresis, because its policies were trained without.
     """
     return sim2reals.randomized(dataclasses.replace(default(robot, setup), actions=velocity_actions()))
 
 
 def presets(setup: LiftSetup) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {
         "default": functools.partial(default, setup=setup),
         "isaac": functools.partial(isaac, setup=setup),

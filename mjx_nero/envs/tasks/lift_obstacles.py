@@ -1,5 +1,7 @@
-"""Lift past obstacles: a cube from the right of the table to a point above its left. Neither arm nor cube may touch what stands
-between."""
+"""Lift past obstacles: carry a cube from the right of the table to a point above its left.
+
+Neither arm nor cube may touch the obstacle between.
+"""
 
 import dataclasses
 import functools
@@ -16,13 +18,13 @@ from mjx_nero.sim.scene import SceneCfg
 
 @dataclasses.dataclass(frozen=True)
 class LiftObstaclesSetup:
-    """What differs from robot to robot. None: from the robot's ``pick``, ``hold`` and gripper.
+    """Numbers that differ from robot to robot. None: derived from the robot's ``pick``, ``hold`` and gripper.
 
     Attributes:
-        cube: ``x`` and ``y`` of the cube at the start [m], in the world.
+        cube: ``x`` and ``y`` of the cube at the start [m], world frame.
         goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
-        room: what start and goal have to themselves on every side [m].
-        top: the highest that an obstacle may be above the robot's foot [m].
+        room: free space around start and goal [m].
+        top: greatest height of an obstacle above the robot's foot [m].
         scene: the cube, cameras and table.
     """
 
@@ -34,7 +36,7 @@ class LiftObstaclesSetup:
 
 
 def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
-    """Success: the cube within 2 cm of the goal for the last half second, without one touch in the whole episode."""
+    """Success: the cube is within 2 cm of the goal for the last half second, with no touch in the whole episode."""
     there = regions.of(robot)
     (x, y), (goal_x, goal_y, z) = there.cube, there.hold
     share = reach_obstacles.SHARE
@@ -51,7 +53,7 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
     done = {"threshold": 0.02, "object": "cube"}
     return dataclasses.replace(
         plain,
-        sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, and a box that is leant on
+        sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, or leaning on a box
         episode_length_s=12.0,
         actions=velocity_actions(),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
@@ -70,11 +72,11 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
             **plain.rewards,
             "touching": RewardTerm(rewards.touching, weight=-10.0),
             "nearness": RewardTerm(rewards.obstacle_nearness, weight=-1.0, params={"margin": 0.05}),
-            # Else a hand that learns to come open learns it too firmly for noise ever to close it.
+            # Otherwise the hand learns to stay open so firmly that noise never closes it.
             "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
         },
-        # Until an environment succeeds a touch costs it a tenth: ten times what a hand at the cube earns would teach it
-        # little but to keep away.
+        # A touch costs a tenth until an environment succeeds. At full cost, ten times what a hand at the cube earns, the policy
+        # learns little but to keep away.
         curriculum=CurriculumCfg(
             weights={"touching": Term(curriculum.level_weight, params={"start": -1.0})},
             levels=Term(curriculum.BySuccess, params={"up": 0.5, "down": 0.1}),
@@ -83,5 +85,5 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
 
 
 def presets(setup: LiftObstaclesSetup | None = None) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": functools.partial(default, setup=setup or LiftObstaclesSetup())}

@@ -1,4 +1,4 @@
-"""Pick and place: a cube from where it lies to where it belongs. The Isaac Sim tutorial's second task."""
+"""Pick and place: move a cube to its place. The Isaac Sim tutorial's second task."""
 
 import dataclasses
 import functools
@@ -13,22 +13,22 @@ from mjx_nero.sim.scene import SceneCfg
 
 @dataclasses.dataclass(frozen=True)
 class PickPlaceSetup:
-    """What differs from robot to robot: where the cube starts, where it has to go, how high it travels [m], and how long that may
-    take [s]."""
+    """Numbers that differ from robot to robot: where the cube starts and must go, how high it travels [m], and the time limit
+    [s]."""
 
     scene: SceneCfg
     cube: tuple[Range, Range]
     goal: tuple[Range, Range]
     travel_height: float
     episode_length_s: float
-    grasp_radius: float = 0.04  # how near to the grasp point the cube counts as held [m]
+    grasp_radius: float = 0.04  # greatest distance of a held cube from the grasp point [m]
 
 
 def default(robot: RobotCfg, setup: PickPlaceSetup) -> EnvCfg:
-    """Success: the cube within 1 cm of its place, at rest and let go of."""
+    """Success: the cube is within 1 cm of its place, at rest, and released."""
     rest = setup.scene.objects["cube"].rest_height
     held = {"minimal_height": rest + 0.01, "grasp_radius": setup.grasp_radius}
-    place = rest - robot.base_pos[2]  # of the robot's frame, as all commands are
+    place = rest - robot.base_pos[2]  # in the robot's root frame, as all commands are
     return EnvCfg(
         robot=dataclasses.replace(robot, gravity_compensation=True),
         scene=setup.scene,
@@ -78,5 +78,5 @@ def default(robot: RobotCfg, setup: PickPlaceSetup) -> EnvCfg:
 
 
 def presets(setup: PickPlaceSetup) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": functools.partial(default, setup=setup)}

@@ -1,4 +1,4 @@
-"""Place: a box from where it lies to a commanded pose on the table, its turn included. For any robot with a gripper."""
+"""Place: move a box to a commanded pose on the table, its heading included. For any robot with a gripper."""
 
 import dataclasses
 import math
@@ -13,19 +13,19 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 
-TURN = (-math.pi / 6, math.pi / 6)  # [rad] of the box at the start, and of its goal
+TURN = (-math.pi / 6, math.pi / 6)  # [rad] heading of the box at the start and at the goal
 STILL = (0.0, 0.0)
-APART = 2.5  # from its start to its goal at least, in heights of the box: one that lies there already is best left alone
-LONG = 1.5  # its longest edge, along x, in shorter ones: its turn can be seen
+APART = 2.5  # least distance from start to goal, in heights of the box: a box already there is best left alone
+LONG = 1.5  # length of the box along x, in its other edges, so that its heading shows
 
 
 def default(robot: RobotCfg) -> EnvCfg:
-    """Success: within 2 cm and 15 degrees of the goal, at rest, the hand away."""
+    """Success: the box is within 2 cm and 15 degrees of the goal, at rest, with the hand away."""
     there, turns = regions.of(robot), regions.turns(robot)
     box = _box(robot, LONG if turns else 1.0)
     yaw, rest = TURN if turns else STILL, box.rest_height - robot.base_pos[2]
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
-    angle = math.radians(15) if turns else math.pi  # a hand that cannot turn at will is not asked to
+    angle = math.radians(15) if turns else math.pi  # a hand that cannot turn freely is not asked to
     tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle, lifted=_lifted(box))
     named = {"object": "box"}
     state = {
@@ -73,18 +73,21 @@ def default(robot: RobotCfg) -> EnvCfg:
 
 
 def _box(robot: RobotCfg, long: float) -> ObjectCfg:
-    """As wide and high as the cube that the robot can lift, and of its density."""
+    """Makes a box as wide, high and dense as the cube that the robot can lift."""
     cube = grasp.cube_for(robot)
     edge = cube.size[0]
     return dataclasses.replace(cube, size=(round(long * edge, 4), edge, edge), mass=float(f"{long * cube.mass:.3g}"))
 
 
 def _lifted(box: ObjectCfg) -> float:
-    """Higher than a box gets that is only tipped over an edge [m], and its turn lost: that is easier learnt than to lift it."""
+    """Least height of a held box above its resting place [m]: higher than a box tipped over an edge.
+
+    Tipping is easier to learn than lifting, and loses the heading.
+    """
     long, _, high = box.size
     return round((math.hypot(long, high) - high) / 2 + high / 20, 4)
 
 
 def presets() -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": default}

@@ -1,4 +1,4 @@
-"""Push: a box to a goal pose on the table, with the gripper closed."""
+"""Push: move a box to a goal pose on the table with the gripper closed."""
 
 import dataclasses
 import math
@@ -12,11 +12,11 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 
-BOX = (1.6, 1.0, 0.8)  # edges of the box, in those of the cube that the gripper could lift
-EDGE = 0.05  # [m] of that cube, for a robot without a gripper
-TURN = (-math.pi / 3, math.pi / 3)  # the box at its start, and at its goal [rad]
+BOX = (1.6, 1.0, 0.8)  # edges of the box, in edges of the cube that the gripper could lift
+EDGE = 0.05  # [m] edge of that cube for a robot without a gripper
+TURN = (-math.pi / 3, math.pi / 3)  # [rad] heading of the box at the start and at the goal
 ANGLE = math.radians(15)
-FOLD = 2  # a box that is turned by half a turn looks as before
+FOLD = 2  # the box looks the same after half a turn
 
 
 def _box(robot: RobotCfg) -> ObjectCfg:
@@ -25,16 +25,16 @@ def _box(robot: RobotCfg) -> ObjectCfg:
     return ObjectCfg(size=(x, y, z), mass=float(f"{grasp.DENSITY * x * y * z:.3g}"))
 
 
-# Long: a task is one list, to be read as one.
+# Long: a task is one list, to read as one.
 def default(robot: RobotCfg) -> EnvCfg:
-    """Success: the box within 2 cm and 15 degrees of the goal, flat on the table."""
+    """Success: the box is within 2 cm and 15 degrees of the goal, flat on the table."""
     x, y, _ = regions.box(robot, "pick", "where on the table it can point down")
     dx, dy, dz = robot.base_pos
     box, object = _box(robot), {"object": "box"}
     start = {"x": regions.span(x[0] + dx, x[1] + dx), "y": regions.span(y[0] + dy, y[1] + dy), "z": (0.0, 0.0)}
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
     hand = dataclasses.replace(robot.gripper, home=robot.gripper.close)
-    back = round(box.size[0] / 2 + robot.pad[0] / 2, 4)  # from its centre, the hand is beside it
+    back = round(box.size[0] / 2 + robot.pad[0] / 2, 4)  # distance of the hand from the centre, when beside the box
     place, at_goal = box.rest_height - dz, {"threshold": 0.02, "angle": ANGLE, "fold": FOLD, **object}
     state = {
         "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
@@ -49,7 +49,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "actions": ObservationTerm(observations.last_action),
     }
     return EnvCfg(
-        robot=dataclasses.replace(robot, gripper=hand, gravity_compensation=True),  # as a robot's own controller does
+        robot=dataclasses.replace(robot, gripper=hand, gravity_compensation=True),  # a robot's own controller does this
         scene=scene,
         sim=contacts.sized(robot, scene, SimCfg()),
         episode_length_s=8.0,
@@ -75,8 +75,8 @@ def default(robot: RobotCfg) -> EnvCfg:
         },
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **object}),
-            # What a box earns where it lies differs from start to start by more than a hand that is near it earns with the term
-            # above alone: for 30 M env steps it stayed away. And a push comes from behind.
+            # The rewards for where the box happens to lie vary more from start to start than the term above pays, and with that
+            # term alone the hand stayed away for 30 M env steps. Besides, a push comes from behind.
             "reaching_behind": RewardTerm(
                 rewards.behind_object_distance, weight=5.0, params={"std": 0.3, "behind": back, **object}
             ),
@@ -104,5 +104,5 @@ def default(robot: RobotCfg) -> EnvCfg:
 
 
 def presets() -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": default}

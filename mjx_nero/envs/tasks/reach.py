@@ -14,8 +14,8 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import UserError
 
 STILL: Range = (0.0, 0.0)
-BUDGET = Budget(steps=60_000_000, steps_on_cpu=2_000_000, success=0.98)  # there is nothing to grasp
-# The recipe's runner settings (RSL-RL).
+BUDGET = Budget(steps=60_000_000, steps_on_cpu=2_000_000, success=0.98)  # quick to learn: nothing to grasp
+# The recipe's learner settings (RSL-RL).
 RUNNER = {
     "num_epochs": 8,
     "num_minibatches": 4,
@@ -30,21 +30,21 @@ RUNNER = {
 
 
 def scene(like: SceneCfg) -> SceneCfg:
-    """A scene to reach in: without objects, and with a table that is a picture."""
+    """Removes the objects, and turns the table into a picture."""
     return dataclasses.replace(like, table=False, objects={})
 
 
 @dataclasses.dataclass(frozen=True)
 class ReachSetup:
-    """What differs from robot to robot.
+    """Numbers that differ from robot to robot.
 
     Attributes:
-        position: ``x``, ``y``, ``z`` of the commands [m], robot root frame; None: the robot's ``workspace``.
-        orientation: roll, pitch and yaw of the commands [rad]; None: only the position counts.
-        start: factors of the home position at reset.
+        position: ``x``, ``y``, ``z`` of the goals [m], robot root frame; None: the robot's ``workspace``.
+        orientation: roll, pitch and yaw of the goals [rad]; None: only the position counts.
+        start: range of the factors of the home position at reset.
         scene: cameras and table.
-        decimation: physics steps of 1/60 s a control step.
-        episode_length_s: [s].
+        decimation: physics steps of 1/60 s per control step.
+        episode_length_s: duration of an episode [s].
     """
 
     position: tuple[Range, Range, Range] | None = None
@@ -62,7 +62,7 @@ def isaac(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
         raise UserError(f"{robot.name} has no workspace to command from: add the field to its robot.yaml")
     turned = setup.orientation is not None
     at_goal = {"threshold": 0.02}
-    # Nothing touches: all that is left to solve are the joints' limits.
+    # Nothing touches, so joint limits are the only constraints to solve.
     objects, sim = setup.scene, SimCfg(dt=1 / 60, decimation=setup.decimation, iterations=3, ls_iterations=6, elliptic=False)
     if robot.folder:  # imported
         objects = scenes.around(robot, objects)
@@ -112,7 +112,7 @@ def isaac(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
 
 
 def default(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
-    """The recipe with the error observed, and rewarded down to the last centimetre."""
+    """The recipe, with the error observed, and rewarded down to the last centimetre."""
     recipe = isaac(robot, setup)
     turned = setup.orientation is not None
     state = {
@@ -134,12 +134,12 @@ def default(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
 
 
 def sim2real(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
-    """The default with all that differs between a simulated arm and a real one: see ``sim2real``."""
+    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
     return sim2reals.randomized(default(robot, setup))
 
 
 def presets(setup: ReachSetup | None = None) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     setup = setup or ReachSetup()
     return {
         "default": functools.partial(default, setup=setup),

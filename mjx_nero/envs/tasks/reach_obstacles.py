@@ -1,4 +1,4 @@
-"""Reach past obstacles: from the right of the workspace to a point on its left, without touching what stands between."""
+"""Reach past obstacles: move from the right of the workspace to a point on its left without touching the obstacle between."""
 
 import dataclasses
 import functools
@@ -14,20 +14,20 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObstacleCfg, SceneCfg
 
-NAMES = ("one", "two")  # boxes: what an obstacle is made of at most
-SHARE = 0.3  # of the region's width, at either side, that start and goal are drawn from
-HAND = 0.08  # [m] from a finger's pad to the far side of the hand, and some more
+NAMES = ("one", "two")  # the boxes that make an obstacle
+SHARE = 0.3  # share of the region's width, at either side, that start and goal are drawn from
+HAND = 0.08  # [m] from a finger's pad to the far side of the hand, with a margin
 
 
 @dataclasses.dataclass(frozen=True)
 class ReachObstaclesSetup:
-    """What differs from robot to robot. None: from the robot's ``workspace`` and gripper.
+    """Numbers that differ from robot to robot. None: derived from the robot's ``workspace`` and gripper.
 
     Attributes:
-        start: ``x`` and ``y`` to which the arm is turned at the start [m], robot root frame.
+        start: ``x`` and ``y`` that the arm points at when an episode starts [m], robot root frame.
         goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
-        room: what start and goal have to themselves on every side [m].
-        top: the highest that an obstacle may be above the robot's foot [m].
+        room: free space around start and goal [m].
+        top: greatest height of an obstacle above the robot's foot [m].
         scene: cameras and table.
     """
 
@@ -39,7 +39,7 @@ class ReachObstaclesSetup:
 
 
 def completed(robot: RobotCfg, setup: ReachObstaclesSetup) -> ReachObstaclesSetup:
-    """The setup with all that it leaves open."""
+    """Fills in all numbers that the setup leaves open."""
     x, y, z = regions.box(robot, "workspace", "where it can work")
     by = SHARE * (y[1] - y[0])
     return ReachObstaclesSetup(
@@ -52,23 +52,23 @@ def completed(robot: RobotCfg, setup: ReachObstaclesSetup) -> ReachObstaclesSetu
 
 
 def between(setup: ReachObstaclesSetup, object: str | None = None) -> Term:
-    """Draws what stands between start and goal; ``object`` is what goes there, None: the end effector."""
+    """Draws the obstacle between start and goal. ``object`` is the one that travels; None: the end effector."""
     params = {"thickness": (0.02, 0.04), "width": (0.15, 0.3), "above": (0.0, 0.08), "top": setup.top, "room": setup.room}
     return Term(obstacles.across, params={**params, "names": NAMES, "object": object})
 
 
 def with_obstacles(scene: SceneCfg) -> SceneCfg:
-    """The scene with the boxes, and a robot that can touch itself."""
+    """Adds the boxes to the scene, and lets the robot touch itself."""
     return dataclasses.replace(scene, obstacles={name: ObstacleCfg() for name in NAMES}, self_collision=True)
 
 
 def seen() -> dict[str, ObservationTerm]:
-    """Where the obstacles are and how large."""
+    """Observes positions and sizes of the obstacles."""
     return {f"obstacle_{name}": ObservationTerm(observations.obstacle, params={"obstacle": name}) for name in NAMES}
 
 
 def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
-    """The arm starts turned to the start, by chance a little beside it."""
+    """Starts the arm turned towards ``start``, with small random offsets."""
     assert setup.start is not None
     turn = regions.turn_to(robot, *setup.start)
     return {
@@ -78,12 +78,12 @@ def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
 
 
 def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str, Any]]:
-    """The expert, of a robot that has RMPflow's files."""
+    """Names the expert, if the robot has RMPflow's files."""
     return {name: fields} if (robot.xml.parent / "rmpflow").is_dir() else {}
 
 
 def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:
-    """Success: within 2 cm of the goal for the last half second, without one touch in the whole episode."""
+    """Success: within 2 cm of the goal for the last half second, with no touch in the whole episode."""
     setup = completed(robot, setup)
     assert setup.goal is not None and setup.scene is not None
     state = {
@@ -127,5 +127,5 @@ def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:
 
 
 def presets(setup: ReachObstaclesSetup | None = None) -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": functools.partial(default, setup=setup or ReachObstaclesSetup())}

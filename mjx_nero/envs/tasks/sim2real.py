@@ -1,8 +1,8 @@
-"""What differs between a simulated arm and a real one, for any task: the preset ``sim2real``. Every range is a field of its own
-(``--env.randomization.object_mass.params.scale "(0.5, 4)"``, ``--env.actions.delay.params.steps "(0, 3)"``).
+"""Sim to real, for any task: the preset ``sim2real`` adds what differs between a simulated arm and a real one.
 
-The ranges are those that others train manipulation with (mjlab's lift_cube, MuJoCo Playground, Isaac Lab, HumanoidVerse), and of
-delays what a bus and a camera have at 50 control steps a second.
+Every range is a field (``--env.randomization.object_mass.params.scale "(0.5, 4)"``, ``--env.actions.delay.params.steps "(0,
+3)"``). The ranges are the ones that other libraries train manipulation with (mjlab's lift_cube, MuJoCo Playground, Isaac Lab,
+HumanoidVerse). The delays are those of a bus and a camera at 50 control steps a second.
 """
 
 import dataclasses
@@ -13,11 +13,11 @@ from mjx_nero.mdp.terms import ObservationGroup, Term
 from mjx_nero.sim import grasp, robot_file
 from mjx_nero.sim.robot import RobotCfg
 
-_STEPS = 200_000_000  # of a lift on a GPU: the curriculum takes some 50 M of them
+_STEPS = 200_000_000  # env steps of a lift on a GPU; the curriculum takes about 50 M of them
 
 
 def randomized(cfg: EnvCfg) -> EnvCfg:
-    """A task with drives, loads, objects, delays and sensors that differ from episode to episode."""
+    """Adds drives, loads, objects, delays and sensor errors that differ from episode to episode."""
     late = {"delay": Term(actions.Delay, params={"steps": (0, 3), "hold": 0.9})}
     first = {name: term for name, term in cfg.actions.items() if name not in ("delay", "speed_limit")}
     noise = {"noise": Term(actions.Noise, params={"amount": 0.002})}
@@ -40,14 +40,14 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
 
 
 def _late(group: ObservationGroup) -> ObservationGroup:
-    """What the arm's bus tells comes up to a step late."""
+    """Delays what the arm's bus reports by up to one step."""
     told = {name: group.terms[name] for name in ("joint_pos", "joint_vel") if name in group.terms}
     late = {name: dataclasses.replace(term, delay=(0, 1), hold=0.9) for name, term in told.items()}
     return dataclasses.replace(group, terms={**group.terms, **late})
 
 
 def _arm(robot: RobotCfg, grips: bool) -> dict[str, Term]:
-    """Terms of links and drives, and of the pads where there is something to grip."""
+    """Randomizes links and drives, and the pads if there is something to grip."""
     spec, joints = robot_file.model(robot), robot.arm.joints
     links = tuple(dict.fromkeys(spec.joint(name).parent.name for name in joints))
     pads = tuple(grasp.pads(spec))
@@ -79,7 +79,7 @@ def _object(name: str) -> dict[str, Term]:
 
 
 def _eyes(objects: list[str]) -> dict[str, Term]:
-    """Terms of what cameras see."""
+    """Adds the errors of cameras."""
     if not objects:
         return {}
     seen = {"offset": 0.005, "noise": 0.002, "delay": (0, 2), "hold": 0.9}

@@ -1,6 +1,6 @@
-"""Stack: one cube onto another, let go of and at rest. For any robot with a gripper.
+"""Stack: put one cube onto another, released and at rest. For any robot with a gripper.
 
-Preset ``three`` puts one more on top.
+The preset ``three`` adds a third cube on top.
 """
 
 import dataclasses
@@ -17,16 +17,16 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
 COLORS = {"blue": (0.2, 0.35, 0.9, 1.0), "red": (0.85, 0.3, 0.2, 1.0), "yellow": (0.95, 0.75, 0.15, 1.0)}  # from the bottom up
-BESIDE = 0.03  # [m] of an open finger behind its pad: cubes lie that much farther apart
+BESIDE = 0.03  # [m] size of an open finger behind its pad, added to the gap between cubes
 
 
 def default(robot: RobotCfg) -> EnvCfg:
-    """The red cube onto the blue one."""
+    """Puts the red cube onto the blue one."""
     return _stack(robot, 2, 7.0)
 
 
 def three(robot: RobotCfg) -> EnvCfg:
-    """And then the yellow one onto both."""
+    """Puts the red cube onto the blue one, and the yellow cube onto both."""
     return _stack(robot, 3, 13.0)
 
 
@@ -34,10 +34,10 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     cube, there = grasp.cube_for(robot), regions.of(robot)
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
     scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
-    # On it, as far as it stays, and so far beside it straight down: the centre within the face below. A cube counts as held from
-    # where none gets that leans on its edge.
+    # A cube counts as on the other, and may come straight down, with its centre above the face below. It counts as held from a
+    # height that a cube leaning on its edge never reaches.
     tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))
-    # Leaving is paid for as far as the fingers have let go: from where they hold a cube, half open already if it is wide.
+    # Leaving pays in proportion to how far the fingers have opened from holding a cube, which may leave them half open already.
     fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
     leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.place, **fingers})
     state = {
@@ -82,10 +82,10 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
 
 
 def _each(objects, name, func, noise=0.0) -> dict[str, ObservationTerm]:
-    """A term for each object."""
+    """Makes one term per object."""
     return {name.format(each): ObservationTerm(func, params={"object": each}, noise=noise) for each in objects}
 
 
 def presets() -> Presets:
-    """Preset -> robot -> config; the default first."""
+    """Maps preset -> robot -> config, the default first."""
     return {"default": default, "three": three}

@@ -1,1 +1,1 @@
-"""Whole episodes played by a policy or a controller, and their figures."""
+"""Plays and measures whole episodes, with a policy or a controller."""

@@ -23,17 +23,18 @@ from mjx_nero.mdp import metrics
 from mjx_nero.sim.physics import warp_available
 
 AGENTS = ("policy", "zero", "random")
-EXPERT = "expert"  # the first of the controllers that can do a task
+EXPERT = "expert"  # the task's first controller
 BACKENDS = ("auto", "mjx", "mujoco")
 
 
 def agent(cfg: "EvalCfg", env: ManipulationEnv) -> tuple[rollout.Act, Any]:
-    """An agent's act function and its parameters: ``policy`` is deterministic, ``random`` uniform in +-1, ``zero`` stays home."""
+    """Returns an agent's act function and parameters. ``policy`` is deterministic, ``random`` uniform in +-1, ``zero`` stays
+    home."""
     if cfg.agent in (None, "policy"):
         trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, cfg.any_robot, cfg.preset)
         return lambda params, obs, key: trained.act(obs), None
 
-    # Where actions are drive targets, staying home means home's; random ones go as far about it as a policy's would.
+    # If actions are drive targets, ``zero`` sends the home targets, and ``random`` spreads about them.
     home = jnp.asarray(env.home_action)
 
     def act(params, obs, key):
@@ -45,10 +46,10 @@ def agent(cfg: "EvalCfg", env: ManipulationEnv) -> tuple[rollout.Act, Any]:
 
 
 def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[str, Any] | None = None) -> control.Controller:
-    """A controller that can do the environment's task.
+    """Makes a controller that can do the environment's task.
 
     Raises:
-        UserError: it cannot, or a field of its config is wrong.
+        UserError: the controller cannot do the task, or a field of its config is wrong.
     """
     able = env.cfg.controllers
     if not able:
@@ -60,19 +61,19 @@ def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[s
 
 @dataclasses.dataclass(frozen=True)
 class EvalCfg:
-    """What to play.
+    """Settings of an evaluation.
 
     Attributes:
-        robot: another than the environment's own, by name or folder.
-        agent: who acts (default: the policy, else the task's controller).
+        robot: robot in place of the environment's own, by name or folder.
+        agent: policy, zero or random (default: the policy, or else the task's controller).
         policy: policy file (default: the bundled one of the environment).
-        any_robot: play a policy though it was trained for another model of the robot.
-        controller: instead of an agent: one of the task's controllers, or expert, the first of them.
-        episodes: played side by side.
-        backend: mjx, or mujoco: the C library on the CPU; auto: what impl says.
-        impl: one of ``physics.impls()``.
-        record: of how many of the episodes every step is kept, for a video, say.
-        env_fields, control_fields: of the environment's and the controller's config by dotted name.
+        any_robot: play a policy that was trained for another model of the robot.
+        controller: play one of the task's controllers, or expert for the first of them, instead of an agent.
+        episodes: number of episodes, played side by side.
+        backend: mjx, or mujoco for the C library on the CPU; auto: see impl.
+        impl: physics, one of ``physics.impls()``.
+        record: number of episodes whose steps are kept, for example for a video.
+        env_fields, control_fields: fields of the environment's and the controller's config by dotted name.
     """
 
     env_name: str
@@ -92,14 +93,14 @@ class EvalCfg:
 
     def __post_init__(self):
         if self.controller and (self.agent or self.policy):
-            raise UserError("one can play: give --controller, or --agent or --policy")
+            raise UserError("only one can play: give --controller, --agent or --policy")
         if self.control_fields and (self.agent or self.policy):
             raise UserError("--control.* needs --controller")
 
 
 @dataclasses.dataclass(frozen=True)
 class Played:
-    """Episodes, where they were played, and their figures (plain JSON)."""
+    """The episodes, the environment that they were played in, and their figures (plain JSON)."""
 
     env: ManipulationEnv
     episodes: rollout.Episodes
@@ -107,7 +108,7 @@ class Played:
 
 
 def _controller_name(cfg: EvalCfg, env_cfg: EnvCfg) -> str | None:
-    """The controller that plays; None: an agent does."""
+    """Returns the name of the controller that plays, or None if an agent does."""
     usual = next(iter(env_cfg.controllers), None)
     if cfg.controller:
         return (usual or EXPERT) if cfg.controller == EXPERT else cfg.controller
@@ -118,7 +119,7 @@ def play(cfg: EvalCfg) -> Played:
     """Plays episodes side by side.
 
     Raises:
-        UserError: unknown names or fields, a policy that does not fit.
+        UserError: a name or field is unknown, or a policy does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
     env_cfg = config.override(env_cfg, cfg.env_fields)
@@ -143,7 +144,7 @@ def play(cfg: EvalCfg) -> Played:
         "seconds": round(time.perf_counter() - begun, 2),
     }
     if all(term.time_out for term in env_cfg.terminations.values()):
-        del result["dropped_rate"]  # nothing can be
+        del result["dropped_rate"]  # nothing can be dropped
     if steering:
         result |= tracking(episodes.distance, round(env_cfg.success.hold_s / env.dt))
         if not env_cfg.success.follows:
@@ -153,7 +154,7 @@ def play(cfg: EvalCfg) -> Played:
 
 
 def _impl(backend: str, impl: str) -> str:
-    """The physics that a backend stands for; ``impl`` chooses among MJX's own."""
+    """Returns the physics of a backend; ``impl`` chooses among MJX's own."""
     native = backend == "mujoco"
     if backend != "auto" and impl != "auto" and native != (impl == "native"):
         raise UserError(f"--backend {backend} cannot play with --impl {impl}: give one of them")
@@ -163,10 +164,11 @@ def _impl(backend: str, impl: str) -> str:
 
 
 def tracking(distance: np.ndarray, last: int) -> dict[str, float]:
-    """Distances to the goal over the last ``last`` steps, and over the second half of the episodes, when all has settled [m].
+    """Distances to the goal over the last ``last`` steps, and over the second half of the episodes, when the robot has settled
+    [m].
 
     Args:
-        distance: [steps, episodes], of ``Episodes``.
+        distance: ``Episodes.distance`` [steps, episodes].
     """
     half = distance[len(distance) // 2 :]
     return {

@@ -1,4 +1,4 @@
-"""A task's metrics as figures over many episodes, each as its term says (``MetricTerm``)."""
+"""Turns a task's metrics into figures over many episodes, each as its term says (``MetricTerm``)."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,14 +10,16 @@ Terms = Mapping[str, MetricTerm]  # by name
 
 
 def of_episodes(terms: Terms, metrics: Mapping[str, np.ndarray], whole: np.ndarray) -> dict[str, float | None]:
-    """The figures of episodes. One that left the numbers counts as an episode without what a rate counts, and is in no mean.
+    """Computes the figures of a set of episodes.
+
+    A non-finite episode counts as an episode without the event of a rate, and is excluded from means.
 
     Args:
-        metrics: name -> [n], by episode.
+        metrics: name -> values of the episodes [n].
         whole: which episodes stayed finite, bool [n].
 
     Returns:
-        ``<figure>_mean`` or ``<figure>_rate``; None is the mean of no episode.
+        ``<figure>_mean`` or ``<figure>_rate``; the mean of no episode is None.
     """
     return {f"{term.figure or name}_{term.over}": _figure(term, metrics, name, whole) for name, term in terms.items()}
 
@@ -29,11 +31,12 @@ def _figure(term: MetricTerm, metrics: Mapping[str, np.ndarray], name: str, whol
 
 
 def of_sums(terms: Terms, sums: Mapping[str, float], episodes: float) -> Iterator[tuple[str, float]]:
-    """(name, figure) of the episodes that ended while metrics were summed: an event by its metric's name, a mean by its own.
+    """Yields (name, figure) of the episodes that ended while metrics were summed: rates under the metric's name, means under the
+    figure's.
 
     Args:
         sums: name -> sum over all steps and environments.
-        episodes: how many ended.
+        episodes: number of ended episodes.
     """
     for name, term in terms.items():
         if term.at_end and name in sums:
@@ -42,5 +45,5 @@ def of_sums(terms: Terms, sums: Mapping[str, float], episodes: float) -> Iterato
 
 
 def mean(values: np.ndarray) -> float | None:
-    """None of nothing."""
+    """Returns the mean, or None for an empty array."""
     return float(values.mean()) if values.size else None

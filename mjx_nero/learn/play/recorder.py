@@ -1,4 +1,4 @@
-"""What is kept of a control step: a ``Record`` made of what ``step`` took and gave, before an episode that ended restarts."""
+"""Records of control steps: what ``step`` took and gave, kept before an ended episode restarts."""
 
 from typing import Any
 
@@ -16,34 +16,34 @@ from mjx_nero.types import Scenery
 class Record:
     """One control step: what the policy saw, what it did, and what came of it. Leading axes are steps and environments."""
 
-    obs: dict[str, Any]  # groups as the policy saw them, noise and delay included; of a group that stays apart, a dict of terms
+    obs: dict[str, Any]  # as the policy saw it, with noise and delay; a dict of terms for a group that stays apart
     action: Float[Array, "*n na"]  # as the policy gave it
-    targets: Float[Array, "*n nu"]  # what the drives were told [rad or m]
-    qpos: Float[Array, "*n nq"]  # after the step, as are all that follow
+    targets: Float[Array, "*n nu"]  # position targets of the drives [rad or m]
+    qpos: Float[Array, "*n nq"]  # after the step, as is everything below
     qvel: Float[Array, "*n nv"]
     readings: dict[str, Array]  # of the scene's sensors
-    scenery: Scenery  # what a picture shows beside qpos
+    scenery: Scenery  # what a picture shows besides qpos
     reward: Float[Array, "*n"]
     terminated: Bool[Array, "*n"]
     truncated: Bool[Array, "*n"]
 
     def __getitem__(self, at: Any) -> "Record":
-        """That of some steps or environments."""
+        """Selects steps or environments."""
         return jax.tree.map(lambda x: x[at], self)
 
     @property
     def done(self) -> Bool[Array, "*n"]:
-        """The step ended its episode."""
+        """True where the step ended its episode."""
         return self.terminated | self.truncated
 
 
 def of_step(env: ManipulationEnv, before: State, action: jax.Array, after: State) -> Record:
-    """The record of one environment's step.
+    """Makes the record of one environment's step.
 
     Args:
-        before: the state that the policy acted in.
-        action: [na].
-        after: what ``step`` made of them; not restarted.
+        before: the state in which the policy acted.
+        action: the policy's action [na].
+        after: the result of ``step``, not restarted.
     """
     sim, truncated = after.pipeline_state, after.info["truncation"] > 0
     return Record(
@@ -61,22 +61,22 @@ def of_step(env: ManipulationEnv, before: State, action: jax.Array, after: State
 
 
 def of_batch(env: ManipulationEnv, before: State, action: jax.Array, after: State) -> Record:
-    """The records of a batch's step: as ``of_step``, with a leading axis."""
+    """Makes the records of a batch's step: ``of_step`` with a leading axis."""
     return jax.vmap(lambda *step: of_step(env, *step))(before, action, after)
 
 
 class Recorder:
-    """Keeps the records of a batch of environments, step after step, in the host's memory, and parts them into episodes."""
+    """Collects the records of a batch step by step, in the host's memory, and splits them into episodes."""
 
     def __init__(self) -> None:
         self._steps: list[Record] = []
 
     def __call__(self, record: Record) -> None:
-        """Takes the records of a step [environments, ...]."""
+        """Adds the records of one step [environments, ...]."""
         self._steps.append(jax.tree.map(np.array, record))
 
     def episodes(self) -> list[Record]:
-        """The episodes that have ended [steps, ...], by environment and in order; what still runs is left out."""
+        """Returns the ended episodes [steps, ...], in order, environment by environment. Running episodes are left out."""
         if not self._steps:
             return []
         all_steps = jax.tree.map(lambda *steps: np.stack(steps), *self._steps)

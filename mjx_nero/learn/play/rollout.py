@@ -1,4 +1,4 @@
-"""Evaluation: whole episodes with a policy or a controller."""
+"""Rollouts: whole episodes played with a policy or a controller."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ Act = Callable[[Any, dict[str, jax.Array], Key], jax.Array]
 
 @dataclasses.dataclass(frozen=True)
 class Agent:
-    """Who plays a batch of environments.
+    """A policy or controller that plays a batch of environments.
 
     Attributes:
         act: (parameters, memory, states, key) -> (actions [n, ...], memory).
@@ -38,14 +38,14 @@ class Agent:
 
 
 def policy_agent(act: Act) -> Agent:
-    """A policy of the observations alone, without memory."""
+    """Makes an agent of a policy, which reads only observations and has no memory."""
     return Agent(act=lambda params, memory, state, key: (act(params, state.obs, key), memory), init=lambda state: ())
 
 
 def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
-    """A controller in every environment of the batch; it has no parameters and draws nothing.
+    """Makes an agent of a controller, one copy per environment. It has no parameters and draws nothing.
 
-    The environment has to take drive targets (``actions.DriveTargets``).
+    The environment must take drive targets (``actions.DriveTargets``).
     """
 
     def act(params, memory, state, key):
@@ -57,16 +57,16 @@ def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
 
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """One entry an episode.
+    """Played episodes, one entry each.
 
     Attributes:
-        metrics: name -> [n], each the sum over the episode's steps (see ``ManipulationEnv.finish``).
-        returns: [n].
-        lengths: [n] control steps.
-        record: [steps, k, ...] of the first k environments, where asked for; after its end an episode stands still.
-        distance: [steps, n], what the task's success is about [m]; an ended episode's stays.
-        memory: the agent's, after the last step.
-        terms: the task's metrics, which say how theirs become figures.
+        metrics: name -> sums over each episode's steps [n] (see ``ManipulationEnv.finish``).
+        returns: returns of the episodes [n].
+        lengths: lengths of the episodes [n, control steps].
+        record: records of the first k episodes [steps, k, ...], if asked for; an ended episode stands still.
+        distance: the distance that success judges [steps, n; m]; an ended episode's stays.
+        memory: the agent's memory after the last step.
+        terms: the task's metric terms, which say how metrics become figures.
     """
 
     metrics: dict[str, np.ndarray]
@@ -79,21 +79,23 @@ class Episodes:
 
     @property
     def qpos(self) -> np.ndarray:
-        """[steps, k, nq]."""
+        """Positions of the recorded episodes [steps, k, nq]."""
         return np.asarray(self.record.qpos)
 
     @property
     def scenery(self) -> Scenery:
-        """[steps, k, ...], what a picture shows beside ``qpos``."""
+        """Everything that a picture shows besides ``qpos`` [steps, k, ...]."""
         return self.record.scenery
 
     def episode(self, index: int) -> Record:
-        """A recorded episode to its end [steps, ...]."""
+        """Returns a recorded episode up to its end [steps, ...]."""
         return self.record[: int(self.lengths[index]), index]
 
     def summary(self) -> dict:
-        """Figures for people and for JSON: distances in m, times in s. An episode whose physics or policy left the numbers is a
-        failure, and in no mean; None is the mean of none."""
+        """Computes the figures for people and for JSON: distances in m, times in s.
+
+        An episode that became non-finite counts as a failure and is excluded from means; None if no episode remains.
+        """
         m, n = self.metrics, len(self.returns)
         whole, success = self._whole, self.success
         low, high = wilson(float(success.sum()), n)
@@ -115,7 +117,7 @@ class Episodes:
 
     @property
     def success(self) -> np.ndarray:
-        """Of each episode, bool [n]."""
+        """True for each episode that succeeded [n]."""
         return (self.metrics["success"] > 0) & self._whole
 
     @property
@@ -123,17 +125,18 @@ class Episodes:
         return ~(self.metrics["nan"] > 0) & np.isfinite(self.returns)
 
     def recorded(self, which: np.ndarray) -> "Episodes":
-        """The same episodes, with the records of those named alone; ``which``: int [any], below the number of recorded ones."""
+        """Returns the same episodes with only the records that ``which`` names; ``which``: int [any], indices of recorded
+        ones."""
         return dataclasses.replace(self, record=self.record[:, which])
 
 
 class Runner:
-    """(parameters of the policy, seed) -> finished episodes, by one compiled program.
+    """A compiled program: (policy parameters, seed) -> finished episodes.
 
     Args:
-        run: jitted, (parameters, keys of the episodes, key) -> what ``Episodes`` is made of.
-        episodes: how many.
-        terms: the task's metrics.
+        run: jitted function (parameters, keys of the episodes, key) -> parts of ``Episodes``.
+        episodes: number of episodes.
+        terms: the task's metric terms.
     """
 
     def __init__(self, run: Any, episodes: int, terms: figures.Terms):
@@ -144,7 +147,7 @@ class Runner:
         return _collect(totals, frames, memory, self._terms)
 
     def compiler(self, params: Any) -> Callable[[], None]:
-        """Traces the program; the call that comes back compiles it, in any thread."""
+        """Traces the program, and returns a call that compiles it in any thread."""
         lowered = self._run.lower(params, *_keys(0, self._episodes))
 
         def compile() -> None:
@@ -154,14 +157,14 @@ class Runner:
 
 
 def wilson(successes: float, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's 95% interval of a proportion (Wilson 1927)."""
+    """Computes Wilson's 95% interval of a proportion (Wilson 1927)."""
     p, zz = successes / n, z * z / n
     middle, half = (p + zz / 2) / (1 + zz), z * math.sqrt(p * (1 - p) / n + zz / (4 * n)) / (1 + zz)
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def _accumulate(state: State, after: State, totals: dict, active: jax.Array) -> tuple[State, dict, jax.Array]:
-    """Adds a step's metrics to the episodes still running; the others stay where they ended."""
+    """Adds a step's metrics to the running episodes; ended ones stay as they are."""
     step = {**after.metrics, "return": after.reward, "length": jnp.ones_like(after.reward)}
     totals = {name: totals[name] + jnp.where(active > 0, step[name], 0.0) for name in totals}
 
@@ -178,7 +181,7 @@ def _start(env: ManipulationEnv, keys: Key) -> tuple[State, dict, jax.Array]:
 
 
 def _step_bytes(env: ManipulationEnv, episodes: int, record: int) -> int:
-    """What ``runner`` keeps of a step."""
+    """Bytes that ``runner`` keeps per step."""
     state, action = env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
     kept = jax.eval_shape(lambda *step: recorder.of_step(env, *step), state, action, state) if record else ()
     return record * device_memory.size(kept) + episodes * device_memory.size(state.metrics["distance"])
@@ -191,14 +194,14 @@ def runner(
     record: int = 0,
     start: Callable[[Any, State], State] | None = None,
 ) -> Runner:
-    """Plays ``episodes`` at once, on the environment's physics: one compiled program, reused from call to call.
+    """Compiles a program that plays ``episodes`` at once, on the environment's physics.
 
     Args:
-        record: of how many of the episodes every step is kept.
-        start: (parameters, states after the reset) -> the states to start from.
+        record: number of episodes whose steps are kept.
+        start: (parameters, states after the reset) -> states to start from.
 
     Raises:
-        UserError: so many episodes of such a length do not fit into the memory.
+        UserError: the episodes do not fit into memory.
     """
     device_memory.check_batch(env, episodes, "episodes:", env.episode_length * _step_bytes(env, episodes, record))
     agent = act if isinstance(act, Agent) else policy_agent(act)
@@ -222,7 +225,7 @@ def runner(
 
 
 def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
-    # Training folds nothing into its seed, so no evaluation ever repeats a training episode's draws.
+    # Training folds nothing into its seed, so an evaluation never repeats the draws of training.
     key = jax.random.fold_in(jax.random.PRNGKey(seed), 0xE7A1)
     k_reset, key = jax.random.split(key)
     return jax.random.split(k_reset, episodes), key

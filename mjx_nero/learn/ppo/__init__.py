@@ -1,1 +1,1 @@
-"""PPO: its config, its networks and its learner."""
+"""The PPO learner: its config, networks and training loop."""

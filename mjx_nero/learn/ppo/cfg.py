@@ -1,4 +1,4 @@
-"""Hyperparameters of PPO and its networks: plain data, read without Brax, which takes seconds to import."""
+"""Hyperparameters of PPO and of its networks: plain data, readable without Brax, whose import takes seconds."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,24 +14,23 @@ from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
 PRECISIONS = ("default", "bfloat16", "tensorfloat32", "float32", "high", "highest")
 Rate = Annotated[float, Bounds(0.0, 1.0, above=True)]
 
-MINIBATCH = 6144  # env steps of an update on one device: more leave too few updates, fewer a GPU idle
+MINIBATCH = 6144  # env steps per update on one device: more would leave too few updates, fewer would leave a GPU idle
 ACTIVATIONS = ("elu", "swish", "relu", "tanh")
 
 
 @dataclasses.dataclass(frozen=True)
 class NetworkCfg:
-    """Multilayer perceptrons of actor and critic, and the action's distribution.
+    """The multilayer perceptrons of actor and critic, and the action distribution.
 
     Attributes:
-        actor, critic: neurons of the hidden layers.
+        actor, critic: widths of the hidden layers.
         activation: elu, swish, relu or tanh.
-        distribution: ``normal`` has one learnt log-std an action, ``tanh_normal`` squashes actions to +-1.
-        init_std: of a normal distribution, at first.
-        output_scale: of the first weights of the actor's last layer: small, so that it starts near home, whatever it sees.
-        max_observation: bound on normalised observations, of which actions are some, so that nothing feeds itself; 0: none.
-        encoders: which encoder reads which observation term, as pairs of names, in groups whose terms stay apart; the others are
-            ``flat``, as they are.
-        encoder_layers: neurons of the encoder ``mlp``.
+        distribution: ``normal`` learns one log-std per action entry; ``tanh_normal`` squashes actions to +-1.
+        init_std: initial standard deviation of a normal distribution.
+        output_scale: scale of the initial weights in the actor's last layer; small, so that the policy starts near home.
+        max_observation: bound on normalised observations; 0: none. Past actions are observed, and would otherwise feed back.
+        encoders: pairs of observation term and encoder, for groups whose terms stay apart. Other terms use ``flat``.
+        encoder_layers: layer widths of the encoder ``mlp``.
     """
 
     actor: tuple[int, ...] = (256, 128, 64)
@@ -61,18 +60,18 @@ class NetworkCfg:
 
 
 def described(network: Mapping[str, Any]) -> NetworkCfg:
-    """The config of the networks that a policy's file describes. Files of version 0.4 know no bound on observations.
+    """Returns the config of the networks in a policy's file. Files of version 0.4 have no bound on observations.
 
     Raises:
-        UserError: it is none.
+        UserError: the file describes no networks.
     """
     return read(NetworkCfg, {"max_observation": 0.0, **network}, "network")
 
 
 def differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields in which the networks of two files differ, by dotted name, with the values of the first.
+    """Returns the fields in which two files' networks differ, by dotted name, with the first file's values.
 
-    The scale of the first weights matters to none that has weights.
+    ``output_scale`` is ignored: it only matters before there are weights.
     """
     if "network" not in there:  # of an older version
         return {}
@@ -82,31 +81,31 @@ def differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, An
 
 @dataclasses.dataclass(frozen=True)
 class PpoCfg:
-    """Hyperparameters. ``num_envs``, ``num_timesteps`` and ``minibatch_size`` 0: chosen for the machine."""
+    """Hyperparameters. 0 for ``num_envs``, ``num_timesteps`` or ``minibatch_size`` lets the machine decide."""
 
-    num_envs: Annotated[int, Bounds(0, 1 << 24)] = 0  # on all devices together; 0: chosen for the machine
-    num_timesteps: Annotated[int, Bounds(0, 10**15)] = 0  # env steps in all; 0: chosen for the machine
-    unroll_length: Annotated[int, Bounds(1, 10_000)] = 24  # control steps of every environment an iteration
-    num_epochs: Annotated[int, Bounds(1, 1_000)] = 2  # times that an iteration learns from its steps
-    num_minibatches: Annotated[int, Bounds(0, 1 << 20)] = 0  # updates an epoch; 0: a power of two, at least 8, by minibatch_size
-    minibatch_size: Annotated[int, Bounds(0)] = 0  # env steps on all devices together; 0: 6,144 for each that the run starts on
-    learning_rate: Rate = 3e-4  # at first
-    desired_kl: NonNegative = 0.02  # adapts the learning rate; 0 keeps it fixed
-    min_learning_rate: Rate = 1e-5  # the least that it is adapted to
-    max_learning_rate: Rate = 1e-3  # the most; with thousands of environments it runs up to what it may
-    discounting: Share = 0.98  # of a reward, a control step later
-    gae_lambda: Share = 0.95  # of generalised advantage estimation: 1 trusts returns, 0 the critic
-    clipping: Positive = 0.2  # bound on the change of an action's probability, as a share
-    normalize_returns: bool = True  # the critic learns them in units of their running deviation
+    num_envs: Annotated[int, Bounds(0, 1 << 24)] = 0  # environments on all devices together; 0: chosen for the machine
+    num_timesteps: Annotated[int, Bounds(0, 10**15)] = 0  # total env steps; 0: chosen for the machine
+    unroll_length: Annotated[int, Bounds(1, 10_000)] = 24  # control steps per environment and iteration
+    num_epochs: Annotated[int, Bounds(1, 1_000)] = 2  # passes over an iteration's steps
+    num_minibatches: Annotated[int, Bounds(0, 1 << 20)] = 0  # updates per epoch; 0: a power of two, at least 8, by minibatch_size
+    minibatch_size: Annotated[int, Bounds(0)] = 0  # env steps on all devices together; 0: 6,144 per device at the start
+    learning_rate: Rate = 3e-4  # initial learning rate
+    desired_kl: NonNegative = 0.02  # target KL that adapts the learning rate; 0: fixed rate
+    min_learning_rate: Rate = 1e-5  # least adapted learning rate
+    max_learning_rate: Rate = 1e-3  # greatest one; with thousands of environments the rate climbs to this bound
+    discounting: Share = 0.98  # discount of rewards per control step
+    gae_lambda: Share = 0.95  # generalised advantage estimation: 1 trusts returns, 0 trusts the critic
+    clipping: Positive = 0.2  # bound on the relative change of an action's probability
+    normalize_returns: bool = True  # the critic learns returns in units of their running standard deviation
     clip_value: NonNegative = 0.0  # bound on the change of a value estimate; 0: none
-    entropy_cost: NonNegative = 0.01  # weight of the entropy in the loss: keeps the policy exploring
-    change_cost: NonNegative = 0.0  # weight of the squared change of the actions' means from step to step: keeps the policy calm
-    min_std: NonNegative = 0.2  # least deviation of an action, so that exploration does not end before the goal is found; 0: none
-    max_std: NonNegative = 1.0  # most, as noise costs nothing where targets saturate; 0: none
+    entropy_cost: NonNegative = 0.01  # weight of the entropy bonus, which keeps the policy exploring
+    change_cost: NonNegative = 0.0  # weight of the squared change of mean actions from step to step, which keeps the policy calm
+    min_std: NonNegative = 0.2  # least standard deviation of actions, so exploration lasts until the goal is found; 0: none
+    max_std: NonNegative = 1.0  # greatest standard deviation, since noise costs nothing where targets saturate; 0: none
     value_loss: NonNegative = 1.0  # weight of the critic's loss
-    max_grad_norm: Positive = 1.0  # longer gradients are shortened to this
-    reward_scaling: Positive = 1.0  # what the learner multiplies rewards by
-    matmul_precision: str = "tensorfloat32"  # of the networks, on GPUs that have it; the environment's is always full
+    max_grad_norm: Positive = 1.0  # greatest norm of the gradient
+    reward_scaling: Positive = 1.0  # factor of rewards
+    matmul_precision: str = "tensorfloat32"  # matmul precision of the networks on a GPU; the environment's is always full
     network: NetworkCfg = NetworkCfg()
 
     def __post_init__(self):
@@ -120,13 +119,13 @@ class PpoCfg:
 
 
 def fit(cfg: PpoCfg, num_devices: int) -> PpoCfg:
-    """Fills in what the number of devices decides. The result is kept with the run, which learns likewise on any number later."""
+    """Fills in what the number of devices decides. The run keeps the result, so it learns alike on any number later."""
     return dataclasses.replace(cfg, minibatch_size=cfg.minibatch_size or MINIBATCH * num_devices)
 
 
-PRESETS = {  # by the environment's preset
+PRESETS = {  # by preset of the environment
     "default": PpoCfg(),
-    # The Isaac Lab recipe's runner settings (RSL-RL), word for word.
+    # The Isaac Lab recipe's own learner settings (RSL-RL).
     "isaac": PpoCfg(
         num_epochs=5,
         num_minibatches=4,
@@ -144,5 +143,5 @@ PRESETS = {  # by the environment's preset
 
 
 def learner_cfg(cfg: EnvCfg, preset: str) -> PpoCfg:
-    """The hyperparameters that go with a preset, and those that the task asks for."""
+    """Returns the hyperparameters of a preset, with the task's own."""
     return config.override(PRESETS.get(preset, PpoCfg()), cfg.training)

@@ -1,6 +1,6 @@
-"""Encoders, by name: each turns one observation term into features. They read groups whose terms stay apart.
+"""Encoders by name. Each turns one observation term into features, in groups whose terms stay apart.
 
-A policy's file says which encoder reads which term (``NetworkCfg.encoders``), so that a policy is rebuilt as it learnt.
+A policy's file says which encoder reads which term (``NetworkCfg.encoders``), so the policy can be rebuilt as it was trained.
 """
 
 from collections.abc import Callable
@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import jax
 from flax import linen
 
-from mjx_nero.config import values
-from mjx_nero.errors import UserError
+from mjx_nero.config.registry import Registry
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.types import Key
 
@@ -18,21 +17,21 @@ FLAT = "flat"
 
 
 class Encoder(Protocol):
-    """Turns a term, normalised, into features. A Flax module is one."""
+    """Turns a normalised term into features. Any Flax module qualifies."""
 
     def init(self, key: Key, x: jax.Array, /) -> Any:
-        """Fresh variables. ``x``: a term [batch, *shape]."""
+        """Makes new variables. ``x``: a term [batch, *shape]."""
         ...
 
     def apply(self, variables: Any, x: jax.Array, /) -> Any:
-        """Features [..., n] of a term [..., *shape]."""
+        """Computes features [..., n] from a term [..., *shape]."""
         ...
 
 
 class Flat(linen.Module):
-    """The term's own numbers in a row."""
+    """Flattens the term's numbers."""
 
-    axes: int  # of the term
+    axes: int  # number of the term's axes
 
     @linen.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -40,12 +39,12 @@ class Flat(linen.Module):
 
 
 class Mlp(linen.Module):
-    """A multilayer perceptron of the term's numbers, which are put in a row.
+    """Feeds the flattened term through a multilayer perceptron.
 
     Attributes:
-        axes: of the term.
-        layers: neurons.
-        activation: of every layer, the last one's too.
+        axes: number of the term's axes.
+        layers: layer widths.
+        activation: activation of every layer, including the last.
     """
 
     axes: int
@@ -62,29 +61,20 @@ class Mlp(linen.Module):
 
 Make = Callable[[tuple[int, ...], NetworkCfg], Encoder]  # (shape of the term, config of the networks) -> encoder
 
-_ENCODERS: dict[str, Make] = {
-    FLAT: lambda shape, cfg: Flat(len(shape)),
-    "mlp": lambda shape, cfg: Mlp(len(shape), tuple(cfg.encoder_layers), cfg.activation),
-}
-
-
-def register(name: str, make: Make) -> None:
-    """Adds an encoder, which ``NetworkCfg.encoders`` may then name.
-
-    Raises:
-        UserError: there is one of that name.
-    """
-    if name in _ENCODERS:
-        raise UserError(f"there is an encoder {name!r} already: register it under another name")
-    _ENCODERS[name] = make
+# ``NetworkCfg.encoders`` names them.
+ENCODERS: Registry[Make] = Registry(
+    "encoder",
+    {
+        FLAT: lambda shape, cfg: Flat(len(shape)),
+        "mlp": lambda shape, cfg: Mlp(len(shape), tuple(cfg.encoder_layers), cfg.activation),
+    },
+)
 
 
 def make(name: str, shape: tuple[int, ...], cfg: NetworkCfg) -> Encoder:
-    """An encoder by name, for a term of that shape.
+    """Makes an encoder by name, for a term of the given shape.
 
     Raises:
-        UserError: unknown.
+        UserError: there is no such encoder.
     """
-    if name not in _ENCODERS:
-        raise UserError(values.unknown("encoder", name, _ENCODERS))
-    return _ENCODERS[name](shape, cfg)
+    return ENCODERS.find(name)(shape, cfg)

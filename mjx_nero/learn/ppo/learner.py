@@ -1,21 +1,22 @@
-"""PPO from Brax's building blocks: networks, advantages, running statistics and adaptive learning rate, in a loop of our own.
+"""PPO in a loop of our own, built from Brax's networks, advantages, running statistics and adaptive learning rate.
 
-Brax's own ``ppo.train`` keeps optimiser, environments and random keys to itself, so a run cannot be resumed exactly, reports
-no training episodes without a host callback at every step, and in release 0.14.2 calls a function that JAX 0.10 removed.
-This loop hands its whole state to the caller and is compiled ahead of time, so compilation is timed apart.
+Brax's ``ppo.train`` hides its optimiser, environments and random keys, so a run cannot resume exactly. It reports training
+episodes only through a host callback at every step, and release 0.14.2 calls a function that JAX 0.10 removed. This loop hands
+its whole state to the caller, and is compiled ahead of time, so that compilation is timed separately.
 
-The loss is Brax's ``compute_ppo_loss`` but for one thing: advantages are computed once an iteration, as in RSL-RL, not anew in
-each of its minibatches, as their loop over time is slow on a GPU. At the first minibatch both agree (tests/learn/test_ppo.py).
+The loss is Brax's ``compute_ppo_loss`` with one difference: advantages are computed once per iteration, as in RSL-RL, and not
+again in each minibatch, because that loop over time is slow on a GPU. At the first minibatch both agree
+(tests/learn/test_ppo.py).
 
-All of it is in this one file, longer than others, to be read from top to bottom.
+The learner is in one file, longer than others, so that it reads from top to bottom.
 
-Nothing in it depends on a task's scale, or can run away: the critic learns returns in units of their own running deviation, the
-policy's advantages are normalised, its deviations have bounds, and so have normalised observations.
+Nothing depends on a task's scale, or can run away: the critic learns returns in units of their running deviation, advantages are
+normalised, and the policy's deviations and the normalised observations are bounded.
 
-On several devices each has an equal share of the environments, and of every minibatch; everything else is on all of them. Sums
-and means go over all devices, so their number changes only which environments share a minibatch, and the noise of the actions.
-A run that starts on several has minibatches as many times larger (``ppo_cfg.fit``), as half an update does not take half as long,
-and keeps them on whatever it goes on later.
+Each of several devices gets an equal share of the environments and of every minibatch, and a copy of everything else. Sums and
+means run over all devices, so their number changes only which environments share a minibatch, and the noise of the actions. A run
+that starts on several devices uses minibatches larger by that factor (``cfg.fit``), since half an update does not take half the
+time, and keeps them on any number of devices later.
 """
 
 import dataclasses
@@ -57,7 +58,7 @@ _UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action
 
 @struct.dataclass
 class TrainState:
-    """All of a run: saved and loaded as it is, training goes on bit for bit."""
+    """The whole state of a run. Training that resumes from a saved state continues bit for bit."""
 
     normalizer: running_statistics.RunningStatisticsState
     params: losses.PPONetworkParams
@@ -65,7 +66,7 @@ class TrainState:
     env_state: State
     key: Key
     iteration: Int[Array, ""]
-    returns: running_statistics.RunningStatisticsState  # of all returns so far: the critic's unit
+    returns: running_statistics.RunningStatisticsState  # statistics of all returns so far: the critic's unit
 
 
 _HERE: Any = PartitionSpec()
@@ -75,15 +76,15 @@ _SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE)
 
 @struct.dataclass
 class Batch:
-    """What an update learns from. Leaves are [time, env, ...], or any part of that."""
+    """The data of an update. Leaves are [time, env, ...], or any part of that."""
 
     obs: dict[str, jax.Array]
-    raw_action: jax.Array  # before the distribution's squashing, if it has one
+    raw_action: jax.Array  # before any squashing by the distribution
     log_prob: jax.Array
-    distribution: Any  # parameters of the distribution that acted
-    last_mean: jax.Array  # of the distribution a step before; at the start of an episode, of its own
-    value: jax.Array  # as the critic gives it, in units of ``TrainState.returns``
-    returns: jax.Array  # likewise
+    distribution: Any  # parameters of the acting distribution
+    last_mean: jax.Array  # mean of the previous step's distribution; at the start of an episode, this step's
+    value: jax.Array  # the critic's output, in units of ``TrainState.returns``
+    returns: jax.Array  # in the same units
     advantages: jax.Array
 
 
@@ -91,12 +92,12 @@ class Learner:
     """PPO on a batch of environments.
 
     Args:
-        env: from ``wrappers.for_training``.
-        cfg: with ``num_envs`` filled in, the number on all devices together.
-        num_devices: how many of each machine's devices to spread them over.
+        env: batch of environments, from ``wrappers.for_training``.
+        cfg: hyperparameters, with ``num_envs`` filled in for all devices together.
+        num_devices: number of each machine's devices to use.
 
     Raises:
-        UserError: sizes or options that do not go together, or fewer devices than that.
+        UserError: sizes or options conflict, or the machine has fewer devices.
     """
 
     def __init__(self, env: Env, cfg: PpoCfg, num_devices: int = 1):
@@ -105,7 +106,7 @@ class Learner:
             raise UserError(f"num_devices is {num_devices}, but JAX finds {len(here)} here ({here[0].platform})")
         devices = machines.devices(num_devices)
         num_devices = len(devices)
-        cfg = fit(cfg, num_devices)  # as a run's config is already
+        cfg = fit(cfg, num_devices)  # a run's config is fitted already
         cfg = dataclasses.replace(cfg, num_minibatches=cfg.num_minibatches or _minibatches(cfg))
         parts = num_devices * cfg.num_minibatches
         if not cfg.num_envs or cfg.num_envs % parts:
@@ -124,12 +125,12 @@ class Learner:
         self.networks = make_networks(self.sizes, env.action_size, cfg.network)
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
-        # On one vector: by parameter it would be a hundred small kernels for every minibatch.
+        # One flat vector: separate parameters would cost a hundred small kernels per minibatch.
         self._optimizer = optax.flatten(optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam))
         self._make_policy = networks.make_inference_fn(self.networks)
 
     def init(self, key: Key, bank: Bank | None = None) -> TrainState:
-        """Fresh networks and environments, the latter spread over their episodes so that they don't all end at once."""
+        """Makes new networks and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.networks, self.sizes, k_net)
         env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs), bank)
@@ -139,11 +140,11 @@ class Learner:
         opt_state = self._optimizer.init(params)
         returns = running_statistics.init_state(specs.Array((), jnp.dtype("float32")), std_eps=jnp.float32(1e-6))
         state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns)
-        # A weakly typed leaf comes back from ``run`` a strong one, and whatever takes the state would be compiled for both.
+        # ``run`` returns weakly typed leaves as strong ones, so whatever takes the state would be compiled twice.
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
 
     def place(self, state: TrainState) -> TrainState:
-        """The state, or its shapes, where ``run`` takes it: environments spread over the devices, the rest on each of them."""
+        """Spreads the environments over the devices, and copies the rest to each. Takes the state or its shapes."""
         if not self._axis:
             return state
 
@@ -151,24 +152,24 @@ class Learner:
             sharding = NamedSharding(self._mesh, spec)
             if isinstance(jax.tree.leaves(part)[0], jax.ShapeDtypeStruct):
                 return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
-            if machines.several():  # each puts its own part of what all of them have
+            if machines.several():  # each process places its own part
                 return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, np.asarray(x).__getitem__), part)
             return jax.device_put(part, sharding)
 
         return TrainState(*(put(getattr(state, f.name), getattr(_SPECS, f.name)) for f in dataclasses.fields(TrainState)))
 
     def policy(self, state: TrainState) -> tuple:
-        """Normalizer and network parameters as the first device has them, for programs that run there alone."""
+        """Returns normalizer and network parameters from the first device, for programs that run only there."""
         params = state.normalizer, state.params
         return jax.tree.map(lambda x: x.addressable_data(0), params) if self._axis else params
 
     def with_policy(self, state: TrainState, params: tuple) -> TrainState:
-        """A fresh state that starts from a policy."""
+        """Returns a new state that starts from a policy."""
         normalizer, networks = params
         return dataclasses.replace(state, normalizer=normalizer, params=networks)
 
     def slower(self, state: TrainState) -> TrainState:
-        """A tenth of the learning rate, and other draws."""
+        """Returns the state with a tenth of the learning rate, and other random draws."""
         *others, adam = state.opt_state
         rate = adam.hyperparams["learning_rate"]
         adam = adam._replace(
@@ -177,18 +178,18 @@ class Learner:
         return dataclasses.replace(state, opt_state=(*others, adam), key=jax.random.fold_in(state.key, 1))
 
     def act(self, params: tuple, obs: Observation) -> jax.Array:
-        """The mode of the action's distribution."""
+        """Returns the mode of the action distribution."""
         return make_act(self.networks, params)(obs)
 
     def describe(self) -> dict[str, Any]:
-        """The networks, for the policy's file."""
+        """Describes the networks for the policy's file."""
         return {"network": config.to_dict(self.cfg.network)}
 
     def footprint(self) -> tuple[float, float]:
-        """See ``learner.Learner.memory``. The factors were measured on compiled programs (tests/learn/test_device_memory.py).
+        """Estimates the memory of ``run`` (see ``learner.Learner.footprint``). Tests measured the factors on compiled programs.
 
-        A rollout keeps every step's observations and the like; its end takes two layers of the critic for all of them; an update
-        copies a minibatch, and keeps what all of its networks' neurons gave, for the gradient.
+        A rollout keeps every step's observations and other data. Its end evaluates two layers of the critic on all of them. An
+        update copies a minibatch, and keeps all activations for the gradient.
         """
         cfg, env = self.cfg, self.env.unwrapped
         state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
@@ -204,9 +205,10 @@ class Learner:
         return 2.0 * (device_memory.size(state) - own), own / cfg.num_envs + 1.1 * cfg.unroll_length * step + max(rollout, update)
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
-        """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""
+        """Makes ``iterations`` rollouts and updates; metrics are means over them. Jit with static ``iterations``, and donate
+        ``state``."""
         run = functools.partial(self._run, iterations=iterations)
-        if self._axis:  # unchecked: no check sees through the calls of physics that is not a JAX program
+        if self._axis:  # unchecked, because no check sees through calls of physics outside JAX
             run = jax.shard_map(run, mesh=self._mesh, in_specs=(_SPECS,), out_specs=(_SPECS, _HERE), check_vma=False)
         return run(state)
 
@@ -222,7 +224,7 @@ class Learner:
         env_state, batch, sums = self.rollout(state, k_roll)
         with self._networks_precision():
             params, opt_state, metrics = self._update(state, batch, k_update)
-        # After the update: the loss compares with log-probabilities made under the statistics that acted.
+        # Updated last: the loss compares with log-probabilities made under the acting statistics.
         normalizer = running_statistics.update(state.normalizer, batch.obs, pmap_axis_name=self._axis)
         returns = state.returns
         if self.cfg.normalize_returns:  # otherwise they stay what they start as, mean 0 and deviation 1
@@ -236,14 +238,14 @@ class Learner:
         return jax.default_matmul_precision(self.cfg.matmul_precision)
 
     def _mean(self, tree: Tree) -> Tree:
-        """The mean over the devices, in ``run``, of what each has for its equal share."""
+        """Averages over the devices in ``run``, where each has an equal share."""
         return jax.lax.pmean(tree, self._axis) if self._axis else tree
 
     def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
-        """Acts for ``unroll_length`` steps in every environment and computes returns and advantages.
+        """Acts for ``unroll_length`` steps in every environment, and computes returns and advantages.
 
         Returns:
-            the environments, the batch (leaves [time, env, ...]), and sums of the environments' metrics over it.
+            the environments, the batch (leaves [time, env, ...]), and the environments' metrics summed over it.
         """
         cfg = self.cfg
         policy = self._make_policy((state.normalizer, state.params.policy))
@@ -257,13 +259,13 @@ class Learner:
             with self._networks_precision():
                 action, extras = policy(env_state.obs, key)
             after = self.env.step(env_state, action, following)
-            totals = jax.tree.map(jnp.add, totals, figures(after))  # by environment: a sum over them at every step costs more
+            totals = jax.tree.map(jnp.add, totals, figures(after))  # per environment: summing over them at every step costs more
             return (after, totals), (env_state.obs, extras, after.reward, after.done, after.info["truncation"])
 
         keys = jax.random.split(key, cfg.unroll_length)
         start = state.env_state, jax.tree.map(jnp.zeros_like, figures(state.env_state))
         (env_state, totals), (obs, extras, reward, done, truncation) = jax.lax.scan(act, start, keys)
-        # All steps' values at once: a few large products in place of many small ones.
+        # All steps at once: a few large products instead of many small ones.
         with self._networks_precision():
             value, last = (
                 self.networks.value_network.apply(state.normalizer, state.params.value, o) for o in (obs, env_state.obs)
@@ -287,7 +289,7 @@ class Learner:
     def loss(
         self, params: losses.PPONetworkParams, normalizer: running_statistics.RunningStatisticsState, batch: Batch, key: Key
     ) -> tuple[Float[Array, ""], Metrics]:
-        """Clipped surrogate, clipped value loss and entropy bonus. Schulman et al. 2017; the value's clipping as in RSL-RL."""
+        """Computes the clipped surrogate, value loss and entropy bonus. Schulman et al. 2017; value clipping as in RSL-RL."""
         cfg, nets = self.cfg, self.networks
         dist = nets.parametric_action_distribution
         logits = nets.policy_network.apply(normalizer, params.policy, batch.obs)
@@ -320,7 +322,7 @@ class Learner:
         def minibatch(carry, envs_and_key):
             params, opt_state = carry
             envs, key = envs_and_key
-            part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat: faster products on a CPU
+            part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat, for faster products on a CPU
             grads, metrics = self._mean(jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key))
             if cfg.desired_kl:
                 opt_state, _ = optimizer.adaptive_kl_learning_rate(
@@ -341,19 +343,19 @@ class Learner:
 
 
 def _minibatches(cfg: PpoCfg) -> int:
-    """How many minibatches an epoch has by ``minibatch_size``."""
+    """Number of minibatches per epoch that follows from ``minibatch_size``."""
     wanted = cfg.num_envs * cfg.unroll_length // cfg.minibatch_size
     return max(8, 1 << wanted.bit_length() - 1 if wanted else 0)
 
 
 def _before(mean: Float[Array, "time env na"], done: Float[Array, "time env"]) -> Float[Array, "time env na"]:
-    """The mean of a step before; where there is none, as an episode or the rollout starts, its own."""
+    """Returns the mean of the previous step; at the start of an episode or rollout, the step's own."""
     starts = jnp.concatenate([jnp.ones_like(done[:1]), done[:-1]])
     return jnp.where(starts[..., None] > 0, mean, jnp.concatenate([mean[:1], mean[:-1]]))
 
 
 def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any]:
-    """The policy's parameters with its learnt deviations within bounds (0: none); ``tanh_normal`` has no such parameters."""
+    """Bounds the policy's learnt deviations (0: no bound). ``tanh_normal`` has none to bound."""
     layers, name = policy["params"], "std_logparam"
     if name not in layers:
         return policy

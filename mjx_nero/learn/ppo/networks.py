@@ -1,4 +1,4 @@
-"""PPO's networks: made by a config, rebuilt from what a policy's file says of them."""
+"""PPO's networks: made from a config, and rebuilt from the description in a policy's file."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -20,10 +20,10 @@ from mjx_nero.learn.ppo import encoders
 from mjx_nero.learn.ppo.cfg import NetworkCfg, described
 from mjx_nero.types import Key
 
-Sizes = Mapping[str, Any]  # shapes, an array a group; of a group whose terms stay apart, a dict of them
-Normalize = Callable[[Any, Any], Any]  # (observations, statistics; None: they are normalised) -> normalised observations
+Sizes = Mapping[str, Any]  # shape of each group; a dict of shapes for a group whose terms stay apart
+Normalize = Callable[[Any, Any], Any]  # (observations, statistics; None: already normalised) -> normalised observations
 
-ACTOR, CRITIC = "state", "privileged_state"  # the groups that they read; without the second the critic reads the first
+ACTOR, CRITIC = "state", "privileged_state"  # the groups that they read; without the second, the critic reads the first
 
 
 def _is_shape(node: Any) -> bool:
@@ -31,17 +31,19 @@ def _is_shape(node: Any) -> bool:
 
 
 def shapes(sizes: Any) -> list[tuple[int, ...]]:
-    """The shapes in ``Sizes``, or in a part of it: of all observations, also of groups whose terms stay apart."""
+    """Lists the shapes in ``Sizes`` or a part of it, including those of terms that stay apart."""
     return jax.tree.leaves(sizes, is_leaf=_is_shape)
 
 
 def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.PPONetworks:
-    """Brax's PPO networks; the critic reads ``privileged_state`` where the environment has that group.
+    """Makes Brax's PPO networks. The critic reads ``privileged_state`` if the environment has that group.
+
+    In a group whose terms stay apart, an encoder reads each term, and their features are concatenated.
 
     A group whose terms stay apart is read through an encoder for each term, whose features stand side by side.
 
     Raises:
-        UserError: an encoder is unknown, or is for a term that no network reads apart.
+        UserError: an encoder is unknown, or names a term that no network reads apart.
     """
     critic = CRITIC if CRITIC in sizes else ACTOR
     apart = {group: _encoders(sizes[group], cfg) for group in (ACTOR, critic) if isinstance(sizes[group], Mapping)}
@@ -49,7 +51,7 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
     if unknown := [term for term, _ in cfg.encoders if term not in known]:
         raise UserError(
             f"network.encoders names {', '.join(unknown)}, and terms that stay apart are: {', '.join(known) or 'none'}; "
-            "an encoder reads a term of a group whose terms are not concatenated"
+            "an encoder can only read a term of a group that is not concatenated"
         )
     bounded = functools.partial(running_statistics.normalize, max_abs_value=cfg.max_observation or None)
 
@@ -67,7 +69,7 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
         distribution_type=cfg.distribution,
         noise_std_type="log",
         init_noise_std=cfg.init_std,
-        mean_kernel_init_fn=jax.nn.initializers.variance_scaling,  # LeCun's uniform one, as in the other layers, times a factor
+        mean_kernel_init_fn=jax.nn.initializers.variance_scaling,  # LeCun's uniform, as in the other layers, times a factor
         mean_kernel_init_kwargs={"scale": cfg.output_scale**2, "mode": "fan_in", "distribution": "uniform"},
     )
     through = functools.partial(_encoded, apart=apart, sizes=sizes, normalize=normalize)
@@ -75,13 +77,13 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
 
 
 def _encoders(size: Mapping[str, Any], cfg: NetworkCfg) -> dict[str, encoders.Encoder]:
-    """One for each term of a group, in the order of their names: what goes through a tree of JAX keeps no other."""
+    """Makes one encoder per term of a group, sorted by name, because JAX trees keep no other order."""
     chosen = dict(cfg.encoders)
     return {term: encoders.make(chosen.get(term, encoders.FLAT), tuple(size[term]), cfg) for term in sorted(size)}
 
 
 def _width(group: Mapping[str, encoders.Encoder], size: Mapping[str, Any]) -> int:
-    """How many features the terms of a group have."""
+    """Number of features of a group's terms."""
 
     def features():
         terms = {name: jnp.zeros((1, *size[name])) for name in group}
@@ -98,7 +100,7 @@ def _encoded(
     sizes: Sizes,
     normalize: Normalize,
 ) -> feed_forward.FeedForwardNetwork:
-    """The network, behind the encoders of the group that it reads; itself where the group is one vector."""
+    """Puts the encoders of a group before the network that reads it; returns the network itself if the group is one vector."""
     if group not in apart:
         return network
     own = apart[group]
@@ -120,9 +122,9 @@ def _encoded(
 
 
 def init_params(nets: networks.PPONetworks, sizes: Sizes, key: Key) -> tuple:
-    """Fresh (normalizer, network parameters)."""
+    """Makes new (normalizer, network parameters)."""
     k_actor, k_critic = jax.random.split(key)
-    # The floor keeps a constant observation, whose deviation is 0, from being divided by nothing.
+    # The floor avoids dividing by the zero deviation of a constant observation.
     normalizer = running_statistics.init_state(
         jax.tree.map(lambda size: specs.Array(size, jnp.dtype("float32")), dict(sizes), is_leaf=_is_shape)
     )
@@ -132,14 +134,14 @@ def init_params(nets: networks.PPONetworks, sizes: Sizes, key: Key) -> tuple:
 
 
 def make_act(nets: networks.PPONetworks, params: tuple) -> Callable[[Observation], jax.Array]:
-    """The deterministic policy: the mode of the action's distribution."""
+    """Makes the deterministic policy, which returns the mode of the action distribution."""
     normalizer, net_params = params
     policy = networks.make_inference_fn(nets)((normalizer, net_params.policy), deterministic=True)
     return lambda obs: policy(obs, None)[0]
 
 
 def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
-    """The networks that a policy file describes: a template of their parameters, and how they act."""
+    """Rebuilds the networks that a policy file describes: a template of their parameters, and their act function."""
     sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=_is_shape)
     nets = make_networks(sizes, meta["action_size"], described(meta["network"]))
     template = jax.eval_shape(functools.partial(init_params, nets, sizes), jax.random.PRNGKey(0))

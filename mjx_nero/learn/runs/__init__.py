@@ -1,1 +1,1 @@
-"""What a training run is, its loop, and everything that it leaves in its folder."""
+"""Training runs: their config, their loop, and everything that they leave in their folder."""

@@ -1,4 +1,4 @@
-"""What a run is: its environment, its learner and how long it goes on."""
+"""The config of a run: its environment, its learner and its length."""
 
 import dataclasses
 import pathlib
@@ -19,7 +19,7 @@ OnNan = Annotated[str, OneOf("stop", "rewind")]
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What the user named beside environment, preset and learner: what a run's config is made from once more."""
+    """The user's choices besides environment, preset and learner, from which the run's config can be rebuilt."""
 
     robot: str | None = None
     env: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields by dotted name
@@ -28,40 +28,41 @@ class Asked:
 
 @dataclasses.dataclass(frozen=True)
 class RunCfg:
-    """One run of train.py. Flags are made of it. Where a run goes on, what is ``free`` may change, what is ``kept`` may not."""
+    """One training run; the flags of train.py are made from it. A resumed run may change ``free`` fields, but not ``kept``
+    ones."""
 
     env_name: str
     preset: str
     env: Any  # EnvCfg
-    hyperparameters: Any  # of the learner: its config
-    learner: str = flag("ppo")  # who learns
+    hyperparameters: Any  # the learner's config
+    learner: str = flag("ppo")  # name of the learner
     asked: Asked = Asked()
     impl: str = flag("auto", free=True)
     seed: Seed = flag(0, kept=True)
     out: pathlib.Path | None = flag(None)  # run folder (default: runs/<env>_<time>)
-    restore: pathlib.Path | None = flag(None)  # run folder or checkpoint to go on from, or a policy to start from
-    eval_every: Whole = flag(0, free=True)  # env steps between evaluations; 0: 12 a run
-    checkpoint_every: Whole = flag(0, free=True)  # env steps between checkpoints; 0: 5 a run
+    restore: pathlib.Path | None = flag(None)  # run folder or checkpoint to resume, or a policy to start from
+    eval_every: Whole = flag(0, free=True)  # env steps between evaluations; 0: 12 per run
+    checkpoint_every: Whole = flag(0, free=True)  # env steps between checkpoints; 0: 5 per run
     eval_episodes: Annotated[int, Bounds(1, 100_000)] = dataclasses.field(default=256, metadata={"kept": True})
-    checkpoint_minutes: NonNegative = flag(10.0, free=True)  # the most minutes between checkpoints; 0: env steps alone decide
-    keep: Count = flag(3, free=True)  # checkpoints to keep beside the best
-    on_nan: OnNan = flag("stop", free=True)  # when training diverges: stop, or rewind once and go on slower
-    auto: bool = False  # go on if ``out`` holds a checkpoint, start if not
-    max_minutes: NonNegative = flag(0.0, free=True)  # stop after so many minutes of training, compilation apart; 0: no limit
+    checkpoint_minutes: NonNegative = flag(10.0, free=True)  # greatest time between checkpoints [min]; 0: only env steps decide
+    keep: Count = flag(3, free=True)  # checkpoints to keep besides the best
+    on_nan: OnNan = flag("stop", free=True)  # when training diverges: stop, or rewind once and learn more slowly
+    auto: bool = False  # resume if ``out`` holds a checkpoint, else start
+    max_minutes: NonNegative = flag(0.0, free=True)  # training time before the run stops, without compilation [min]; 0: no limit
     num_devices: Annotated[int, Bounds(1, 4096)] = flag(1, free=True)  # GPUs to spread the environments over
-    track: Annotated[str, OneOf("", "wandb")] = flag("")  # also tell this service how it goes (the extra track)
+    track: Annotated[str, OneOf("", "wandb")] = flag("")  # service to report metrics to as well (needs the extra track)
 
     def __post_init__(self):
         bounds.check(self)
 
     @property
     def num_envs(self) -> int:
-        """On all devices together."""
+        """Number of environments on all devices together."""
         return self.hyperparameters.num_envs
 
     @property
     def num_timesteps(self) -> int:
-        """Env steps in all."""
+        """Total env steps."""
         return self.hyperparameters.num_timesteps
 
 
@@ -74,13 +75,13 @@ def resolve(
     learner: str = "ppo",
     **rest: Any,
 ) -> RunCfg:
-    """A run's config from names and dotted fields.
+    """Builds a run's config from names and dotted fields.
 
     Args:
-        robot: another than the environment's own, by name or folder.
+        robot: robot in place of the environment's own, by name or folder.
 
     Raises:
-        UserError: unknown names or fields, wrong types.
+        UserError: a name or field is unknown, or a value has the wrong type.
     """
     cfg = registry.env_cfg(env, preset, robot, **env_fields)
     hyperparameters = config.override(learner_cfg(cfg, preset, learner), learner_fields)
@@ -89,15 +90,15 @@ def resolve(
 
 
 def learner_cfg(cfg: EnvCfg, preset: str, name: str = "ppo") -> Any:
-    """The hyperparameters that go with a preset, and those that the task asks for."""
+    """Returns the hyperparameters of a preset, with the task's own."""
     return learner.cfg_for(name, preset, cfg.training)
 
 
 def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
-    """Fills in what the machine decides: number of environments, env steps, time limit, and whatever the learner fits to devices.
+    """Fills in what the machine decides: number of environments, env steps, time limit, and what the learner adapts to devices.
 
     Returns:
-        the run, and a line that says so where there is no GPU.
+        the run, and a note for the user if there is no GPU.
     """
     on_cpu, budget = jax.default_backend() == "cpu", run.env.budget
     enough = budget.steps_on_cpu if on_cpu else budget.steps

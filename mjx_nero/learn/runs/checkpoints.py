@@ -1,4 +1,4 @@
-"""The checkpoints of a run: written beside the training, the newest few and the best of them kept."""
+"""The checkpoints of a run, written during training. The newest few and the best one are kept."""
 
 import concurrent.futures
 import contextlib
@@ -10,19 +10,19 @@ from mjx_nero import files
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint
 
-_NAME = re.compile(r"\d{12}\.safetensors")  # env steps
+_NAME = re.compile(r"\d{12}\.safetensors")  # the number of env steps
 FOLDER, POLICY, BEST = "checkpoints", "policy.safetensors", "best.safetensors"
 
 
 class NotWritten(UserError):
-    """A checkpoint or policy that could not be written: training without them would be for nothing."""
+    """A checkpoint or policy could not be written. Training must stop, or its result would be lost."""
 
 
 def saved(run_folder: pathlib.Path) -> list[pathlib.Path]:
-    """Checkpoints of a run, the newest first. What the run has not named so itself is somebody else's, and left alone.
+    """Lists a run's checkpoints, newest first. Files that the run did not name itself are ignored.
 
     Raises:
-        UserError: a link stands in their place.
+        UserError: one of them is a link.
     """
     folder = files.inside(run_folder, FOLDER)
     names = sorted((path.name for path in folder.glob("*.safetensors") if _NAME.fullmatch(path.name)), reverse=True)
@@ -30,12 +30,12 @@ def saved(run_folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 class Checkpoints:
-    """Writes a run's checkpoints and policies in a thread of its own, one after another.
+    """Writes a run's checkpoints and policies, one after another, in a thread of its own.
 
     Args:
-        run_folder: gets ``checkpoints/<steps>.safetensors``, ``policy.safetensors`` and ``best.safetensors``.
-        keep: how many of the newest stay; the best does beside them.
-        active: False writes nothing, in a process that is not the first, but helps to put the copies together.
+        run_folder: folder for ``checkpoints/<steps>.safetensors``, ``policy.safetensors`` and ``best.safetensors``.
+        keep: number of newest checkpoints to keep, besides the best.
+        active: False in processes that are not the first: they help to assemble the copies, but write nothing.
     """
 
     def __init__(self, run_folder: pathlib.Path, keep: int, active: bool = True):
@@ -44,14 +44,14 @@ class Checkpoints:
         self._writing: concurrent.futures.Future[None] | None = None
 
     def save(self, state: Any, policy: Any, meta: dict[str, Any], steps: int, best: int) -> None:
-        """Hands a state and its policy over; they are copied, so the caller may go on with them.
+        """Copies a state and its policy, and queues them for writing. The caller may reuse both at once.
 
         Args:
-            meta: of the policy's file (``policy.describe``).
-            best: env steps of the best checkpoint so far, perhaps these.
+            meta: description for the policy's file (``policy.describe``).
+            best: env steps of the best checkpoint so far, which may be this one.
 
         Raises:
-            NotWritten: the one before.
+            NotWritten: the previous checkpoint could not be written.
         """
         copies = checkpoint.fetch((state, policy))
         self.wait()
@@ -60,10 +60,10 @@ class Checkpoints:
         self._writing = self._thread.submit(self._write, *copies, meta, steps, best)
 
     def wait(self) -> None:
-        """Until all that was handed over is on the disk.
+        """Waits until everything queued is on the disk.
 
         Raises:
-            NotWritten: it is not.
+            NotWritten: it could not be written.
         """
         if self._writing is not None:
             writing, self._writing = self._writing, None
@@ -78,7 +78,7 @@ class Checkpoints:
             checkpoint.save(self._folder / FOLDER / f"{steps:012d}.safetensors", state, {**meta, "kind": "checkpoint"})
             self._write_policy(policy, meta, steps == best)
         except UserError as error:
-            with contextlib.suppress(UserError):  # it is smaller, and may find room yet
+            with contextlib.suppress(UserError):  # the policy is smaller, and may still fit
                 self._write_policy(policy, meta, False)
             raise NotWritten(str(error)) from None
         for path in saved(self._folder)[self._keep :]:

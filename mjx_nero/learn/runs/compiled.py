@@ -1,4 +1,4 @@
-"""A run's programs, compiled side by side: so many iterations of its learner, and the judge of its policy."""
+"""A run's programs, compiled side by side: training iterations, and the evaluation of the policy."""
 
 import concurrent.futures
 import contextlib
@@ -21,13 +21,13 @@ from mjx_nero.learn.runs.cfg import RunCfg
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
-    """What a run steps, ready to run.
+    """A run's compiled programs and first state.
 
     Attributes:
-        advance: ``chunk`` iterations; takes the state for its own.
-        state: what it starts from.
-        evaluate: judges the policy of a state.
-        seconds: that all this took.
+        advance: makes ``chunk`` iterations; consumes the state.
+        state: the state to start from.
+        evaluate: evaluates the policy of a state.
+        seconds: time that compilation took [s].
     """
 
     learner: Learner
@@ -39,12 +39,13 @@ class Compiled:
 
     @property
     def steps(self) -> int:
-        """Env steps of ``advance``."""
+        """Env steps of one ``advance``."""
         return self.chunk * self.learner.steps_per_iteration
 
 
 class Evaluator:
-    """Deterministic policy, no observation noise, episodes that training never saw; in MuJoCo's C library unless on Warp."""
+    """Evaluates the deterministic policy without observation noise, in unseen episodes. Uses MuJoCo's C library, or Warp if
+    training does."""
 
     def __init__(self, run: RunCfg, learner: Learner):
         impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
@@ -53,13 +54,13 @@ class Evaluator:
         self._runner = rollout.runner(env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
 
     def of_seed(self, seed: int) -> "Evaluator":
-        """The same program, on another seed's episodes."""
+        """Returns the same program with another seed's episodes."""
         other = copy.copy(self)
         other._seed = seed
         return other
 
     def compiler(self, state: Any) -> Callable[[], None]:
-        """See ``rollout.Runner.compiler``."""
+        """Returns a call that compiles the program: see ``rollout.Runner.compiler``."""
         return self._runner.compiler(self._policy(state))
 
     def __call__(self, state: Any) -> dict[str, Any]:
@@ -67,29 +68,29 @@ class Evaluator:
 
 
 def make_learner(run: RunCfg) -> Learner:
-    """The learner of a run and its environments.
+    """Makes a run's environments and learner.
 
     Raises:
-        UserError: the number of environments or devices does not suit it.
+        UserError: the number of environments or devices does not suit the learner.
     """
     env = ManipulationEnv(run.env, impl=run.impl, num_envs=run.num_envs)
     return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
 
 
 def fresh(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
-    """Makes a new run's state of a seed, by one program, with the bank of that seed."""
+    """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank."""
     init = jax.jit(learner.init)
 
     def start(seed: int) -> Any:
         found = bank(seed)
-        given = () if found is None else (found,)  # not every learner has a use for it
+        given = () if found is None else (found,)  # not every learner takes a bank
         return init(jax.random.PRNGKey(seed), *given)
 
     return start
 
 
 def starter(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
-    """``fresh``, and the state where ``learner.run`` takes it."""
+    """Returns ``fresh``, with the state placed for ``learner.run``."""
     start = fresh(learner, bank)
     return lambda seed: learner.place(start(seed))
 
@@ -98,14 +99,14 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
     """Compiles a run's programs, and makes its first state meanwhile.
 
     Args:
-        chunk: iterations of a call.
-        start: makes the first state, placed.
+        chunk: iterations per call.
+        start: makes the first state, placed on the devices.
 
     Raises:
-        UserError: it does not fit into memory.
+        UserError: the run does not fit into memory.
     """
     begun, env = time.perf_counter(), learner.env.unwrapped
-    with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers work without Python's lock
+    with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
         waiting = [side_by_side.submit(env.physics.prepare, run.num_envs // learner.num_devices, run.num_devices)]
         starting = side_by_side.submit(start)
         shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
@@ -123,7 +124,7 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
 
 @contextlib.contextmanager
 def _threads():
-    """An executor that does not keep an error or Ctrl-C waiting for the others' ends."""
+    """Opens an executor that lets errors and Ctrl-C through without waiting for its threads."""
     pool = concurrent.futures.ThreadPoolExecutor()
     try:
         yield pool

@@ -1,4 +1,4 @@
-"""Where a run writes: a folder of its own, with one owner."""
+"""The folder of a run, which one process owns at a time."""
 
 import contextlib
 import fcntl
@@ -24,24 +24,22 @@ CONFIG, SUMMARY = "config.json", "summary.json"
 _LOCK = ".lock"
 _WRITTEN = (METRICS, "seeds.json", "policy.safetensors", "best.safetensors", "curve.png", "video.mp4")
 _FOLDERS = ("checkpoints", "tensorboard", "wandb")
-_RELINKED = re.compile(r"wandb/(latest-run|debug[\w-]*\.log)")  # links that wandb itself makes anew at every start
+_RELINKED = re.compile(r"wandb/(latest-run|debug[\w-]*\.log)")  # links that wandb itself renews at every start
 _RUNS = pathlib.Path("runs")
 
 
 @contextlib.contextmanager
 def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathlib.Path]:
-    """The folder of a run, this process's alone until the end.
+    """Claims the folder of a run for this process until the context ends.
 
-    If nothing has been written there by then, a folder made here goes again.
+    A folder made here is removed if it is still empty then. Processes other than the first claim nothing, and get the same path.
 
     Args:
-        path: None makes a new one: ``runs/<name>_<time>``.
-        goes_on: it may hold a run.
-
-    A process that is not the first of several owns nothing, and gets the same path.
+        path: the folder; None: a new one, ``runs/<name>_<time>``.
+        goes_on: the folder may hold a run already.
 
     Raises:
-        UserError: the folder holds a run, belongs to a process that runs, or cannot be written.
+        UserError: the folder holds a run, belongs to a running process, or cannot be written.
     """
     if not machines.first():
         yield path or _RUNS / name
@@ -57,7 +55,7 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
         raise UserError(f"cannot write to {path or 'runs'}: {error.strerror or error}; pass another --out") from None
     try:
         if (path / CONFIG).exists() and not goes_on:
-            raise UserError(f"{path} already holds a run: pass another --out, or --restore {path} to go on with it")
+            raise UserError(f"{path} already holds a run: pass another --out, or --restore {path} to resume it")
         _tidy(path)
         files.own(path / METRICS)
         yield path
@@ -66,17 +64,17 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
             (path / _LOCK).unlink()
         os.close(lock)
         if made and not (path / CONFIG).exists():
-            with contextlib.suppress(OSError):  # it holds something
+            with contextlib.suppress(OSError):  # the folder is not empty
                 path.rmdir()
                 if path.parent == _RUNS:
                     path.parent.rmdir()
 
 
 def check(folder: pathlib.Path) -> None:
-    """Nothing that a run reads or writes in its folder leads out of it: a stranger may have made the folder.
+    """Checks that nothing a run reads or writes leads out of its folder, which a stranger may have made.
 
     Raises:
-        UserError: a link, a pipe or a device stands in place of one of a run's files or folders.
+        UserError: one of the run's files or folders is a link, a pipe or a device.
     """
     for name in (_LOCK, CONFIG, SUMMARY, *_WRITTEN):
         files.inside(folder, name)
@@ -90,16 +88,16 @@ def check(folder: pathlib.Path) -> None:
 
 
 def begin(path: pathlib.Path, run: dict[str, Any]) -> None:
-    """Writes the resolved config.
+    """Writes the run's resolved config.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     files.write_json(path / CONFIG, {**run, "versions": versions()})
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides a result, and the device."""
+    """Versions of everything that affects a result, and the device."""
     names = ("mjx-nero", "mujoco", "mujoco-mjx", "jax", "brax", "flax", "optax", "warp-lang")
     found = {}
     for name in names:
@@ -109,7 +107,7 @@ def versions() -> dict[str, str]:
 
 
 def _new(name: str) -> pathlib.Path:
-    """A folder that was not there, however many processes look for one at the same moment."""
+    """Makes a new folder, even if many processes look for one at the same moment."""
     stamp = time.strftime("%Y%m%d_%H%M%S")
     _RUNS.mkdir(exist_ok=True)
     for i in itertools.count(1):
@@ -121,7 +119,7 @@ def _new(name: str) -> pathlib.Path:
 
 
 def _lock(folder: pathlib.Path) -> int:
-    """A file that the system keeps locked for as long as this process lives."""
+    """Opens a file that the system keeps locked while this process lives."""
     path = folder / _LOCK
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
@@ -134,11 +132,11 @@ def _lock(folder: pathlib.Path) -> int:
                 f"{folder} is in use by {owner or 'another process'}: wait for its end, or pass another --out"
             ) from None
         except OSError:
-            return handle  # a file system without locks
+            return handle  # the file system has no locks
         with contextlib.suppress(FileNotFoundError):
-            if os.fstat(handle).st_nlink > 1:  # somebody's file that has this name, too
+            if os.fstat(handle).st_nlink > 1:  # a hard link to someone else's file
                 path.unlink()
-            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # else its owner took it away just before we had it
+            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # otherwise its owner removed it just before we locked it
                 os.truncate(handle, 0)
                 os.write(handle, f"process {os.getpid()} on {os.uname().nodename}\n".encode())
                 return handle
@@ -146,7 +144,7 @@ def _lock(folder: pathlib.Path) -> int:
 
 
 def _tidy(folder: pathlib.Path) -> None:
-    """Removes what a killed run had not finished writing."""
+    """Removes half-written files of a killed run."""
     for part in [*folder.glob(f".*{files.PART}*"), *folder.glob(f"checkpoints/.*{files.PART}*")]:
         with contextlib.suppress(OSError):
             shutil.rmtree(part) if part.is_dir() else part.unlink()

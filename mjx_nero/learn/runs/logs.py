@@ -1,4 +1,4 @@
-"""What a run notes as it goes. Logs are expendable: where they cannot be written, training goes on without them."""
+"""The logs of a run. They are expendable: if one cannot be written, training continues without it."""
 
 import contextlib
 import json
@@ -16,25 +16,28 @@ Row = dict[str, Any]
 
 
 class Tracker(Protocol):
-    """Who else is told; any error of its costs what is lost, not the run."""
+    """A service that also receives metrics. Its errors lose data, but never stop the run."""
 
     def write(self, row: Row) -> None:
-        """A row of metrics."""
+        """Takes a row of metrics."""
 
     def close(self) -> None:
-        """The last is written."""
+        """Ends the log after the last row."""
 
 
 class Logs:
-    """``metrics.jsonl``, TensorBoard's files, and what a tracker makes of them.
+    """Writes ``metrics.jsonl`` and TensorBoard's files, and feeds a tracker.
+
+    Everything runs in the caller's thread. TensorBoard's usual writer has a thread that dies when the disk is full, and then
+    blocks its callers forever.
 
     Everything is written by the caller's own thread: TensorBoard's usual writer has one that dies with a full disk, and whoever
     then hands it a number waits for ever.
 
     Args:
-        warn: gets a line the first time that something is lost.
-        active: False writes nothing, in a process that is not the first.
-        tracker: made at the first row.
+        warn: called with a line when something is lost for the first time.
+        active: False in processes that are not the first, which write nothing.
+        tracker: makes the tracker, at the first row.
     """
 
     def __init__(
@@ -44,14 +47,14 @@ class Logs:
         active: bool = True,
         tracker: Callable[[], Tracker] | None = None,
     ):
-        self.lost: dict[str, int] = {}  # how many rows or pictures, by file
+        self.lost: dict[str, int] = {}  # lost rows or pictures, by file
         self._folder, self._warn, self._active = folder, warn, active
         self._events: Any = None
         self._make_tracker = tracker
         self._tracker: Tracker | None = None
 
     def write(self, row: Row) -> None:
-        """A row of metrics; ``steps`` is its place."""
+        """Writes a row of metrics, placed by its ``steps``."""
         if not self._active:
             return
         row = files.finite(row)
@@ -60,7 +63,7 @@ class Logs:
         with self._expendable("tensorboard"):
             self._write_events(row)
         if self._make_tracker is not None:
-            make, self._make_tracker = self._make_tracker, None  # tried once: it may wait for a network
+            make, self._make_tracker = self._make_tracker, None  # tried once, because it may wait for a network
             with self._expendable("track", (Exception,)):
                 self._tracker = make()
         if self._tracker is not None:
@@ -68,7 +71,7 @@ class Logs:
                 self._tracker.write(row)
 
     def close(self) -> None:
-        """Draws the learning curve of all rows."""
+        """Closes the logs, and draws the learning curve of all rows."""
         if not self._active:
             return
         with self._expendable("tensorboard"):
@@ -92,7 +95,7 @@ class Logs:
             folder = self._folder / "tensorboard"
             folder.mkdir(parents=True, exist_ok=True)
             self._events = EventsWriter(str(folder / "events"))
-            # What an earlier process noted after this step is not to be shown.
+            # Hides what an earlier process logged after this step.
             start = Event(wall_time=time.time(), step=int(row["steps"]), session_log=SessionLog(status=SessionLog.START))
             self._events.write_event(start)
         for name, value in row.items():
@@ -107,18 +110,18 @@ class Logs:
         except kinds as error:
             if not self.lost:
                 reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-                self._warn(f"warning: cannot write {name} in {self._folder} ({reason}): training goes on without what is lost")
+                self._warn(f"warning: cannot write {name} in {self._folder} ({reason}): training continues without it")
             self.lost[name] = self.lost.get(name, 0) + 1
 
 
 def read(path: pathlib.Path) -> list[Row]:
-    """The rows of a run. One that went back to a checkpoint made some steps twice: of those the later rows count."""
+    """Reads the rows of a run. A rewound run logged some steps twice; the later rows count."""
     rows: list[Row] = []
     if not path.is_file():
         return rows
     for text in files.read_bytes(path, MAX_METRICS).splitlines():
         row = _row(text)
-        if row:  # else a line that a killed run left half-written
+        if row:  # None: a half-written line of a killed run
             while rows and rows[-1]["steps"] >= row["steps"]:
                 rows.pop()
             rows.append(row)
@@ -126,7 +129,7 @@ def read(path: pathlib.Path) -> list[Row]:
 
 
 def _row(text: bytes) -> Row | None:
-    """A row of metrics by name; None: it is none."""
+    """Parses a row of metrics by name; None if the line is not one."""
     try:
         row = files.parse_json(text)
     except (ValueError, RecursionError):
@@ -136,7 +139,7 @@ def _row(text: bytes) -> Row | None:
 
 
 def _append(path: pathlib.Path, text: str) -> None:
-    """Adds a line, on a line of its own even where the last was never finished."""
+    """Appends a line, and first ends an unfinished last line."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab+") as file:
         if file.tell():
@@ -146,7 +149,7 @@ def _append(path: pathlib.Path, text: str) -> None:
 
 
 def plot_curve(rows: list[Row], path: pathlib.Path) -> None:
-    """Success, return and every reward term over env steps."""
+    """Plots success, return and every reward term over env steps."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.8), layout="constrained")
@@ -169,6 +172,6 @@ def plot_curve(rows: list[Row], path: pathlib.Path) -> None:
         axes.locator_params(axis="x", nbins=6)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7, loc="upper left")  # the best place takes seconds to find
+            axes.legend(fontsize=7, loc="upper left")  # matplotlib takes seconds to find the best place
     success.set_ylim(-0.02, 1.02)
     figure.savefig(path, dpi=110)

@@ -1,4 +1,4 @@
-"""The training loop between compilation and the final files."""
+"""The training loop, from compiled programs to the last checkpoint."""
 
 import dataclasses
 import math
@@ -17,15 +17,15 @@ from mjx_nero.learn.runs.logs import Logs
 from mjx_nero.learn.runs.signals import Stop
 from mjx_nero.types import LEVEL
 
-_ROWS = 2000  # of metrics in a run, evaluations apart
+_ROWS = 2000  # rows of metrics per run, besides evaluations
 
 
 @dataclasses.dataclass
 class Tally:
-    """What a run counts; it goes on where the run does."""
+    """The counts of a run, which continue when it resumes."""
 
     steps: int = 0  # env steps
-    wall_s: float = 0.0  # of training and evaluations
+    wall_s: float = 0.0  # time of training and evaluations
     steps_per_s: float = 0.0
     nan_count: int = 0
     overflow_count: int = 0
@@ -35,10 +35,10 @@ class Tally:
     best_return: float = -1e30  # JSON has no infinity
     best_steps: int = 0
     rewound_at: int | None = None  # env steps
-    evaluation: dict[str, Any] = dataclasses.field(default_factory=dict)  # the last
+    evaluation: dict[str, Any] = dataclasses.field(default_factory=dict)  # the latest evaluation
 
     def evaluated(self, result: dict[str, Any]) -> bool:
-        """Notes an evaluation; true if it is the best so far, by success and, of equals, by return."""
+        """Records an evaluation; returns True if it is the best so far, by success and then by return."""
         self.evaluation = result
         if self.seconds_to_95 is None and result["success_rate"] >= 0.95:
             self.seconds_to_95, self.steps_to_95 = round(self.wall_s, 1), self.steps
@@ -50,7 +50,7 @@ class Tally:
 
 
 class Diverged(UserError):
-    """Training left the numbers."""
+    """Training produced numbers that are not finite."""
 
 
 class Mean:
@@ -61,12 +61,12 @@ class Mean:
         self._count = 0
 
     def add(self, metrics: dict[str, float]) -> None:
-        """Metrics of a chunk."""
+        """Adds the metrics of a chunk."""
         self._sums = {name: self._sums.get(name, 0.0) + value for name, value in metrics.items()}
         self._count += 1
 
     def take(self) -> dict[str, float]:
-        """The mean since the last time; empty if there was nothing."""
+        """Returns the mean since the last call; empty if nothing was added."""
         found = {name: value / self._count for name, value in self._sums.items()}
         self._sums, self._count = {}, 0
         return found
@@ -74,25 +74,25 @@ class Mean:
 
 @dataclasses.dataclass
 class Loop:
-    """Trains until the steps or minutes are used up or a signal comes."""
+    """Trains until the steps or minutes are used up, or a signal comes."""
 
     run: RunCfg
     made: Compiled
     tally: Tally
-    meta: dict[str, Any]  # of a policy's file
+    meta: dict[str, Any]  # description for a policy's file
     checkpoints: Checkpoints
     logs: Logs
-    back: Callable[[], tuple[Any, Tally]]  # state and tally of the newest checkpoint
+    back: Callable[[], tuple[Any, Tally]]  # loads state and tally of the newest checkpoint
     say: Callable[[str], None]
     show: Show
     stop: Stop
 
     def __call__(self, state: Any) -> str:
-        """Trains on from ``state``; says why it ended.
+        """Trains from ``state``; returns why training ended.
 
         Raises:
-            Diverged: see ``RunCfg.on_nan``.
-            NotWritten: a checkpoint.
+            Diverged: training diverged (see ``RunCfg.on_nan``).
+            NotWritten: a checkpoint could not be written.
         """
         tally, total = self.tally, self.run.num_timesteps
         mean, begun = Mean(), time.perf_counter() - tally.wall_s
@@ -141,12 +141,15 @@ class Loop:
                 return ended
 
     def _agree(self, unsaved: float) -> tuple[int, float, float]:
-        """Any process's signal (0: none), and the first one's clocks [s]. Read once, so that no signal comes half-way."""
+        """Returns any process's signal (0: none) and the first process's clocks [s].
+
+        They are read once per chunk, so that a signal never takes effect half-way.
+        """
         found = machines.gather([self.stop.number or 0, self.tally.wall_s, unsaved])
         return int(found[:, 0].max()), float(found[0, 1]), float(found[0, 2])
 
     def _ended(self, stop: int) -> str:
-        """Why training ends here; empty: it does not."""
+        """Says why training ends here; empty if it does not."""
         if stop:
             self.stop.number = stop
             return "interrupted"
@@ -155,22 +158,22 @@ class Loop:
         return "time limit" if 0 < 60 * self.run.max_minutes <= self.tally.wall_s else ""
 
     def _not_finite(self, means: dict[str, float], state: Any) -> str | None:
-        """The first quantity that is no number any more: a metric, or an array of the policy."""
+        """Names the first quantity that is not finite: a metric, or an array of the policy."""
         bad = next((name for name, value in means.items() if not math.isfinite(value)), None)
         return bad or checkpoint.not_finite(self.made.learner.policy(state))
 
     def _after_divergence(self, what: str) -> Any:
-        """The state to go on with: once, the newest checkpoint's, which was finite when it was saved."""
+        """Returns the state to continue with, at most once: the newest checkpoint, which was finite when saved."""
         self.checkpoints.wait()
-        machines.wait()  # for the first one's files
+        machines.wait()  # the first process's files must be complete
         at, before = self.tally.steps, self.tally.rewound_at
         state, tally = self.back()
         said = f"{what} is not finite after {at:,} steps"
         if self.run.on_nan != "rewind" or before is not None:
-            again = f" (a second time, after a return from {before:,} steps)" if before is not None else ""
+            again = f" (for the second time, after rewinding from {before:,} steps)" if before is not None else ""
             raise Diverged(
-                f"{said}{again}: training stopped. The last finite checkpoint is that of {tally.steps:,} steps: go on from it "
-                "with a lower learning rate as a new run" + ("" if before is not None else ", or with --on-nan rewind")
+                f"{said}{again}: training stopped. The last finite checkpoint is at {tally.steps:,} steps: start a new run from "
+                "it with a lower learning rate" + ("" if before is not None else ", or pass --on-nan rewind")
             )
         for field in dataclasses.fields(tally):  # in place: the summary reads it
             setattr(self.tally, field.name, getattr(tally, field.name))
@@ -197,7 +200,7 @@ class Loop:
         self.checkpoints.save(state, policy, meta, tally.steps, tally.best_steps)
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
-        """Sums over an iteration become figures an episode."""
+        """Turns sums over an iteration into figures per episode."""
         learner = self.made.learner
         per, length = learner.steps_per_iteration, learner.env.unwrapped.episode_length
         sums = {name.removeprefix("sum/"): value for name, value in metrics.items() if name.startswith("sum/")}
@@ -220,5 +223,5 @@ class Loop:
 
 
 def _next(steps: int, every: int) -> int:
-    """The next multiple: a run that goes on keeps its rhythm."""
+    """Returns the next multiple of ``every``, so that a resumed run keeps its rhythm."""
     return (steps // every + 1) * every

@@ -1,4 +1,4 @@
-"""Going on: the same run from its newest whole checkpoint, or another from a checkpoint or a policy."""
+"""Resuming: the same run from its newest intact checkpoint, or a new run from a checkpoint or a policy."""
 
 import dataclasses
 import pathlib
@@ -19,31 +19,31 @@ from mjx_nero.learn.runs import trust as trust_of
 from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
 from mjx_nero.learn.runs.folder import CONFIG
 
-# Fields of a run's environment that name files: another place than the folder of the run.
+# Fields of a run's environment that name files, which may lie outside the run's folder.
 _PATHS = ("identified", "robot.folder", "robot.name", "robot.mjcf")
-# What may change when a run goes on: how long, on what, and what it leaves behind. What its config keeps of it.
+# Fields that a resumed run may change (how long, on what, what it leaves behind), and all that its config stores.
 _FREE = config.marked(RunCfg, "free")
 _OWN = (*_FREE, *config.marked(RunCfg, "kept"))
 
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A file to go on from, and what it says of itself."""
+    """A file to resume from, and its description."""
 
     path: pathlib.Path
     meta: dict[str, Any]
 
     @property
     def is_checkpoint(self) -> bool:
-        """A whole run's state; else a policy, whose networks alone a new run starts from."""
+        """True for a run's whole state; False for a policy, from which a new run takes only the networks."""
         return self.meta.get("kind") == "checkpoint"
 
 
 def find(restore: pathlib.Path, warn: Callable[[str], None]) -> Source:
-    """The newest checkpoint of a run folder that is whole, or the file itself.
+    """Finds the newest intact checkpoint of a run folder; a file is returned as it is.
 
     Raises:
-        UserError: there is none.
+        UserError: the folder holds no checkpoint.
     """
     if not restore.is_dir():
         return Source(restore, checkpoint.load_meta(restore))
@@ -52,33 +52,33 @@ def find(restore: pathlib.Path, warn: Callable[[str], None]) -> Source:
             checkpoint.verify(path)
             return Source(path, checkpoint.load_meta(path))
         except checkpoint.Damaged:
-            warn(f"warning: {path} is damaged and passed over for the checkpoint before")
+            warn(f"warning: {path} is damaged: using the checkpoint before it")
     raise UserError(f"{restore} holds no checkpoint to restore: give a run folder or a .safetensors file")
 
 
 def same_run(
     folder: pathlib.Path, asked: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]], trust: bool = False
 ) -> RunCfg:
-    """The run of a folder, to go on as it was; what the user asks for beside that may only say how long and on what.
+    """Rebuilds the run of a folder to resume it unchanged. The user may only change its length, its machine and its outputs.
 
     Args:
         asked: the run that the command line describes.
-        flags: names of the flags that it has.
-        dotted: its dotted flags, by prefix.
-        trust: the user knows who made the run, so files that it names outside of its folder may be read.
+        flags: names of the flags that the user passed.
+        dotted: the dotted flags, by prefix.
+        trust: the user vouches for the run, so files that it names outside its folder may be read.
 
     Raises:
-        UserError: a flag differs from the run's own; the config is damaged, names files of a stranger's choice, or is of a
-            version that this one cannot follow.
+        UserError: a flag differs from the run's own; or the config is damaged, names files that a stranger may have chosen, or
+            comes from a version that this one cannot continue.
     """
     run = _rebuilt(folder, trust)
-    if run is None:  # of a version that did not say enough
+    if run is None:  # a version that stored too little
         return dataclasses.replace(asked, restore=folder, out=folder)
 
     def refuse(flag: str, own: Any, other: Any) -> None:
         if own != other:
             raise UserError(
-                f"--{flag} is {other}, and {folder} is a run with {own}: leave it out to go on with that run, or start another "
+                f"--{flag} is {other}, and {folder} is a run with {own}: leave the flag out to resume that run, or start another "
                 "with another --out"
             )
 
@@ -102,8 +102,8 @@ def same_run(
 
 
 def overridden(folder: pathlib.Path, run: RunCfg) -> str:
-    """What a run that goes on does otherwise than before, for people; empty if nothing."""
-    before = _rebuilt(folder, trust=True)  # it has been asked for
+    """Describes, for people, what a resumed run does differently from before; empty if nothing."""
+    before = _rebuilt(folder, trust=True)  # trust was checked before
     if before is None:
         return ""
     pairs = [(name, getattr(before, name), getattr(run, name)) for name in ("num_timesteps", *_FREE)]
@@ -112,7 +112,7 @@ def overridden(folder: pathlib.Path, run: RunCfg) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Stored:
-    """What ``config.json`` says, as far as a run is made of it once more."""
+    """The parts of ``config.json`` from which a run is rebuilt."""
 
     env_name: str
     preset: str
@@ -124,7 +124,7 @@ class _Stored:
 
 
 def _rebuilt(folder: pathlib.Path, trust: bool) -> RunCfg | None:
-    """The run that ``config.json`` describes; None if it is one of a version that did not keep what it was made from.
+    """Rebuilds the run that ``config.json`` describes; None if its version stored too little.
 
     Raises:
         UserError: see ``same_run``.
@@ -153,11 +153,11 @@ def _rebuilt(folder: pathlib.Path, trust: bool) -> RunCfg | None:
         return dataclasses.replace(run, **fields)
     except UserError as error:
         version = values.short(stored.versions.get("mjx-nero", "unknown"))[1:-1]
-        raise UserError(f"{path} is of a run of version {version}, which this version cannot go on with: {error}") from None
+        raise UserError(f"{path} is of a run of version {version}, which this version cannot resume: {error}") from None
 
 
 def _outside(asked: Asked) -> Iterator[str]:
-    """The files that a run names beside those of its folder."""
+    """Yields the files that a run names outside its folder."""
     if asked.robot is not None and asked.robot not in registry.list_robots():
         yield asked.robot
     for name in _PATHS:
@@ -166,7 +166,7 @@ def _outside(asked: Asked) -> Iterator[str]:
 
 
 def _as_stored(cfg: Any, stored: Any) -> Any:
-    """The config with the numbers that a run was begun with, where this version has others; not which files it reads."""
+    """Restores the numbers that the run began with where this version has others, except the files that it reads."""
     was = config.current(cfg, config.flatten(stored))
     now = config.flatten(config.to_dict(cfg))
     own = [name for name in config.flatten(cfg) if name in was and name not in _PATHS]
@@ -174,13 +174,13 @@ def _as_stored(cfg: Any, stored: Any) -> Any:
 
 
 def check(source: Source, meta: dict[str, Any]) -> None:
-    """Does it fit a run?
+    """Checks that a file fits a run.
 
     Args:
-        meta: what the run's own checkpoints say (``policy.describe``).
+        meta: description in the run's own checkpoints (``policy.describe``).
 
     Raises:
-        UserError: it does not; says why in words.
+        UserError: the file does not fit; the message says why.
     """
     path, there = source.path, source.meta
     header.check_fields(there, path)
@@ -210,28 +210,28 @@ def check(source: Source, meta: dict[str, Any]) -> None:
         )
     if other := learner.find(meta["learner"]).differing(there, meta):
         flags = " ".join(f"--{meta['learner']}.{name} {_flag(x)}" for name, x in other.items())
-        raise UserError(f"{path} does not fit: its networks are others: pass {flags}")
+        raise UserError(f"{path} does not fit, because its networks differ: pass {flags}")
 
 
 def _flag(value: Any) -> str:
-    """A field as one types it."""
+    """Formats a field's value as one types it."""
     return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
 def state(source: Source | None, learner: Learner, seed: int, bank: starts.Make = starts.none) -> Any:
-    """A fresh state, or that of a checkpoint; of a policy file, its networks alone.
+    """Makes a new state, or loads a checkpoint's. A policy file gives only its networks.
 
     Args:
-        bank: of a fresh one, what its environments start from.
+        bank: the expert starts of a new state.
 
     Raises:
-        UserError: another version's, damaged, or its networks hold numbers that are not finite.
+        UserError: the file is damaged or of another version, or its networks hold numbers that are not finite.
     """
     if source is None:
         return compiled.starter(learner, bank)(seed)
     like = jax.eval_shape(learner.init, jax.random.PRNGKey(seed))
     if not source.is_checkpoint:
-        networks = checkpoint_policy(source.path).params  # before compiling takes its time
+        networks = checkpoint_policy(source.path).params  # checked before the slow compilation
         if (found := _shapes(networks)) != (wanted := _shapes(learner.policy(like))):
             name = min(found.items() ^ wanted.items())[0]
             raise UserError(f"{source.path} does not fit: {name} is {found.get(name)}, expected {wanted.get(name)}")
@@ -246,5 +246,5 @@ def state(source: Source | None, learner: Learner, seed: int, bank: starts.Make 
 
 
 def _shapes(networks: Any) -> dict[str, tuple[int, ...]]:
-    """Of each array, by name."""
+    """Shape of each array, by name."""
     return {jax.tree_util.keystr(path): tuple(x.shape) for path, x in jax.tree_util.tree_leaves_with_path(networks)}

@@ -1,4 +1,4 @@
-"""Several seeds, one after another in one process: one compiled program, and for each seed a run of its own."""
+"""Several seeds, trained one after another in one process: one compiled program, and one run per seed."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ Row = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class SeedRow:
-    """What ``seeds.json`` says of a seed."""
+    """One seed's row in ``seeds.json``."""
 
     seed: Seed
     success_rate: Share
@@ -38,19 +38,22 @@ class SeedRow:
 
 
 def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple[list[Row], pathlib.Path, int]:
-    """Trains each seed as ``training.train`` does, in ``seed_<n>`` of the run's folder, which gets ``seeds.json``: a row a seed.
+    """Trains each seed as ``training.train`` does, in ``seed_<n>`` of the run's folder, and writes ``seeds.json``, one row per
+    seed.
+
+    A seed that diverges becomes a row without success, and the next seed follows. A signal ends them all.
 
     A seed that diverges is a row without success, and the next one follows; a signal ends them all.
 
     Returns:
-        the rows of the folder's seeds, the folder, and an exit status.
+        the rows of all seeds in the folder, the folder, and an exit status.
 
     Raises:
-        UserError: anything that the user can mend.
+        UserError: something that the user can mend.
         signals.Signalled: a signal came before training began.
     """
     if machines.several():
-        raise UserError("--seeds trains on one machine: on several, start a run a seed with --seed")
+        raise UserError("--seeds trains on one machine: on several, start one run per seed with --seed")
     say = training.speaker()
     run, note = fit_machine(run)
     learner = compiled.make_learner(run)
@@ -77,13 +80,13 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
             files.write_json(folder / SEEDS, {**summary(rows), "rows": rows})
             if code:
                 left = ",".join(map(str, seeds[i + 1 :]))
-                say(f"seeds {left} were not begun: --seeds {left} --out {folder} trains them" if left else "no seed is left")
+                say(f"seeds {left} were not started: --seeds {left} --out {folder} trains them" if left else "no seed is left")
                 return rows, folder, code
     return rows, folder, 0
 
 
 def _run(run: RunCfg, made: compiled.Compiled, meta: dict[str, Any], home: pathlib.Path, command: str) -> tuple[Row, int]:
-    """A seed's row and exit status."""
+    """Trains one seed; returns its row and exit status."""
     tally = Tally()
     try:
         found = training.carry_out(run, made, tally, meta, home, command)
@@ -103,7 +106,7 @@ def _run(run: RunCfg, made: compiled.Compiled, meta: dict[str, Any], home: pathl
 
 
 def _earlier(path: pathlib.Path) -> list[Row]:
-    """The rows of seeds that were trained in this folder before."""
+    """Reads the rows of seeds that this folder already holds."""
     if not path.exists():
         return []
     try:
@@ -114,8 +117,11 @@ def _earlier(path: pathlib.Path) -> list[Row]:
 
 
 def summary(rows: list[Row]) -> Row:
-    """About all seeds, each interval at 95%: how many reached 95% success (Wilson), mean success (Student's t), seconds till then
-    (median, and the mean's interval if all got there)."""
+    """Summarises all seeds, with intervals at 95%: how many reached 95% success (Wilson), mean success (Student's t), and seconds
+    until then.
+
+    The seconds are the median over seeds that got there, and the mean's interval if all did.
+    """
     seconds = [row["seconds_to_95"] for row in rows if row["seconds_to_95"] is not None]
     successes = [row["success_rate"] for row in rows]
     return {
@@ -130,7 +136,7 @@ def summary(rows: list[Row]) -> Row:
 
 
 def mean_interval(values: Sequence[float], most: float = math.inf) -> tuple[float, float] | None:
-    """Student's 95% interval of the mean of independent values from 0 to ``most``; None: there is but one."""
+    """Returns Student's 95% interval of the mean of independent values from 0 to ``most``; None for a single value."""
     if len(values) < 2:
         return None
     half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / math.sqrt(len(values))

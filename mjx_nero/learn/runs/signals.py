@@ -1,4 +1,4 @@
-"""Signals: before training they end a program at once, during training they let it save first."""
+"""Signals end a program at once before training, and let it save first during training."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)  # Ctrl
 
 
 class Signalled(KeyboardInterrupt):
-    """A signal that ends the program. ``code`` is its exit status, 128 and the signal's number."""
+    """A signal that ends the program. ``code`` is its exit status, 128 plus the signal's number."""
 
     def __init__(self, number: int):
         super().__init__(signal.Signals(number).name)
@@ -18,7 +18,7 @@ class Signalled(KeyboardInterrupt):
 
 
 class Stop:
-    """Whether a signal came, and which."""
+    """Records whether a signal came, and which."""
 
     number: int | None = None
 
@@ -30,7 +30,7 @@ class Stop:
 
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
-    """A signal raises ``Signalled`` wherever the program is, so that it cleans up as it ends."""
+    """Raises ``Signalled`` at a signal, wherever the program is, so that it cleans up as it ends."""
 
     def handle(number: int, _: Any) -> None:
         raise Signalled(number)
@@ -41,10 +41,10 @@ def at_once() -> Iterator[None]:
 
 @contextlib.contextmanager
 def after_this(say: Callable[[str], None]) -> Iterator[Stop]:
-    """The first signal sets a flag, so that what is in flight ends whole; the second ends the process where it stands.
+    """Sets a flag at the first signal, so that the current work completes; ends the process at the second.
 
-    The second raises nothing: the program may be within a callback of compiled code, through which no exception may pass. Files
-    appear whole or not at all, so nothing is left half-written.
+    The second signal raises nothing, because the program may be inside a callback of compiled code, which no exception may cross.
+    Files appear whole or not at all, so nothing is left half-written.
     """
     stop = Stop()
 
@@ -66,7 +66,7 @@ def _handled(handle: Callable[[int, Any], None]) -> Iterator[None]:
             continue
         try:
             before[number] = signal.signal(number, handle)
-        except ValueError:  # not the main thread: whoever has that decides
+        except ValueError:  # only the main thread may set handlers
             break
     try:
         yield

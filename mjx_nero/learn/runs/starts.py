@@ -1,9 +1,9 @@
-"""Where a task's expert has been: the bank of states that ``wrappers.ExpertStarts`` begins training's episodes in.
+"""Expert starts: the bank of visited states in which ``wrappers.ExpertStarts`` begins training episodes.
 
-The first of the task's controllers plays an episode in each of some environments, side by side in one program: on the processor's
-cores, which compile it and run it while the device's own programs are compiled, and so that every machine comes to the same.
-States are taken all along the episodes that succeed; of an arm that hardly gets to the goal, and with obstacles on the way, until
-shortly after it has grasped. They are states at rest: joints, objects, and what the fingers press with.
+The task's first controller plays one episode in each of several environments, side by side in one program. The program compiles
+and runs on the CPU while the device's programs compile, so every machine gets the same states. States are taken along the whole
+of successful episodes. If the expert rarely succeeds, or obstacles are in the way, they end shortly after the grasp. A state is
+at rest: joints, objects, and the pressure of the fingers.
 """
 
 import dataclasses
@@ -27,23 +27,23 @@ from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
 from mjx_nero.types import Bank, Start
 
-HALF, ENOUGH = 0.5, 0.25  # of the episodes: see ``way`` and ``Way.enough``
+HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
-_QUICK = {"ik.restarts": 0}  # a controller's search for another way to reach takes most of the compiler's time
-COMING, LIFTED = 1.5, 0.3  # [s] before an object is held the hand is on its way down to it; after, it is well above the table
+_QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
+COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
 _GRASPED, _HOLD = "metrics.grasped", "success.hold"
 
-Make = Callable[[int], Bank | None]  # of a seed
+Make = Callable[[int], Bank | None]  # seed -> bank
 
 
 @dataclasses.dataclass(frozen=True)
 class Way:
-    """What the expert did.
+    """The expert's episodes.
 
     Attributes:
         states: leaves [steps, episodes, ...].
-        begins, ends: of each episode, the first step worth starting from, and the first after those; both 0: there is none.
-        won, held: shares of the episodes that succeed and that grasp.
+        begins, ends: first and one past last step of each episode that are worth starting from; both 0 if none is.
+        won, held: shares of episodes that succeed and that grasp.
     """
 
     states: Bank
@@ -54,16 +54,17 @@ class Way:
 
     @property
     def enough(self) -> bool:
-        """Whether so many episodes are worth starting from that it can be said to do the task."""
+        """True if enough episodes are worth starting from to say that the expert can do the task."""
         return bool((self.ends > 0).mean() >= ENOUGH)
 
 
 def none(seed: int) -> None:
-    """No bank: all episodes start as usual."""
+    """Makes no bank: all episodes start as usual."""
 
 
 def maker(learner: Learner, say: Callable[[str], None]) -> Make:
-    """Makes the bank of a learner's environments, of a seed; None, and a line says why, where there is none."""
+    """Returns a function that makes the bank of a learner's environments from a seed; None, with a line that says why, if it
+    cannot."""
     env = learner.env
     player = functools.cache(lambda: _player(env.unwrapped, learner.num_envs))
 
@@ -86,7 +87,8 @@ def maker(learner: Learner, say: Callable[[str], None]) -> Make:
 
 
 def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
-    """So many states, row i of phase 1 + i % ``phases``: of any of the episodes, at any step within that part of its way."""
+    """Draws ``n`` states. Row i belongs to phase 1 + i % ``phases``, from any episode and any step within that part of its
+    way."""
     rng, phases = np.random.default_rng(seed), min(phases, n)
     episode = rng.choice(np.flatnonzero(way.ends), n)
     begin, end = way.begins[episode], way.ends[episode]
@@ -95,18 +97,21 @@ def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
 
 
 def playground(cfg: EnvCfg) -> EnvCfg:
-    """The task as the expert plays it: by drive targets, the arm's weight carried, with nothing that differs, is late or in the
-    way. What it passes through there are places for joints and objects in the task itself, too."""
+    """Returns the task as the expert plays it: drive targets, the arm's weight carried, and no randomization, delays or
+    obstacles.
+
+    Its states are valid states of the task itself.
+    """
     plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "obstacles": None, "curriculum": CurriculumCfg()}
     robot = dataclasses.replace(cfg.robot, gravity_compensation=True)
     return for_controllers(dataclasses.replace(cfg.uncorrupted(), robot=robot, **plain))
 
 
 def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:
-    """Plays the expert's episodes of a seed, by a program that is compiled here.
+    """Compiles a program that plays the expert's episodes of a seed.
 
     Raises:
-        UserError: there is no expert.
+        UserError: the task has no expert.
     """
     cfg, name = own.cfg, next(iter(own.cfg.controllers), None)
     if name is None or "grasped" not in cfg.metrics:
@@ -128,7 +133,7 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:
 
 
 def _processor() -> jax.Device | None:
-    """JAX's own device of that name; None: it has been told to do without."""
+    """Returns JAX's CPU device; None if JAX was told to do without."""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:
@@ -136,7 +141,7 @@ def _processor() -> jax.Device | None:
 
 
 def _play(env: ManipulationEnv, expert: rollout.Agent, keys: Array) -> tuple[Bank, Array, Array, Array]:
-    """An episode each: what ``way`` is made of."""
+    """Plays one episode per key; returns the arguments of ``way``."""
 
     def step(carry: tuple, _: None) -> tuple:
         state, memory, alive = carry
@@ -155,7 +160,7 @@ def _play(env: ManipulationEnv, expert: rollout.Agent, keys: Array) -> tuple[Ban
 
 
 def _at_rest(env: ManipulationEnv, state: State) -> Start:
-    """Where joints and objects are, the goal, and what the fingers press with."""
+    """Takes joints, objects, goal and finger pressure from a state."""
     view = env.view(state)
     objects = {name: view.objects[name] for name in env.cfg.scene.objects}
     return Start(
@@ -170,17 +175,19 @@ def _at_rest(env: ManipulationEnv, state: State) -> Start:
 
 
 def way(states: Bank, grasped: np.ndarray, won: np.ndarray, hold: np.ndarray, coming: int, past: int, whole: bool = True) -> Way:
-    """What is worth starting from: episodes that succeed, from a little before they grasp until they have succeeded; if fewer
-    than half do, those that grasp, too, until a little after that.
+    """Selects the steps worth starting from.
+
+    They are those of successful episodes, from shortly before the grasp until success. If fewer than half of the episodes
+    succeed, episodes that only grasp count too, until shortly after the grasp.
 
     Args:
         states: leaves [steps, n, ...].
         grasped: the object is or has been held, bool [steps, n].
-        won: bool [n].
-        hold: for how many steps, up to the end, all has been as it should be, int [n].
-        coming: steps before the object is held from which on the hand is on its way down to it.
-        past: steps from when the object is held until it is well above the table.
-        whole: else no further than that, whoever succeeds.
+        won: the episode succeeded, bool [n].
+        hold: number of steps up to the end in which the task was done, int [n].
+        coming: steps that the hand takes to come down before the grasp.
+        past: steps from the grasp until the object is well above the table.
+        whole: use successful episodes to their end; otherwise only until shortly after the grasp.
     """
     steps, held = len(grasped), grasped.any(axis=0)
     lifted = np.where(held, np.minimum(grasped.argmax(axis=0) + past, steps), 0)

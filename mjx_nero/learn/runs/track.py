@@ -1,4 +1,4 @@
-"""Services that are told how a run goes, beside its folder: ``--track``."""
+"""Tracking services that receive a run's metrics besides its folder: ``--track``."""
 
 import importlib.util
 import os
@@ -17,8 +17,8 @@ from mjx_nero.learn.runs.logs import Row, Tracker
 class Wandb:
     """Weights & Biases: a run in the project ``mjx_nero`` with every row, over env steps.
 
-    ``WANDB_MODE=offline``, ``WANDB_PROJECT`` and its other settings come from the environment. A run that is gone on with goes on
-    there, too.
+    Its settings come from the environment, such as ``WANDB_MODE=offline`` and ``WANDB_PROJECT``. A resumed run continues there,
+    too.
     """
 
     def __init__(self, run: RunCfg, folder: pathlib.Path):
@@ -37,15 +37,15 @@ class Wandb:
             dir=folder,
             config=config.to_dict(run),
             resume="allow",
-            settings=wandb.Settings(console="off", silent=True),  # it leaves stdout and stderr alone
+            settings=wandb.Settings(console="off", silent=True),  # leaves stdout and stderr alone
         )
 
     def write(self, row: Row) -> None:
-        """A row of metrics."""
+        """Sends a row of metrics."""
         self._run.log({name: value for name, value in row.items() if value is not None}, step=int(row["steps"]))
 
     def close(self) -> None:
-        """Waits until all is sent."""
+        """Waits until everything is sent."""
         self._run.finish()
 
 
@@ -53,7 +53,7 @@ TRACKERS: dict[str, Callable[[RunCfg, pathlib.Path], Tracker]] = {"wandb": Wandb
 
 
 def check(name: str) -> None:
-    """Is what a tracker needs installed?
+    """Checks that a tracker's package is installed.
 
     Raises:
         UserError: it is not.
@@ -63,5 +63,5 @@ def check(name: str) -> None:
 
 
 def tracker(run: RunCfg, folder: pathlib.Path) -> Callable[[], Tracker] | None:
-    """What makes the tracker of a run; None: it has none."""
+    """Returns a function that makes the run's tracker; None if it has none."""
     return (lambda: TRACKERS[run.track](run, folder)) if run.track else None

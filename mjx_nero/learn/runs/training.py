@@ -1,4 +1,4 @@
-"""A training run: compile, loop, finish. Everything about it is left in its folder."""
+"""A training run: compile, loop, finish. All its results are left in its folder."""
 
 import dataclasses
 import functools
@@ -31,7 +31,8 @@ __all__ = ["RunCfg", "carry_out", "describe", "film", "fit_machine", "learner_cf
 
 @dataclasses.dataclass(frozen=True)
 class Ended:
-    """How a run's loop ended: ``finished``, ``time limit`` or ``interrupted``, by which signal, and what its logs lost."""
+    """The end of a run's loop: ``finished``, ``time limit`` or ``interrupted``, the signal's exit status, and what the logs
+    lost."""
 
     why: str
     code: int
@@ -39,13 +40,13 @@ class Ended:
 
 
 def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
-    """Trains a policy and leaves everything about it in the run folder; returns the summary, the folder and an exit status.
+    """Trains a policy and leaves all results in the run folder; returns the summary, the folder and an exit status.
 
     Args:
-        command: how the user calls us, for the hint how to go on.
+        command: the user's command, for the hint on how to resume.
 
     Raises:
-        UserError: anything that the user can mend: impl, folder, checkpoint, sizes.
+        UserError: something that the user can mend: impl, folder, checkpoint, sizes.
         signals.Signalled: a signal came before training began.
     """
     say = speaker()
@@ -68,17 +69,17 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         if note:
             say(note)
         if goes_on and (changes := resume.overridden(folder, run)):
-            say(f"{folder} goes on with {changes}")
+            say(f"{folder} resumes with {changes}")
         bank = starts.maker(learner, say)
         made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank), folder)
         return carry_out(run, made, tally, meta, folder, command)
 
 
 def _summary(folder: pathlib.Path) -> dict[str, Any]:
-    """What a run that has ended came to.
+    """Reads the summary of an ended run.
 
     Raises:
-        UserError: its file is damaged.
+        UserError: the file is damaged.
     """
     path = files.inside(folder, run_folder.SUMMARY)
     found = files.read_json(path)
@@ -94,22 +95,22 @@ def _summary(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def speaker() -> Callable[[str], None]:
-    """Says a line on stderr, in the first process."""
+    """Returns a function that prints a line on stderr, in the first process only."""
     return functools.partial(console.line, console.screen(stderr=True, quiet=not machines.first()))
 
 
 def describe(run: RunCfg, learner: Learner) -> dict[str, Any]:
-    """What the run's files say of it."""
+    """Describes a run for its files."""
     meta = policy.describe(learner.env.unwrapped, run.env_name, run.preset, run.learner, learner.describe())
     return {**meta, "num_envs": run.num_envs}
 
 
 def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pathlib.Path) -> Compiled:
-    """The programs of a run, and the state that it starts from. See ``compiled.compile``."""
+    """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
     with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl)):
-        importlib.import_module("tensorboardX")  # seconds where it finds PyTorch
+        importlib.import_module("tensorboardX")  # takes seconds if PyTorch is installed
         made = compiled.compile(run, learner, chunk, start)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""
     speaker()(f"{folder}: compiled in {made.seconds:.0f} s; {learner.env.unwrapped.impl}, {run.num_envs} environments{spread}")
@@ -119,11 +120,11 @@ def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pat
 def carry_out(
     run: RunCfg, made: Compiled, tally: Tally, meta: dict[str, Any], folder: pathlib.Path, command: str
 ) -> dict[str, Any]:
-    """Trains from ``made.state`` on, leaves everything in the folder, and returns what ``train`` does.
+    """Trains from ``made.state``, leaves all results in the folder, and returns what ``train`` returns.
 
     Args:
-        tally: of the run so far.
-        meta: of ``describe``.
+        tally: the counts of the run so far.
+        meta: result of ``describe``.
 
     Raises:
         UserError: training diverged, or a checkpoint could not be written.
@@ -133,7 +134,7 @@ def carry_out(
     if machines.first():
         run_folder.begin(folder, config.to_dict(run))
         trust.mark(folder)
-    go_on = f"go on with: {command} --restore {folder}"
+    go_on = f"resume with: {command} --restore {folder}"
     try:
         ended = _loop(run, made, tally, meta, folder)
     except NotWritten as error:
@@ -145,10 +146,10 @@ def carry_out(
 
 
 def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
-    """Draws episodes of a run's policy, played in MuJoCo C, into its folder's ``video.mp4``; says so where that cannot be.
+    """Plays a run's policy in MuJoCo's C library and draws its episodes to ``video.mp4``. If it cannot, it says so.
 
     Args:
-        run: its config.
+        run: the run's config.
     """
     screen = console.screen(stderr=True)
     env = ManipulationEnv(run.env.uncorrupted(), impl="native")
@@ -164,7 +165,7 @@ def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
 
 
 def _source(run: RunCfg, meta: dict[str, Any], say: Callable[[str], None]) -> resume.Source | None:
-    """What a run goes on from, checked; None: nothing."""
+    """Finds and checks what a run resumes from; None if nothing."""
     if run.restore is None:
         return None
     try:
@@ -172,22 +173,22 @@ def _source(run: RunCfg, meta: dict[str, Any], say: Callable[[str], None]) -> re
     except UserError:
         if not run.auto:
             raise
-        say(f"warning: no checkpoint of {run.restore} is whole: it starts anew")
+        say(f"warning: no checkpoint of {run.restore} is intact: starting again")
         return None
     resume.check(source, meta)
     return source
 
 
 def _tally(source: resume.Source) -> Tally:
-    """What a checkpoint's run had counted."""
+    """Reads the counts in a checkpoint."""
     try:
         return Tally(**source.meta.get("tally", {}))
-    except TypeError:  # other fields than this version's
+    except TypeError:  # fields of another version
         raise header.damaged(source.path) from None
 
 
 def _over(run: RunCfg, tally: Tally) -> str:
-    """Why nothing is left to do of a run; empty if there is."""
+    """Says why nothing is left to do of a run; empty if something is."""
     if tally.steps >= run.num_timesteps:
         return f"has made its {tally.steps:,} steps already: pass a larger --num-timesteps"
     if 0 < 60 * run.max_minutes <= tally.wall_s:
@@ -196,7 +197,7 @@ def _over(run: RunCfg, tally: Tally) -> str:
 
 
 def _loop(run: RunCfg, made: Compiled, tally: Tally, meta: dict[str, Any], folder: pathlib.Path) -> Ended:
-    """Trains, with checkpoints and logs."""
+    """Runs the loop, with checkpoints and logs."""
     screen, say = console.screen(stderr=True, quiet=not machines.first()), speaker()
     checkpoints = Checkpoints(folder, run.keep, machines.first())
     logs = Logs(folder, say, machines.first(), track.tracker(run, folder) if machines.first() else None)
@@ -221,7 +222,7 @@ def _loop(run: RunCfg, made: Compiled, tally: Tally, meta: dict[str, Any], folde
 def _finish(
     run: RunCfg, learner: Learner, tally: Tally, ended: Ended, folder: pathlib.Path, compile_s: float = 0.0
 ) -> dict[str, Any]:
-    """Writes the summary; policy and checkpoints are there already."""
+    """Writes the summary. Policy and checkpoints are already there."""
     summary = {
         "env": run.env_name,
         "preset": run.preset,

@@ -1,6 +1,6 @@
-"""Whose a run is: the config of a stranger's run may name any file, and reading it is asked for once.
+"""Trust: a stranger's run may name any file in its config, so reading such a file needs the user's consent once.
 
-A run that this user began here, or has trusted once, is marked in the user's cache folder by the fingerprint of its config.
+A run that this user started here, or has trusted once, is marked in the user's cache folder by the fingerprint of its config.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from mjx_nero.learn.runs.folder import CONFIG
 
 
 def mark(folder: pathlib.Path) -> None:
-    """The run of a folder is the user's, as its config stands now. Without a cache folder nothing is kept."""
+    """Marks the folder's run as the user's, with its present config. Without a cache folder nothing is kept."""
     place = _place(folder)
     if place is not None:
         with contextlib.suppress(UserError):
@@ -22,14 +22,14 @@ def mark(folder: pathlib.Path) -> None:
 
 
 def ask(folder: pathlib.Path, named: Iterable[str], trust: bool) -> None:
-    """May the files that a run's config names be read?
+    """Checks that the files named by a run's config may be read.
 
     Args:
-        named: their paths.
-        trust: the user says so.
+        named: paths of the files.
+        trust: the user consents.
 
     Raises:
-        UserError: the run is not known as the user's own.
+        UserError: the run is neither the user's own nor trusted.
     """
     named = list(named)
     if not named:

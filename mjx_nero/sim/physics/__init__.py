@@ -15,6 +15,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjx_nero.config import values
+from mjx_nero.config.registry import Registry
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim, UserError
 
@@ -72,27 +73,20 @@ def _own(module: str, name: str) -> Make:
     return lambda *args: getattr(importlib.import_module(f"mjx_nero.sim.physics.{module}"), name)(*args)
 
 
-_BACKENDS: dict[str, Make] = {
-    "warp": _own("mujoco_warp", "WarpPhysics"),
-    "jax": _own("mjx", "JaxPhysics"),
-    "native": _own("native", "NativePhysics"),
-}
+BACKENDS: Registry[Make] = Registry(
+    "physics",
+    {
+        "auto": lambda *args: BACKENDS[resolve_impl("auto")](*args),
+        "warp": _own("mujoco_warp", "WarpPhysics"),
+        "jax": _own("mjx", "JaxPhysics"),
+        "native": _own("native", "NativePhysics"),
+    },
+)
 
 
 def impls() -> tuple[str, ...]:
     """Lists the names that ``--impl`` takes."""
-    return ("auto", *_BACKENDS)
-
-
-def register(name: str, make: Make) -> None:
-    """Adds a backend.
-
-    Raises:
-        UserError: a backend has this name already.
-    """
-    if name in impls():
-        raise UserError(f"there is a physics {name!r} already: choose another name")
-    _BACKENDS[name] = make
+    return tuple(BACKENDS)
 
 
 def warp_available() -> bool:
@@ -128,7 +122,7 @@ def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str, fields: Sequence
     Raises:
         UserError: the backend cannot compute this model.
     """
-    return _BACKENDS[impl](model, cfg, fields)
+    return BACKENDS[impl](model, cfg, fields)
 
 
 def fusion() -> dict[str, str | bool]:

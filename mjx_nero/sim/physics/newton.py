@@ -34,14 +34,16 @@ def floats(nv: int, njmax: int, dense: bool) -> int | None:
 
 
 def make(model, data) -> Callable[[], None]:
-    """What puts the solution into ``data.qacc`` and ``data.efc.Ma``, all that MuJoCo Warp's integrators read of it; and where the
-    model has sensors, those of the contacts' forces into ``data.efc.force``.
+    """Makes a function that writes the solution to ``data.qacc`` and ``data.efc.Ma``, which is all that MuJoCo Warp's integrators
+    read.
+
+    If the model has sensors, it also writes the contacts' forces to ``data.efc.force``.
 
     Args:
-        model, data: MuJoCo Warp's.
+        model, data: MuJoCo Warp's model and data.
 
     Returns:
-        a function without arguments; MuJoCo Warp's own solver where the model is too large for this one.
+        a function without arguments; it calls MuJoCo Warp's own solver if the model is too large for this one.
     """
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp

@@ -1,4 +1,4 @@
-"""What was identified: a table, a picture, a file."""
+"""Reports identified drives: a table, a picture, a file."""
 
 import math
 import pathlib

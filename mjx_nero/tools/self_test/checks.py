@@ -64,7 +64,7 @@ def run(robot: RobotCfg, tries: int = TRIES) -> Result:
 
 
 def _gripper(robot: RobotCfg) -> str:
-    """Where it stops before one of its ends."""
+    """Finds where the gripper stops before one of its ends."""
     lags = dict(zip(robot.gripper.joints, robot.gripper.lead, strict=True))
     sim = SimCfg().finer(robot.max_step)
     bounds.check(sim)
@@ -81,7 +81,7 @@ def _gripper(robot: RobotCfg) -> str:
 
 
 def _home(robot: RobotCfg) -> str:
-    """What touches there."""
+    """Finds what touches in the home pose."""
     model = scene.build(robot, SceneCfg(objects={}), SimCfg(), visuals=False)
     data = mujoco.MjData(model)
     for joint, position in zip(robot.joints, robot.home, strict=True):
@@ -96,7 +96,7 @@ def _home(robot: RobotCfg) -> str:
 
 
 def _tried(robot: RobotCfg, tries: int) -> dict[str, Any]:
-    """What of a result is about the tries."""
+    """Selects the part of a result that is about the tries."""
     none = {"script": "", "tries": 0, "good": 0, "placed": 0, "failures": {}}
     if len(robot.arm.joints) > MOST_JOINTS:
         return {**none, "reason": f"no try: an arm of more than {MOST_JOINTS} joints"}
@@ -133,7 +133,7 @@ class _Goer:
         return (q, goal), jnp.concatenate([q, view.ctrl[self._n :]])
 
     def warning(self, memory: Any) -> str:
-        """Nothing."""
+        """Returns no warning."""
         return ""
 
 
@@ -192,7 +192,7 @@ def _drawn(box: Sequence[Range], tries: int, seed: int = 0) -> np.ndarray:
 
 
 def _failure(seen: dict[str, np.ndarray], ends: np.ndarray, grasped: bool) -> tuple[str, str]:
-    """In which phase a try failed, and what was seen of it.
+    """Describes in which phase a try failed, and what was seen.
 
     Args:
         seen: what was watched, [steps, ...].

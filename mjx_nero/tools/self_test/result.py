@@ -1,4 +1,4 @@
-"""What a self-test found, as values and as one line."""
+"""Results of a self-test, as values and as one line."""
 
 import dataclasses
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What the robot does, in physics.
+    """The measurements of a self-test in physics.
 
     Attributes:
         gripper: whether it opens and closes to the ends that it claims: empty, or where it stops and why.
@@ -32,7 +32,7 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is left to look at."""
+        """True if nothing is left to look at."""
         return not (self.gripper or self.home or self.reason)
 
     @property
@@ -49,5 +49,5 @@ class Result:
         return f"self-test: {'; '.join(parts)}"
 
     def json(self) -> dict[str, Any]:
-        """For ``report.json``."""
+        """Returns the content for ``report.json``."""
         return {**dataclasses.asdict(self), "passed": self.passed, "line": self.line}

@@ -120,7 +120,7 @@ def gains(robot: RobotCfg) -> dict[str, dict[str, float]]:
 
 
 def _round(value: float, way) -> float:
-    """To three significant digits: stiffness down, to stay within the effort; damping up, to stay without overshoot."""
+    """Rounds to three significant digits: stiffness down, to stay within the effort; damping up, to avoid overshoot."""
     if value == 0:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)

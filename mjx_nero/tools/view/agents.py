@@ -1,4 +1,4 @@
-"""Who can act in a viewed environment: policies, controllers, and the user's own hand on the joints."""
+"""Agents of a viewed environment: policies, controllers, and the user's own hand on the joints."""
 
 import dataclasses
 import pathlib
@@ -47,7 +47,7 @@ def of_policy(trained: policy.Policy) -> rollout.Agent:
 
 
 def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollout.Agent:
-    """In any environment: its drive targets as the action that gives them."""
+    """Lets a controller act in any environment, through the action that gives its drive targets."""
     steering = rollout.controller_agent(env, controller)
 
     def act(params, memory, state, key):
@@ -68,7 +68,7 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
 
 def _joint_pos(env: ManipulationEnv, state: State) -> jax.Array:
-    """Of each environment [n, joints]."""
+    """Joint positions of each environment [n, joints]."""
     return jax.vmap(lambda each: env.view(each).joint_pos)(state)
 
 

@@ -96,7 +96,7 @@ class View:
         self._thread.start()
 
     def wait(self) -> None:
-        """Until the simulation fails; follows the run meanwhile."""
+        """Waits until the simulation fails, and follows the run meanwhile."""
         while self.session.failure is None and not self._ended.wait(WATCH_S):
             self.follow()
         if self.session.failure is not None:
@@ -179,7 +179,7 @@ def open_view(
 
 
 def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
-    """Who acts first; a policy may be named without that word."""
+    """Returns the first agent; a policy may be named without that word."""
     found = next((name for name in (agent or names[0], f"policy {agent}") if name in names), None)
     if found is None:
         raise UserError(f"nobody called {agent!r} can act in {env_name}: choose one of {', '.join(names)}")

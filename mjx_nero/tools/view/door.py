@@ -129,7 +129,7 @@ class Door:
             await _answer(reader, writer, "403 Forbidden", _STRANGER)
 
     def _is_mine(self, asked: request.Request) -> bool:
-        """Whether a request means this address, and comes from it."""
+        """True if a request means this address, and comes from it."""
         known = asked.host in self._names or (self._everywhere and _is_address(asked.host))  # no name leads to an address
         return known and asked.own_origin
 

@@ -68,7 +68,7 @@ class Inner:
 
 
 def tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What an event loop does with errors that nobody waits for: a line, now and then."""
+    """Logs an event loop's errors that nobody waits for, one line now and then."""
     LOG.warning("a connection failed: %s", context.get("exception") or context["message"])
 
 

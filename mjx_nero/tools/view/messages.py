@@ -1,4 +1,4 @@
-"""What a page may say to its server: three kinds of message, with bounds, about controls and things that there are."""
+"""Messages that a page may send to its server: three kinds, with bounds, about existing controls and things."""
 
 from typing import Annotated, Literal
 
@@ -21,7 +21,7 @@ class _Said(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=Tr
 
 
 class ViewerCameraMessage(_Said):
-    """Where the page looks from."""
+    """The place and direction of the page's camera."""
 
     wxyz: tuple[_Number, _Number, _Number, _Number]
     position: _Vector

@@ -1,4 +1,4 @@
-"""What pages ask for, done one after the other."""
+"""Orders of pages, carried out one after the other."""
 
 import threading
 from collections.abc import Callable, Hashable

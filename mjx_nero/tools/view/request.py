@@ -29,15 +29,12 @@ class Request:
 
     @property
     def upgrades(self) -> bool:
-        """Whether it asks for a websocket."""
+        """True if it asks for a websocket."""
         return "upgrade" in self.headers
 
     @property
     def own_origin(self) -> bool:
-        """Whether it comes from a page of this address.
-
-        A browser names the origin of every websocket, but not of a page that is opened.
-        """
+        """True if it comes from a page of this address."""
         origin = self.headers.get("origin")
         return not self.upgrades if origin is None else origin.lower() == f"http://{self.headers['host'].lower()}"
 

@@ -25,7 +25,7 @@ EPISODES = 100  # the last ones, of which the success rate is told
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What there is to see after a control step: arrays of the host, one row an environment.
+    """One picture's data after a control step: arrays on the host, one row per environment.
 
     Attributes:
         qpos: [n, nq].

@@ -1,8 +1,8 @@
-"""Xacro to URDF with an expander of our own, so that a stranger's file can only calculate.
+"""Expands xacro to URDF with an expander of our own, so that a stranger's file can only calculate.
 
-The format's usual implementation hands expressions to Python's ``eval`` and opens whatever a file names. Here expressions are
-walked node by node (``evaluate``), with the functions and methods of one table (``functions``); files are found within the given
-folders only (``files.Roots``); and one budget bounds time and memory (``budget``).
+The usual implementation passes expressions to Python's ``eval`` and opens whatever a file names. Here expressions are walked node
+by node (``evaluate``), with the functions and methods of one table (``functions``). Files are found only within the given folders
+(``files.Roots``), and one budget bounds time and memory (``budget``).
 """
 
 from mjx_nero.urdf.xacro.expander import expand, is_xacro

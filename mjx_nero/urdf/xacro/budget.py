@@ -1,10 +1,10 @@
-"""What a file may cost: sizes of values, and how much of everything an expansion may use up."""
+"""Limits on what a file may cost: sizes of values, and the total work of an expansion."""
 
 from typing import Any
 
-MAX_SIZE = 100_000  # characters and items of one value, those of its items among them
-MAX_BITS = 1_024  # of a whole number: as far as floats go
-MAX_NESTING = 30  # of lists and dictionaries in one another
+MAX_SIZE = 100_000  # characters and items of one value, including nested ones
+MAX_BITS = 1_024  # bits of a whole number, the range of floats
+MAX_NESTING = 30  # nested lists and dictionaries
 LIMITS = {
     "evaluation steps": 500_000,
     "expanded elements": 50_000,
@@ -17,7 +17,7 @@ Value = bool | int | float | str | list[Any] | tuple[Any, ...] | dict[Any, Any] 
 
 
 class Fault(Exception):
-    """What is wrong, and in which expression; the expander adds the construct and where it stands."""
+    """An error, and the expression in which it occurs. The expander adds the construct and its place."""
 
     def __init__(self, message: str, expression: str = ""):
         super().__init__(f"{expression!r}: {message}" if expression else message)
@@ -26,32 +26,32 @@ class Fault(Exception):
 
 
 class Budget:
-    """How much is left of each of ``LIMITS``."""
+    """Tracks what is left of each of ``LIMITS``."""
 
     def __init__(self) -> None:
         self._left = dict(LIMITS)
 
     def spend(self, what: str, amount: int = 1) -> None:
-        """Raises Fault: the limit is passed."""
+        """Uses up part of a limit; raises Fault if it is exceeded."""
         self._left[what] -= amount
         if self._left[what] < 0:
             raise Fault(f"the file asks for more than {LIMITS[what]:,} {what}: no robot needs that; does it repeat itself?")
 
     def checked(self, value: Any) -> Value:
-        """``value``, if it is plain and small.
+        """Returns ``value`` if it is plain and small.
 
         Raises:
-            Fault: it is too large, nested too deep, or something else than numbers, strings, lists and dictionaries of these.
+            Fault: it is too large or nested too deep, or holds anything but numbers, strings, lists and dictionaries.
         """
         self.spend("evaluation steps", 1 + size(value) // 16)
         return value
 
 
 def size(value: Any) -> int:
-    """Characters and items of a plain value, counted as often as they occur.
+    """Counts the characters and items of a plain value, as often as they occur.
 
     Raises:
-        Fault: as ``Budget.checked``.
+        Fault: the value is too large or not plain (see ``Budget.checked``).
     """
     total = 0
     stack: list[tuple[Any, int]] = [(value, 0)]

@@ -1,7 +1,7 @@
-"""Expressions of xacro files, evaluated node by node.
+"""Evaluates expressions of xacro files, node by node.
 
-There is neither ``eval`` nor ``getattr``: a node that has no rule here is refused, an attribute is a dictionary's key or a
-namespace's name, and a function is one of ``functions`` or of those that the expander adds.
+It uses neither ``eval`` nor ``getattr``. A node without a rule here is refused. An attribute is a dictionary's key or a
+namespace's name, and a function comes from ``functions`` or from the expander.
 """
 
 import ast
@@ -14,18 +14,18 @@ from mjx_nero.urdf.xacro.budget import Budget, Fault, Value
 from mjx_nero.urdf.xacro.functions import METHODS, OPERATORS, Function, dictionary
 
 _MAX_LENGTH = 4_000  # characters of an expression
-_ROUND = 5  # evaluation steps that a round of a comprehension counts for
-_PARSING = 10  # evaluation steps that parsing counts for, and one more for every four characters
+_ROUND = 5  # evaluation steps charged per round of a comprehension
+_PARSING = 10  # evaluation steps charged for parsing, plus one per four characters
 
 
 class Namespace:
-    """What a name stands for that has names of its own: ``math``, or an include with ``ns``."""
+    """A thing with names of its own: ``math``, or an include with ``ns``."""
 
     def member(self, name: str) -> Any:
-        """A value, function or namespace.
+        """Looks up a value, function or namespace.
 
         Raises:
-            KeyError: there is none of that name.
+            KeyError: the name is unknown.
         """
         raise NotImplementedError
 
@@ -41,10 +41,10 @@ class Names(Namespace):
 
 
 def evaluate(expression: str, lookup: Callable[[str], Any], budget: Budget) -> Value:
-    """The value of an expression.
+    """Computes the value of an expression.
 
     Args:
-        lookup: name -> value, ``Function`` or ``Namespace``; KeyError if there is none.
+        lookup: name -> value, ``Function`` or ``Namespace``; KeyError if unknown.
 
     Raises:
         Fault: it is no expression, does what has no rule here, fails, or passes a limit.
@@ -64,7 +64,7 @@ def evaluate(expression: str, lookup: Callable[[str], Any], budget: Budget) -> V
     except Fault as fault:
         raise Fault(
             fault.message, fault.expression or shown
-        ) from None  # the innermost: properties are evaluated at their first use
+        ) from None  # the innermost expression: properties are evaluated at their first use
     except KeyError as error:
         raise Fault(f"there is no {str(error)[:60]}", shown) from None
     except (TypeError, ValueError, ArithmeticError, IndexError, AttributeError) as error:

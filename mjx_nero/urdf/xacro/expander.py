@@ -1,4 +1,4 @@
-"""Elements of xacro files: properties, arguments, includes, conditions and macros, expanded into a new document."""
+"""Expands the elements of xacro files (properties, arguments, includes, conditions and macros) into a new document."""
 
 import pathlib
 import re
@@ -17,26 +17,26 @@ from mjx_nero.urdf.xacro.macro import Macro, filled, parameters
 from mjx_nero.urdf.xacro.scope import Scope, Surroundings, truth
 
 URIS = ("http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro", "http://wiki.ros.org/xacro")
-_MAX_INCLUDES = 20  # in one another
-_MAX_DEPTH = 100  # of elements in elements, macros in macros and files in files, all together
-_YAML_BYTES = 20  # reading one of YAML costs as much as of so many of XML
-# What describes a simulator or a real robot's drives, which an import has no use for.
+_MAX_INCLUDES = 20  # nested files
+_MAX_DEPTH = 100  # nested elements, macros and files, all together
+_YAML_BYTES = 20  # a byte of YAML costs as much as this many of XML
+# Files about simulators or a real robot's drives, which an import does not need.
 _EXTRAS = re.compile(r"gazebo|ign(ition)?_|isaac|ros_?2?_?control|transmission|simulat|hardware", re.IGNORECASE)
-_UNUSED = ("gazebo", "ros2_control", "transmission")  # elements of the same
+_UNUSED = ("gazebo", "ros2_control", "transmission")  # elements about the same
 _XML_NAME = re.compile(r"[A-Za-z_][\w.-]*")
 
 
 def is_xacro(root: etree._Element) -> bool:
-    """Whether there is anything for xacro to do."""
+    """True if the document needs xacro."""
     elements = (e for e in root.iter() if isinstance(e.tag, str))
     return any(_own(e) or e.prefix == "xacro" or e.tag.startswith("xacro:") for e in elements) or _declared(root)
 
 
 def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: Mapping[str, str], notes: Notes) -> etree._Element:
-    """The URDF that a xacro file describes.
+    """Expands a xacro file to the URDF that it describes.
 
     Args:
-        args: values of ``xacro:arg``, in place of their defaults.
+        args: values of ``xacro:arg``, instead of their defaults.
 
     Raises:
         UserError: one line that says what is wrong in which construct of which file.
@@ -63,7 +63,7 @@ def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: M
 
 
 def _own(element: etree._Element) -> str:
-    """The name of a xacro element, "" of others."""
+    """Name of a xacro element; empty for others."""
     uri, brace, name = str(element.tag).removeprefix("{").partition("}")
     return name if brace and uri in URIS else ""
 
@@ -73,7 +73,7 @@ def _declared(root: etree._Element) -> bool:
 
 
 class _Expander(Surroundings):
-    """State of one expansion. A method an element of the language: their number makes the module longer than others."""
+    """State of one expansion. It has one method per element of the language, which makes the module longer than others."""
 
     def __init__(self, path: pathlib.Path, roots: files.Roots, args: Mapping[str, str]):
         own = {"load_yaml": self._load_yaml, "abs_filename": self._abs_filename, "arg": self._arg_value}

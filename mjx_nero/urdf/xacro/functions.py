@@ -1,6 +1,6 @@
-"""The operators, functions and methods that expressions can use. What may grow is checked before it does.
+"""Operators, functions and methods of expressions. Results that may grow are checked before they do.
 
-Arguments are plain values (``budget.Value``) always, so a function can be handed neither another function nor an object.
+Arguments are always plain values (``budget.Value``), so no function ever receives another function or an object.
 """
 
 import ast
@@ -13,14 +13,14 @@ from typing import Any
 
 from mjx_nero.urdf.xacro.budget import MAX_BITS, MAX_SIZE, Fault, size
 
-_MOST_DIGITS = 400  # that round() takes: more than floats have
-_MOST_KEY_BITS = 60  # longer whole numbers can be chosen to have one hash, and make a dictionary slow
-_CONVERSION = re.compile(r"%(?:\(\w+\))?[-+ 0#]{0,5}\d{0,3}(?:\.\d{0,2})?[diouxXeEfFgGrs%]")  # without * for the width
+_MOST_DIGITS = 400  # digits that round() accepts, more than floats have
+_MOST_KEY_BITS = 60  # longer numbers could be chosen with equal hashes, which makes a dictionary slow
+_CONVERSION = re.compile(r"%(?:\(\w+\))?[-+ 0#]{0,5}\d{0,3}(?:\.\d{0,2})?[diouxXeEfFgGrs%]")  # excludes * as a width
 
 
 @dataclasses.dataclass(frozen=True)
 class Function:
-    """What a name stands for that can be called."""
+    """A callable that a name can refer to."""
 
     call: Callable[..., Any]
 
@@ -64,7 +64,7 @@ def _remainder(left: Any, right: Any) -> Any:
 
 
 def _is(left: Any, right: Any) -> bool:
-    return type(left) is type(right) and left == right  # as Python has it for None, small numbers and words
+    return type(left) is type(right) and left == right  # Python's result for None, small numbers and words
 
 
 OPERATORS: dict[type, Callable[..., Any]] = {
@@ -98,7 +98,7 @@ OPERATORS: dict[type, Callable[..., Any]] = {
 
 
 def dictionary(*pairs: Any, **named: Any) -> dict[Any, Any]:
-    """``dict`` with keys that cannot make it slow."""
+    """Makes a ``dict`` whose keys cannot make it slow."""
     made = dict(*pairs, **named)
     for key in made:
         if not isinstance(key, str | float | None) and not (isinstance(key, int) and key.bit_length() <= _MOST_KEY_BITS):
@@ -125,13 +125,13 @@ def _sum(items: Any, start: Any = 0) -> Any:
 
 
 def tokens(text: Any, sep: Any = ",; ", skip_empty: Any = True) -> list[str]:
-    """``text`` cut at any of the characters ``sep``."""
+    """Splits ``text`` at any of the characters in ``sep``."""
     parts = text.translate(dict.fromkeys(map(ord, sep), sep[:1])).split(sep[:1])
     return [part for part in parts if part or not skip_empty]
 
 
 def _message(*_: Any, **__: Any) -> str:
-    return ""  # xacro prints these; the import's notes are about other things
+    return ""  # xacro prints these, but they are no notes about the import
 
 
 def _fatal(*words: Any) -> str:
@@ -164,7 +164,7 @@ PYTHON = _wrapped(
 XACRO = _wrapped(
     {
         **dict.fromkeys(("message", "warning", "error", "print_location"), _message),
-        "dotify": lambda items: items,  # dictionaries take dots anyhow
+        "dotify": lambda items: items,  # dictionaries support dots anyway
         "fatal": _fatal,
         "tokenize": tokens,
     }

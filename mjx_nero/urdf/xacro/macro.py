@@ -17,7 +17,7 @@ _MAX_PARAMS = 10_000  # characters
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """``default``: text, None for none. ``inherited``: the caller's property of that name comes before it (``:=^``)."""
+    """A parameter. ``default``: text, or None. ``inherited``: the caller's property of that name has priority (``:=^``)."""
 
     name: str
     default: str | None = None
@@ -36,7 +36,7 @@ class Macro:
 
 
 def parameters(text: str) -> tuple[Parameter, ...]:
-    """The parameters of ``params="a b:=2 c:=^ d:=^|'x' *block **blocks"``."""
+    """Parses the parameters in ``params="a b:=2 c:=^ d:=^|'x' *block **blocks"``."""
     if len(text) > _MAX_PARAMS:
         raise Fault(f"params: more than {_MAX_PARAMS:,} characters")
     found = []
@@ -50,7 +50,7 @@ def parameters(text: str) -> tuple[Parameter, ...]:
             found.append(Parameter(name[1]))
             continue
         default = _DEFAULT.match(text, equals.end())
-        assert default is not None  # it matches nothing, too
+        assert default is not None  # it also matches the empty string
         found.append(Parameter(name[1], default[0] or None, bool(equals[1])))
         text = text[default.end() :]
         if text and not text[0].isspace():
@@ -59,15 +59,15 @@ def parameters(text: str) -> tuple[Parameter, ...]:
 
 
 def filled(macro: Macro, given: dict[str, Value], blocks: list[etree._Element], caller: Scope, home: Scope) -> Scope:
-    """The scope of a macro's body.
+    """Makes the scope of a macro's body.
 
     Args:
         given: values of the call's attributes.
-        blocks: elements within the call, expanded.
+        blocks: expanded elements within the call.
         home: the scope that holds the macro, or the caller's.
 
     Raises:
-        Fault: a parameter or block is missing, or there is one too many.
+        Fault: a parameter or block is missing or superfluous.
     """
     scope = Scope(caller.around, home)
     names = [p.name for p in macro.parameters]

@@ -1,4 +1,4 @@
-"""Names of properties, and the text that they and expressions are written in."""
+"""Names of properties, and the text in which properties and expressions are written."""
 
 import dataclasses
 import pathlib
@@ -15,7 +15,7 @@ _UNKNOWN: Any = object()
 
 
 class Surroundings:
-    """What text can name besides properties, and what it may cost.
+    """Everything that text can name besides properties, and the budget of its evaluation.
 
     Args:
         path: the document.
@@ -25,15 +25,15 @@ class Surroundings:
 
     def __init__(self, path: pathlib.Path, args: Mapping[str, str], functions: Mapping[str, Callable[..., Any]]):
         self.budget = Budget()
-        self.stack = [path]  # files that are expanded, the innermost last
+        self.stack = [path]  # files being expanded, innermost last
         self.args = dict(args)
         self.asked: set[str] = set()  # arguments that the file declares or uses
-        self.later: dict[str, str] = {}  # properties of whole files: old ones use them before they define them
+        self.later: dict[str, str] = {}  # properties of whole files, as old files use them before defining them
         self.functions = {name: Function(call) for name, call in functions.items()}
 
     @property
     def folder(self) -> pathlib.Path:
-        """Of the file that is expanded."""
+        """The folder of the file being expanded."""
         return self.stack[-1].parent
 
 
@@ -45,10 +45,10 @@ class Lazy:
 
 
 class Scope(Namespace):
-    """Properties, blocks and macros of a document, a macro's call or an include with ``ns``; expressions see a ``Namespace``.
+    """Properties, blocks and macros of a document, a macro call or an include with ``ns``. Expressions see a ``Namespace``.
 
     Args:
-        parent: where names are looked up that this one lacks.
+        parent: scope in which missing names are looked up.
         named: it is an include's with ``ns``, not a macro's.
     """
 
@@ -61,7 +61,7 @@ class Scope(Namespace):
         self.macros: dict[str, Any] = {}
 
     def member(self, name: str) -> Any:
-        """What a name stands for: a property, function or namespace.
+        """Looks up a property, function or namespace.
 
         Raises:
             KeyError: nothing.
@@ -89,7 +89,7 @@ class Scope(Namespace):
         return scope
 
     def set(self, name: str, value: Value, lazy: bool = False) -> None:
-        """Sets a property; text that looks like a number or a truth value becomes one."""
+        """Sets a property. Text that looks like a number or a truth value becomes one."""
         value = literal(value)
         self.properties[name] = Lazy(value) if lazy and isinstance(value, str) else value
 
@@ -97,7 +97,7 @@ class Scope(Namespace):
         return self if self.parent is None else self.parent.outermost()
 
     def text(self, text: str) -> Value:
-        """The value of text with ``${...}`` and ``$(...)`` in it: a string, unless one of these is all there is.
+        """Evaluates text that may contain ``${...}`` and ``$(...)``; the result is a string, unless one of these is all the text.
 
         Raises:
             Fault: an expression fails, or a bracket is not closed.
@@ -132,7 +132,7 @@ class Scope(Namespace):
         return whole
 
     def string(self, text: str) -> str:
-        """The same as a string."""
+        """Evaluates text to a string."""
         return str(self.text(text))
 
     def _extension(self, content: str) -> Value:
@@ -183,7 +183,7 @@ _UNSPACED = ("load_yaml", "abs_filename")  # known without "xacro.", too
 
 
 def literal(value: Value) -> Value:
-    """A number or truth value, if text is one; without the quotes, if it is in single ones."""
+    """Converts text to a number or truth value if it is one, and strips single quotes."""
     if not isinstance(value, str):
         return value
     if len(value) >= 2 and value[0] == value[-1] == "'":
@@ -199,7 +199,7 @@ def literal(value: Value) -> Value:
 
 
 def truth(value: Value) -> bool:
-    """Whether a condition holds.
+    """Evaluates a condition.
 
     Raises:
         Fault: it is text other than true, false or a whole number.

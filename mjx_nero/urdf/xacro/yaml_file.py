@@ -1,4 +1,4 @@
-"""``load_yaml``: plain values from a YAML file, with the units that xacro knows."""
+"""Implements ``load_yaml``: plain values from a YAML file, with xacro's units."""
 
 import math
 import pathlib
@@ -14,11 +14,11 @@ _UNITS = {"radians": 1.0, "degrees": math.pi / 180, "meters": 1.0, "millimeters"
 
 
 def values(path: pathlib.Path, budget: Budget) -> Value:
-    """The content. Keys that are numbers are numbers; of a key that stands twice, as in some makers' files, the last one counts.
+    """Reads the file's content. Numeric keys are numbers; of a repeated key, which some makers' files have, the last one counts.
 
     Raises:
-        Fault: a number with a unit is none.
-        UserError: as ``read_yaml``.
+        Fault: a value with a unit is not a number.
+        UserError: the file cannot be read (see ``read_yaml``).
     """
 
     class Loader(YamlLoader):

@@ -1,0 +1,51 @@
+"""Registries: the package's and its guests' things of one kind, by name."""
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+from mjx_nero.config.values import hint, read, short
+from mjx_nero.errors import UserError
+
+Thing = TypeVar("Thing")
+
+
+class Registry(dict[str, Thing]):
+    """Things of one kind by name.
+
+    Args:
+        kind: what messages call one of them.
+        own: the package's own.
+    """
+
+    def __init__(self, kind: str, own: Mapping[str, Thing]):
+        super().__init__(own)
+        self.kind = kind
+
+    def add(self, name: str, thing: Thing) -> None:
+        """Adds a thing.
+
+        Raises:
+            UserError: the name is taken.
+        """
+        if name in self:
+            raise UserError(f"there is a{'n' * (self.kind[0] in 'aeiou')} {self.kind} {name!r} already: choose another name")
+        self[name] = thing
+
+    def find(self, name: str) -> Thing:
+        """Finds a thing.
+
+        Raises:
+            UserError: the name is unknown.
+        """
+        return pick(self, name, self.kind)
+
+
+def pick(table: Mapping[str, Thing], name: str, kind: str) -> Thing:
+    """Looks a name up.
+
+    Raises:
+        UserError: the table lacks it; the message lists the names that it has.
+    """
+    if read(str, name, kind) not in table:
+        raise UserError(f"unknown {kind} {short(name)}{hint(name, table)}: choose one of {', '.join(table)}")
+    return table[name]
