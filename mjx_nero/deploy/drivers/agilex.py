@@ -39,7 +39,7 @@ class Model:
 
     @property
     def count(self) -> int:
-        """Of the joints."""
+        """Number of joints."""
         return len(self.fast)
 
 

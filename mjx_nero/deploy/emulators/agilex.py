@@ -105,7 +105,7 @@ class CanPort:
         self._message, self._bus = can.Message, can.Bus(interface=interface, channel=channel)
 
     def take(self) -> None:
-        """What has come."""
+        """Takes what has arrived."""
         while message := self._bus.recv(0.0):
             self.arm.take(message.arbitration_id, bytes(message.data))
 
@@ -148,7 +148,7 @@ class Port:
                 self.say()
 
     def take(self) -> None:
-        """What has come."""
+        """Takes what has arrived."""
         with contextlib.suppress(BlockingIOError):
             self._take(os.read(self._master, 4096))
 
