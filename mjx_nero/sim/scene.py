@@ -139,7 +139,7 @@ class SimCfg:
     elliptic: bool = True  # friction cones; else pyramids
     contacts_per_env: Slots = 24  # Warp: contact slots, times the number of environments
     constraints_per_env: Slots = 128  # Warp: constraint rows of one environment
-    solver: Annotated[str, OneOf("newton", "mujoco_warp")] = "newton"  # Warp: the package's own kernel, or the engine's
+    solver: Annotated[str, OneOf("newton", "mujoco_warp")] = "newton"  # Warp: the package's own kernels, or the engine's
 
     def finer(self, max_step: float) -> "SimCfg":
         """Splits each physics step until none is longer than ``max_step`` [s]; the control step stays. 0 changes nothing."""

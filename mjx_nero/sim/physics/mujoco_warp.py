@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.sim import touch
-from mjx_nero.sim.physics import Footprint, fusion, newton, possible
+from mjx_nero.sim.physics import Footprint, dynamics, fusion, kernels, newton, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -163,29 +163,53 @@ class WarpPhysics:
         drawn = self._world_fields(model, n)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
-        solve = newton.make(model, data) if cfg.solver == "newton" else functools.partial(mujoco_warp.solve, model, data)
-        strongest, sense = self._sense(model, data)
+        step, strongest = self._stepper(model, data)
 
         def run():
             data.overflow.zero_()
             if strongest is not None:
                 strongest.zero_()
             for _ in range(self.decimation):
-                mujoco_warp.fwd_position(model, data, factorize=False)
-                mujoco_warp.fwd_velocity(model, data)
-                mujoco_warp.fwd_actuation(model, data)
-                mujoco_warp.fwd_acceleration(model, data, factorize=True)
-                solve()
-                sense()
-                mujoco_warp.implicit(model, data)
+                step()
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, drawn, run, strongest, run
-        _load_kernels()
-        run()  # loads those made for this model, which cannot be done while a graph is captured
+        kernels.load(run)
+        run()  # makes what kernels keep between launches, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
         return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
+
+    def _stepper(self, model: Any, data: Any) -> tuple[Callable[[], None], Any]:
+        """Makes the function of one physics step, and the array of the strongest unwanted contacts."""
+        from mujoco.mjx.third_party import mujoco_warp
+
+        strongest, sense = self._sense(model, data)
+        own = self._cfg.solver == "newton"
+        solve = newton.make(model, data) if own else functools.partial(mujoco_warp.solve, model, data)
+
+        def engines():
+            mujoco_warp.fwd_position(model, data, factorize=False)
+            mujoco_warp.fwd_velocity(model, data)
+            mujoco_warp.fwd_actuation(model, data)
+            mujoco_warp.fwd_acceleration(model, data, factorize=True)
+            solve()
+            sense()
+            mujoco_warp.implicit(model, data)
+
+        if not own or dynamics.missing(self.model) or not newton.fits(model, data):
+            return engines, strongest
+        before, after = dynamics.make(self.model, model, data)
+
+        def ours():
+            before()
+            mujoco_warp.collision(model, data)
+            mujoco_warp.make_constraint(model, data)
+            solve()
+            sense()
+            after()
+
+        return ours, strongest
 
     def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
         """Makes the array of each world's strongest unwanted contact [N], and the function that updates it after the solver.
@@ -244,12 +268,3 @@ class WarpPhysics:
             setattr(model, name, view)
             at += size
         return drawn
-
-
-def _load_kernels() -> None:
-    """Compiles the parts of MuJoCo Warp that every model needs in parallel; a first run would compile them one by one."""
-    import warp as wp
-    from mujoco.mjx.third_party.mujoco_warp._src import constraint, derivative, forward, passive, smooth, support
-
-    parts = (constraint, derivative, forward, passive, smooth, support)
-    wp.force_load(wp.get_device(), [wp.get_module(part.__name__) for part in parts], max_workers=len(parts))

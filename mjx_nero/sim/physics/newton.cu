@@ -82,7 +82,7 @@ for (int t = 0; t < turns; ++t) {
     const int i = t * lanes + lane;
     low[t] = high[t] = 0;
     if (i >= NV) continue;
-    a[i] = n ? in.qacc_warmstart.data[world * NV + i] : in.qacc_smooth.data[world * NV + i];
+    a[i] = in.qacc_warmstart.data[world * NV + i];
     auto root = [&](int j) { return in.M_colind.data[in.M_rowadr.data[j]]; };
     low[t] = root(i), high[t] = i + 1;
     while (high[t] < NV && root(high[t]) == low[t]) ++high[t];
@@ -171,7 +171,7 @@ auto sliding = [&](int row, const float* Jx, const float* Jy, int apart) {
 
 multiply(a, Ma, r, aref);
 int iteration = 0;
-while (iteration < in.iterations && n) {
+while (iteration < in.iterations) {
     for (int row = lane; row < n; row += lanes) {
         const int dim = cone[row];
         if (dim < 0) continue;

@@ -33,6 +33,11 @@ def floats(nv: int, njmax: int, dense: bool) -> int | None:
     return size if nv <= _DOFS and 4 * size <= _SHARED_BYTES else None
 
 
+def fits(model, data) -> bool:
+    """True if the kernel can solve for this model; MuJoCo Warp's own solver does otherwise."""
+    return floats(model.nv, data.njmax, not model.is_sparse) is not None
+
+
 def make(model, data) -> Callable[[], None]:
     """Makes a function that writes the solution to ``data.qacc`` and ``data.efc.Ma``, which is all that MuJoCo Warp's integrators
     read.
@@ -56,7 +61,7 @@ def make(model, data) -> Callable[[], None]:
     numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
     numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
     source = "".join(f"constexpr int {name} = {value};\n" for name, value in numbers.items()) + _solver()
-    arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_smooth", "qacc_warmstart")}
+    arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_warmstart")}
     arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
     arrays |= {f"efc_J_{name}": getattr(data.efc, f"J_{name}") for name in ("rownnz", "rowadr", "colind")}
     arrays |= {f"contact_{name}": getattr(data.contact, name) for name in ("friction", "dim", "efc_address")}

@@ -1,0 +1,70 @@
+"""Kernels of Warp: made from a source of this folder, and compiled side by side."""
+
+from collections.abc import Callable, Iterable, Mapping
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+
+def make(name: str, constants: Mapping[str, int | Iterable[int]], values: Mapping[str, Any], n: int) -> Callable[[], None]:
+    """A source of this folder as a function without arguments, a thread for each of ``n`` environments.
+
+    Args:
+        name: the source's, without ``.cu``: the body of a function of (world, problem).
+        constants: numbers and tables that it is compiled with.
+        values: the fields of ``problem``: Warp's arrays, and whole numbers.
+    """
+    import warp as wp
+
+    types: dict[str, Any] = {
+        key: int if isinstance(x, int) else wp.array(dtype=x.dtype, ndim=x.ndim) for key, x in values.items()
+    }
+    Problem = wp.struct(type("Problem", (), {"__annotations__": types}))
+    problem = Problem()
+    for key, x in values.items():
+        setattr(problem, key, x)
+
+    @wp.func_native("".join(map(_constant, constants, constants.values())) + source(name))
+    def work(world: int, problem: Problem): ...  # type: ignore[valid-type]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def environments(problem: Problem):  # type: ignore[valid-type]
+        work(wp.tid(), problem)
+
+    return lambda: wp.launch(environments, dim=n, inputs=[problem], block_dim=32)
+
+
+def source(name: str) -> str:
+    """A source of this folder."""
+    return resources.files(__package__).joinpath(f"{name}.cu").read_text()
+
+
+def load(work: Callable[[], None]) -> None:
+    """Compiles all that ``work`` would launch on the current device, side by side, and launches nothing.
+
+    Warp compiles a kernel when it is first launched, so a first call of ``work`` would compile one after another; and the modules
+    of MuJoCo Warp hold many kernels that no model here needs.
+    """
+    import warp as wp
+
+    found: dict[int, dict[Any, None]] = {}  # by block size, in order
+    launch, launch_tiled = wp.launch, wp.launch_tiled
+
+    def note(kernel: Any, dim: Any = (), *args: Any, block_dim: int = 256, **kwargs: Any) -> None:
+        if np.prod(dim) and not kernel.is_generic:
+            found.setdefault(block_dim, {})[kernel.module] = None
+
+    wp.launch = wp.launch_tiled = note
+    try:
+        work()
+    finally:
+        wp.launch, wp.launch_tiled = launch, launch_tiled
+    for block_dim, modules in found.items():
+        wp.force_load(wp.get_device(), list(modules), block_dim=block_dim, max_workers=len(modules))
+
+
+def _constant(name: str, value: int | Iterable[int]) -> str:
+    if isinstance(value, int):
+        return f"constexpr int {name} = {value};\n"
+    return f"static constexpr int {name}[] = {{{', '.join(str(int(x)) for x in value) or '0'}}};\n"
