@@ -3,8 +3,8 @@
 // "Rigid Body Dynamics Algorithms", 5.3), the joint-space inertia M by composite rigid bodies (6.2), passive forces and drives.
 //
 // Bodies and degrees of freedom have MuJoCo's order: parents before children. A row of M has the columns of the degrees of freedom
-// between the root of the tree and its own. Spatial vectors are (angular, linear), in the world's axes about the centre of mass of
-// the tree.
+// between the root of the tree and its own. Spatial vectors are (angular, linear), in the world's axes about the first joint of the
+// tree: MuJoCo takes its centre of mass, and whoever reads ``subtree_com`` only asks what ``cdof`` is about.
 //
 // The body of a function of (world, problem) that dynamics.py compiles, after the model's sizes and tables.
 
@@ -49,6 +49,11 @@ auto momentum = [&](const I& i, S v) {
                     r[4] * v.a.x + r[5] * v.a.y + r[2] * v.a.z};
     return S{spin + cross(i.h, v.l), v.l * i.m - cross(i.h, v.a)};
 };
+auto sum = [](I a, const I& b) {
+    for (int k = 0; k < 6; ++k) a.r[k] += b.r[k];
+    a.h = a.h + b.h, a.m += b.m;
+    return a;
+};
 auto moved = [&](S v, S axis) { return S{cross(v.a, axis.a), cross(v.a, axis.l) + cross(v.l, axis.a)}; };  // d axis / dt
 auto pressed = [&](S v, S p) { return S{cross(v.a, p.a) + cross(v.l, p.l), cross(v.a, p.l)}; };            // d p / dt
 auto along = [&](S axis, S force) { return dot(axis.a, force.a) + dot(axis.l, force.l); };
@@ -69,98 +74,46 @@ auto put_matrix = [](float* to, R m) {
 const float *qpos = in.qpos.data + (size_t)world * NQ, *qvel = in.qvel.data + (size_t)world * NV;
 const float h = in.timestep.data[world % in.timestep.shape[0]];
 
-// Where bodies are, and each joint's axis and anchor; the trees' centres of mass.
-V at[NB], centre[NB], anchor[NJ], axis[NJ], com[NB];
+// From the roots to the leaves: where bodies are, how they move, the accelerations that this and gravity cause, and the forces which
+// that takes. Chains are long, so a body's state stays in registers for the next one; others look it up.
+V at[NB];
 Q turned[NB];
-float mass[NB];
-{
-    const float *body_pos = of(in.body_pos), *body_quat = of(in.body_quat), *body_ipos = of(in.body_ipos);
-    const float *mocap_pos = of(in.mocap_pos), *mocap_quat = of(in.mocap_quat);
-    const float *body_mass = of(in.body_mass), *jnt_pos = of(in.jnt_pos), *jnt_axis = of(in.jnt_axis), *qpos0 = of(in.qpos0);
-    at[0] = {0, 0, 0}, turned[0] = {1, {0, 0, 0}};
-    for (int b = 0; b < NB; ++b) com[b] = {0, 0, 0}, mass[b] = 0.0f;
-#pragma unroll 1  // here and below: unrolled, the whole tree would not fit the instruction cache
-    for (int b = 1; b < NB; ++b) {
-        const int p = PARENT[b];
-        V x = at[p] + rotate(turned[p], MOCAP[b] < 0 ? vector(body_pos, b) : vector(mocap_pos, MOCAP[b]));
-        Q q = times(turned[p], MOCAP[b] < 0 ? quaternion(body_quat, b) : quaternion(mocap_quat, MOCAP[b]));
-#pragma unroll 1
-        for (int j = FIRST_JOINT[b]; j < FIRST_JOINT[b + 1]; ++j) {
-            const float* value = qpos + QPOS[j];
-            const V local = vector(jnt_axis, j), offset = vector(jnt_pos, j);
-            if (TYPE[j] == FREE) {
-                x = vector(value, 0), q = unit(Q{value[3], {value[4], value[5], value[6]}});
-                anchor[j] = x, axis[j] = local;
-                continue;
-            }
-            anchor[j] = x + rotate(q, offset), axis[j] = rotate(q, local);
-            const float by = *value - qpos0[QPOS[j]];
-            if (TYPE[j] == SLIDE) {
-                x = x + axis[j] * by;
-            } else {
-                q = times(q, Q{cosf(0.5f * by), local * sinf(0.5f * by)});
-                x = anchor[j] - rotate(q, offset);
-            }
-        }
-        at[b] = x, turned[b] = unit(q);
-        centre[b] = x + rotate(turned[b], vector(body_ipos, b));
-        const int root = ROOT[b];
-        com[root] = com[root] + centre[b] * body_mass[b], mass[root] += body_mass[b];
-    }
-#pragma unroll 1
-    for (int b = 1; b < NB; ++b) {
-        if (ROOT[b] != b) continue;
-        com[b] = mass[b] > 0.0f ? com[b] * (1.0f / mass[b]) : centre[b];
-        put((float*)(in.subtree_com.data + (size_t)world * NB + b), com[b]);
-    }
-    const float *geom_pos = of(in.geom_pos), *geom_quat = of(in.geom_quat);
-#pragma unroll 1
-    for (int g = 0; g < NG; ++g) {
-        const int b = BODY_OF_GEOM[g];
-        if (b < 0) continue;  // stands still
-        put((float*)(in.geom_xpos.data + (size_t)world * NG + g), at[b] + rotate(turned[b], vector(geom_pos, g)));
-        put_matrix((float*)(in.geom_xmat.data + (size_t)world * NG + g), matrix(times(turned[b], quaternion(geom_quat, g))));
-    }
-}
-
-// Velocities, the accelerations that they and gravity cause, and the forces which that takes.
 I inertia[NB];
 S velocity[NB], acceleration[NB], force[NB], dof[NV];
 {
-    const float *body_mass = of(in.body_mass), *body_inertia = of(in.body_inertia), *body_iquat = of(in.body_iquat);
+    const float *body_pos = of(in.body_pos), *body_quat = of(in.body_quat), *body_ipos = of(in.body_ipos);
+    const float *body_iquat = of(in.body_iquat), *body_mass = of(in.body_mass), *body_inertia = of(in.body_inertia);
     const float *gravcomp = of(in.body_gravcomp), *gravity = (const float*)(in.gravity.data + world % in.gravity.shape[0]);
+    const float *jnt_pos = of(in.jnt_pos), *jnt_axis = of(in.jnt_axis), *qpos0 = of(in.qpos0);
+    const float *mocap_pos = of(in.mocap_pos), *mocap_quat = of(in.mocap_quat), *geom_pos = of(in.geom_pos);
+    const float* geom_quat = of(in.geom_quat);
     const V down = {gravity[0], gravity[1], gravity[2]};
-    velocity[0] = {{0, 0, 0}, {0, 0, 0}}, acceleration[0] = {{0, 0, 0}, down * -1.0f};
-#pragma unroll 1
+    V x = at[0] = {0, 0, 0}, origin = x;
+    Q q = turned[0] = {1, {0, 0, 0}};
+    S v = velocity[0] = {{0, 0, 0}, {0, 0, 0}}, a = acceleration[0] = {{0, 0, 0}, down * -1.0f};
+#pragma unroll 1  // here and below: unrolled, the whole tree would not fit the instruction cache
     for (int b = 1; b < NB; ++b) {
-        const V origin = com[ROOT[b]], away = centre[b] - origin, diagonal = vector(body_inertia, b);
-        const float m = body_mass[b];
-        const R frame = matrix(times(turned[b], quaternion(body_iquat, b)));
-        auto about = [&](float V::*i, float V::*j) {
-            return diagonal.x * frame.x.*i * frame.x.*j + diagonal.y * frame.y.*i * frame.y.*j + diagonal.z * frame.z.*i * frame.z.*j -
-                   m * away.*i * away.*j;
+        const int p = PARENT[b];
+        if (p != b - 1) x = at[p], q = turned[p], v = velocity[p], a = acceleration[p];
+        x = x + rotate(q, MOCAP[b] < 0 ? vector(body_pos, b) : vector(mocap_pos, MOCAP[b]));
+        q = times(q, MOCAP[b] < 0 ? quaternion(body_quat, b) : quaternion(mocap_quat, MOCAP[b]));
+        auto move = [&](int i, S way, S change) {
+            dof[i] = way, a = a + change * qvel[i];
+            if (!LINKS) return;
+            float* to = (float*)(in.cdof_dot.data + (size_t)world * NV + i);
+            put(to, change.a), put(to + 3, change.l);
         };
-        const float square = m * dot(away, away);
-        const I own = {{about(&V::x, &V::x) + square, about(&V::y, &V::y) + square, about(&V::z, &V::z) + square, about(&V::x, &V::y),
-                        about(&V::x, &V::z), about(&V::y, &V::z)},
-                       away * m,
-                       m};
-        S v = velocity[PARENT[b]], a = acceleration[PARENT[b]];
-        auto move = [&](int i, S along_it, S change) {
-            dof[i] = along_it, a = a + change * qvel[i];
-            if (LINKS) {
-                float* to = (float*)(in.cdof_dot.data + (size_t)world * NV + i);
-                put(to, change.a), put(to + 3, change.l);
-            }
-        };
+        bool begins = ROOT[b] == b;
 #pragma unroll 1
         for (int j = FIRST_JOINT[b]; j < FIRST_JOINT[b + 1]; ++j) {
+            const float* value = qpos + QPOS[j];
             const int i = DOF[j];
-            const V arm = origin - anchor[j];
+            const V offset = vector(jnt_pos, j), local = vector(jnt_axis, j);
             if (TYPE[j] == FREE) {
-                const R ways = matrix(turned[b]);
-                const S none = {{0, 0, 0}, {0, 0, 0}}, rx = {ways.x, cross(ways.x, arm)}, ry = {ways.y, cross(ways.y, arm)};
-                const S rz = {ways.z, cross(ways.z, arm)};
+                x = vector(value, 0), q = unit(Q{value[3], {value[4], value[5], value[6]}});
+                origin = x, begins = false;
+                const R ways = matrix(q);
+                const S none = {{0, 0, 0}, {0, 0, 0}}, rx = {ways.x, {0, 0, 0}}, ry = {ways.y, {0, 0, 0}}, rz = {ways.z, {0, 0, 0}};
                 move(i, {{0, 0, 0}, {1, 0, 0}}, none), move(i + 1, {{0, 0, 0}, {0, 1, 0}}, none);
                 move(i + 2, {{0, 0, 0}, {0, 0, 1}}, none);
                 v.l = v.l + V{qvel[i], qvel[i + 1], qvel[i + 2]};
@@ -168,24 +121,51 @@ S velocity[NB], acceleration[NB], force[NB], dof[NV];
                 v = v + rx * qvel[i + 3] + ry * qvel[i + 4] + rz * qvel[i + 5];
                 continue;
             }
-            const S way = TYPE[j] == SLIDE ? S{{0, 0, 0}, axis[j]} : S{axis[j], cross(axis[j], arm)};
+            const V anchor = x + rotate(q, offset), axis = rotate(q, local);
+            if (begins) origin = anchor, begins = false;
+            const float by = *value - qpos0[QPOS[j]];
+            if (TYPE[j] == SLIDE) {
+                x = x + axis * by;
+            } else {
+                q = times(q, Q{cosf(0.5f * by), local * sinf(0.5f * by)});
+                x = anchor - rotate(q, offset);
+            }
+            const S way = TYPE[j] == SLIDE ? S{{0, 0, 0}, axis} : S{axis, cross(axis, origin - anchor)};
             move(i, way, moved(v, way));
             v = v + way * qvel[i];
         }
-        velocity[b] = v, acceleration[b] = a, inertia[b] = own;
-        force[b] = momentum(own, a) + pressed(v, momentum(own, v));
+        if (begins) origin = x;
+        q = unit(q);
+        at[b] = x, turned[b] = q, velocity[b] = v, acceleration[b] = a;
+        if (ROOT[b] == b) put((float*)(in.subtree_com.data + (size_t)world * NB + b), origin);
+#pragma unroll 1
+        for (int g = FIRST_GEOM[b]; g < FIRST_GEOM[b + 1]; ++g) {
+            if (STANDS[g]) continue;
+            put((float*)(in.geom_xpos.data + (size_t)world * NG + g), x + rotate(q, vector(geom_pos, g)));
+            put_matrix((float*)(in.geom_xmat.data + (size_t)world * NG + g), matrix(times(q, quaternion(geom_quat, g))));
+        }
+        const V away = x + rotate(q, vector(body_ipos, b)) - origin, diagonal = vector(body_inertia, b);
+        const R frame = matrix(times(q, quaternion(body_iquat, b)));
+        const float m = body_mass[b], square = m * dot(away, away);
+        auto about = [&](float V::*i, float V::*j) {
+            return diagonal.x * frame.x.*i * frame.x.*j + diagonal.y * frame.y.*i * frame.y.*j + diagonal.z * frame.z.*i * frame.z.*j -
+                   m * away.*i * away.*j;
+        };
+        const I own = {{about(&V::x, &V::x) + square, about(&V::y, &V::y) + square, about(&V::z, &V::z) + square, about(&V::x, &V::y),
+                        about(&V::x, &V::z), about(&V::y, &V::z)},
+                       away * m,
+                       m};
+        S f = momentum(own, a) + pressed(v, momentum(own, v));
         if (GRAVCOMP && gravcomp[b] != 0.0f) {  // lifts the body at its centre of mass
             const V lift = down * (-m * gravcomp[b]);
-            force[b] = force[b] + S{cross(away, lift), lift} * -1.0f;
+            f = f + S{cross(away, lift), lift} * -1.0f;
         }
-        if (LINKS) {
-            float* to = (float*)(in.cvel.data + (size_t)world * NB + b);
-            put(to, v.a), put(to + 3, v.l);
-            put((float*)(in.xpos.data + (size_t)world * NB + b), at[b]);
-            put_matrix((float*)(in.xmat.data + (size_t)world * NB + b), matrix(turned[b]));
-            float* quat = (float*)(in.xquat.data + (size_t)world * NB + b);
-            quat[0] = turned[b].w, put(quat + 1, turned[b].v);
-        }
+        inertia[b] = own, force[b] = f;
+        if (!LINKS) continue;
+        float *speed = (float*)(in.cvel.data + (size_t)world * NB + b), *quat = (float*)(in.xquat.data + (size_t)world * NB + b);
+        put(speed, v.a), put(speed + 3, v.l), quat[0] = q.w, put(quat + 1, q.v);
+        put((float*)(in.xpos.data + (size_t)world * NB + b), x);
+        put_matrix((float*)(in.xmat.data + (size_t)world * NB + b), matrix(q));
     }
 }
 
@@ -194,25 +174,29 @@ float M[NM], smooth[NV], implicit[NV];
 {
     const float *armature = of(in.dof_armature), *damping = of(in.dof_damping), *curve = of(in.dof_dampingpoly);
     const float *stiffness = of(in.jnt_stiffness), *stiffening = of(in.jnt_stiffnesspoly), *rest = of(in.qpos_spring);
+    S f = force[NB - 1];
+    I carried = inertia[NB - 1];
 #pragma unroll 1
     for (int b = NB - 1; b > 0; --b) {
 #pragma unroll 1
         for (int i = FIRST_DOF[b + 1] - 1; i >= FIRST_DOF[b]; --i) {
-            const S carried = momentum(inertia[b], dof[i]);
+            const S along_it = momentum(carried, dof[i]);
             const int begin = ROW[i], n = ROW[i + 1] - begin;
-#pragma unroll 1
-            for (int k = 0; k < n; ++k) M[begin + k] = along(dof[COLUMN[begin + k]], carried);
+#pragma unroll 2
+            for (int k = 0; k < n; ++k) M[begin + k] = along(dof[COLUMN[begin + k]], along_it);
             M[begin + n - 1] += armature[i];
             // A damper's force is -v (d + d1 |v| + d2 v^2).
             const float speed = fabsf(qvel[i]), d = damping[i], d1 = curve[2 * i], d2 = curve[2 * i + 1];
-            smooth[i] = -along(dof[i], force[b]) - qvel[i] * (d + (d1 + d2 * speed) * speed);
+            smooth[i] = -along(dof[i], f) - qvel[i] * (d + (d1 + d2 * speed) * speed);
             implicit[i] = d + (2.0f * d1 + 3.0f * d2 * speed) * speed;
         }
+        if (FREE_AT[b] >= 0) inertia[b] = carried;
         const int p = PARENT[b];
-        if (p == 0) continue;
-        force[p] = force[p] + force[b];
-        for (int k = 0; k < 6; ++k) inertia[p].r[k] += inertia[b].r[k];
-        inertia[p].h = inertia[p].h + inertia[b].h, inertia[p].m += inertia[b].m;
+        const S below = f;
+        const I lower = carried;
+        f = force[b - 1], carried = inertia[b - 1];
+        if (p == b - 1) f = f + below, carried = sum(carried, lower);
+        else if (p > 0) force[p] = force[p] + below, inertia[p] = sum(inertia[p], lower);
     }
 #pragma unroll 1
     for (int j = 0; j < NJ; ++j) {
@@ -264,9 +248,14 @@ for (int i = 0; i < NV; ++i) {
 for (int f = 0; f < NFREE; ++f) {
     const int b = FREE_BODY[f], i = FIRST_DOF[b];
     const R ways = matrix(turned[b]);
-    const V s = com[b] - at[b], w = ways.x * qvel[i + 3] + ways.y * qvel[i + 4] + ways.z * qvel[i + 5], ws = cross(w, s);
     const float m = inertia[b].m;
-    I spinning = inertia[b];
+    const V s = inertia[b].h * (1.0f / m), w = ways.x * qvel[i + 3] + ways.y * qvel[i + 4] + ways.z * qvel[i + 5], ws = cross(w, s);
+    I spinning = inertia[b];  // about the centre of mass
+    const float* r = inertia[b].r;
+    const float square = m * dot(s, s);
+    spinning.r[0] = r[0] - square + m * s.x * s.x, spinning.r[1] = r[1] - square + m * s.y * s.y;
+    spinning.r[2] = r[2] - square + m * s.z * s.z, spinning.r[3] = r[3] + m * s.x * s.y;
+    spinning.r[4] = r[4] + m * s.x * s.z, spinning.r[5] = r[5] + m * s.y * s.z;
     spinning.h = {0, 0, 0}, spinning.m = 0.0f;
     auto spun = [&](V u) { return momentum(spinning, {u, {0, 0, 0}}).a; };
     const V Jw = spun(w);
