@@ -235,3 +235,30 @@ def test_memory_of_warp(env):
     physics._bytes = 2**18
     assert warp_mb(types.SimpleNamespace(physics=physics, num_envs=12)) == 3.0
     assert warp_mb(env) is None
+
+
+@pytest.mark.slow
+def test_the_stages_of_a_start(call, tmp_path):
+    argv = [
+        "--what",
+        "start",
+        "--env",
+        "nero_reach",
+        "--num-envs",
+        "4",
+        "--impl",
+        "native",
+        "--json",
+        str(tmp_path / "rows.json"),
+    ]
+    assert call("benchmark", *argv)[0] == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    stages = {caches: {row["stage"]: row for row in rows if row["caches"] == caches} for caches in ("empty", "filled")}
+    assert set(stages["empty"]) == set(stages["filled"])
+    for found in stages.values():
+        assert (
+            found["until the first training step"]["seconds"]
+            == found["first iteration"]["begins_s"]
+            > found["imports"]["seconds"]
+        )
+    assert stages["filled"]["learner, compiled"]["seconds"] < 0.5 * stages["empty"]["learner, compiled"]["seconds"]

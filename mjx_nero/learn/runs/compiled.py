@@ -5,7 +5,7 @@ import contextlib
 import copy
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,6 +17,7 @@ from mjx_nero.learn.learner import Learner, Metrics
 from mjx_nero.learn.play import rollout
 from mjx_nero.learn.runs import starts
 from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.runs.spans import Span, Spans
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Compiled:
     state: Any
     evaluate: "Evaluator"
     seconds: float
+    spans: Sequence[Span] = ()
 
     @property
     def steps(self) -> int:
@@ -105,21 +107,25 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
     Raises:
         UserError: the run does not fit into memory.
     """
-    begun, env = time.perf_counter(), learner.env.unwrapped
+    begun, env, spans = time.perf_counter(), learner.env.unwrapped, Spans()
+    prepare, start = spans.timed("physics", env.physics.prepare), spans.timed("first state", start)
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
-        waiting = [side_by_side.submit(env.physics.prepare, run.num_envs // learner.num_devices, run.num_devices)]
+        waiting = [side_by_side.submit(prepare, run.num_envs // learner.num_devices, run.num_devices)]
         starting = side_by_side.submit(start)
-        shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
-        program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
-        compiling = side_by_side.submit(program.compile, env.physics.compiler_options)
+        with spans.span("learner, traced"):
+            shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
+            program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
+        compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile), env.physics.compiler_options)
         state = starting.result()
-        evaluate = Evaluator(run, learner)
-        waiting.append(side_by_side.submit(evaluate.compiler(state)))
+        with spans.span("evaluation, traced"):
+            evaluate = Evaluator(run, learner)
+            compiler = evaluate.compiler(state)
+        waiting.append(side_by_side.submit(spans.timed("evaluation, compiled", compiler)))
         advance = compiling.result()
         device_memory.check_compiled(learner, advance)
         for work in waiting:
             work.result()
-    return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun)
+    return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun, spans.found)
 
 
 @contextlib.contextmanager

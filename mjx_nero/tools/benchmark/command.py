@@ -8,6 +8,7 @@ import pathlib
 import re
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.learn.runs import compiled
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools import cli
-from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, throughput
+from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, start, throughput
 from mjx_nero.tools.benchmark.program import Row
 
 WHATS = {
@@ -34,6 +35,7 @@ WHATS = {
     "reset": "batched resets",
     "render": "frames of the offscreen renderer",
     "learning": "seeds trained until they succeed",
+    "start": "what comes before the first training step, in a process of its own",
     "ik": "inverse kinematics",
 }
 _SIZES = "1024,4096,16384"
@@ -49,6 +51,7 @@ _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the ta
     ("reset",): ("what", "impl", "num_envs", "resets_per_s", *_MEMORY),
     ("render",): ("what", "gl", "width", "height", "frames_per_s"),
     ("learning",): (*("impl", "num_envs", "seed", "reached", "seconds", "evaluation_s", "env_steps", "success_rate", *_COUNTS),),
+    ("start",): ("impl", "num_envs", "caches", "stage", "begins_s", "seconds"),
     ("ik",): (*("solver", "batch", "ms_per_batch", "solves_per_s", "success", "error_mm", "error_mrad", "compile_s"),),
 }
 
@@ -76,7 +79,7 @@ def main(argv: Sequence[str]) -> None:
     _check_files(args.json, args.plot, whats)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
-    jobs = _jobs(args, cfg, dotted.get(args.learner, {}), whats)
+    jobs = _jobs(args, cfg, dotted.get(args.learner, {}), whats, argv)
     head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
     here = machine.machine()
     report = {"machine": here, "versions": machine.versions(), "command": command(argv), "complete": False}
@@ -141,7 +144,19 @@ def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     return {"env": cfg, args.learner: run_cfg.learner_cfg(cfg, args.preset, args.learner)}
 
 
-def _jobs(args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str]) -> list[_Job]:
+def begin() -> None:
+    """The process of ``--what start``; the first argument is when it was started, the others are the benchmark's."""
+    imported, spawned, argv = time.time(), float(sys.argv[1]), sys.argv[2:]
+    args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    cli.setup_jax()
+    cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
+    impl, sizes = resolve_impl(args.impl.split(",")[0]), args.num_envs or [0]
+    start.begin(spawned, imported, _run(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
+
+
+def _jobs(
+    args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str], argv: Sequence[str]
+) -> list[_Job]:
     """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here."""
     make_run = functools.partial(_run, args, hyperparameters)
     jobs = []
@@ -153,6 +168,9 @@ def _jobs(args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, s
                     rows = functools.partial(learning.measure_learning, run, args.seeds, args.target)
                     compiled.make_learner(run)
                     jobs.append(_Job(what, impl, run.num_envs, rows))
+            elif what == "start":
+                run = make_run(cfg, impl, (args.num_envs or [0])[0])
+                jobs.append(_Job(what, impl, run.num_envs, functools.partial(start.measure_start, argv, run)))
             elif what not in ("ik", "render"):
                 task = for_controllers(cfg) if what == "control" else cfg
                 sizes = args.num_envs or _sizes(_SIZES)

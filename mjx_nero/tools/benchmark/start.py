@@ -1,0 +1,84 @@
+"""What a user waits for before the first training step: every second of it, with empty caches and with filled ones."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+
+import jax
+
+from mjx_nero.errors import UserError
+from mjx_nero.learn.runs import compiled
+from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.runs.spans import Span, Spans
+from mjx_nero.tools.benchmark.program import Row
+
+_CHILD = "from mjx_nero.tools.benchmark import command; command.begin()"
+
+
+def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
+    """Yields a row for each stage of a start, twice: with empty caches of JAX and Warp, then with what that start has left there.
+
+    Stages run side by side, so each has when it begins and how long it takes. Each start is a process of its own.
+
+    Args:
+        argv: of this benchmark, for the new process.
+        run: what it starts, of ``run_cfg.fit_machine``.
+
+    Raises:
+        UserError: a start failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        for caches in ("empty", "filled"):
+            for stage in _started(argv, pathlib.Path(folder)):
+                seconds = {"begins_s": round(stage.begun, 1), "seconds": round(stage.seconds, 1)}
+                yield {
+                    "what": "start",
+                    "impl": run.impl,
+                    "num_envs": run.num_envs,
+                    "caches": caches,
+                    "stage": stage.name,
+                    **seconds,
+                }
+
+
+def _started(argv: Sequence[str], caches: pathlib.Path) -> list[Span]:
+    env = {key: value for key, value in os.environ.items() if key not in ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH")}
+    begun = time.time()
+    done = subprocess.run(
+        [sys.executable, "-c", _CHILD, str(begun), *argv],
+        env={**env, "XDG_CACHE_HOME": str(caches)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    if done.returncode:
+        raise UserError("the start that was to be measured failed: see above")
+    stages = [Span(*row) for row in json.loads(done.stdout.splitlines()[-1])]
+    return [*stages, Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iteration"))]
+
+
+def begin(spawned: float, imported: float, run: RunCfg) -> None:
+    """Starts a run, takes one iteration and one evaluation, and prints the stages as JSON in a line.
+
+    Args:
+        spawned, imported: when the process was started, and when its modules were there [s since 1970].
+        run: of ``run_cfg.fit_machine``.
+    """
+    so_far = time.time() - spawned
+    spans = Spans()
+    with spans.span("environments"):
+        learner = compiled.make_learner(run)
+    before = time.time() - spawned
+    made = compiled.compile(run, learner, 1, lambda: compiled.starter(learner)(0))
+    with spans.span("first iteration"):
+        state, _ = jax.block_until_ready(made.advance(made.state))
+    with spans.span("first evaluation"):
+        made.evaluate(state)
+    stages = [Span("imports", 0.0, imported - spawned), Span("config", imported - spawned, spawned + so_far - imported)]
+    stages += [Span(name, begun + so_far, seconds) for name, begun, seconds in spans.found]
+    stages += [Span(name, begun + before, seconds) for name, begun, seconds in made.spans]
+    print(json.dumps(sorted(stages, key=lambda stage: stage.begun)))
