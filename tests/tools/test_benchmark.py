@@ -245,7 +245,7 @@ def test_the_stages_of_a_start(call, tmp_path):
         "--env",
         "nero_reach",
         "--num-envs",
-        "4",
+        "8",
         "--impl",
         "native",
         "--json",

@@ -170,6 +170,7 @@ def _jobs(
                     jobs.append(_Job(what, impl, run.num_envs, rows))
             elif what == "start":
                 run = make_run(cfg, impl, (args.num_envs or [0])[0])
+                compiled.make_learner(run)
                 jobs.append(_Job(what, impl, run.num_envs, functools.partial(start.measure_start, argv, run)))
             elif what not in ("ik", "render"):
                 task = for_controllers(cfg) if what == "control" else cfg
