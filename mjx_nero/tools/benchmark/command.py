@@ -150,7 +150,7 @@ def begin() -> None:
     args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _cfgs)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
-    impl, sizes = resolve_impl(args.impl.split(",")[0]), args.num_envs or [0]
+    impl, sizes = resolve_impl(args.impl), args.num_envs or [0]
     start.begin(spawned, imported, _run(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
 
 
@@ -171,7 +171,7 @@ def _jobs(
             elif what == "start":
                 run = make_run(cfg, impl, (args.num_envs or [0])[0])
                 compiled.make_learner(run)
-                jobs.append(_Job(what, impl, run.num_envs, functools.partial(start.measure_start, argv, run)))
+                jobs.append(_Job(what, impl, run.num_envs, functools.partial(start.measure_start, [*argv, "--impl", impl], run)))
             elif what not in ("ik", "render"):
                 task = for_controllers(cfg) if what == "control" else cfg
                 sizes = args.num_envs or _sizes(_SIZES)
