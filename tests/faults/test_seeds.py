@@ -9,7 +9,8 @@ import pytest
 from faults_run import STEPS, last, rows
 
 from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import loop, seeds, track
+from mjx_nero.learn.runs import loop, track
+from mjx_nero.tools import seeds
 
 
 def test_each_seed_is_the_run_that_it_is_alone(train, tmp_path):

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero import console, files
-from mjx_nero.sim.motion import moves
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tools import cli, self_test
 from mjx_nero.tools.inspection.report import environments, find, inspect, picture
 from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
+from mjx_nero.tools.motion import moves
 
 
 def main(argv: Sequence[str]) -> None:
