@@ -250,8 +250,8 @@ class BinaryGripper(Gripper):
     """One entry, if there is a gripper: negative closes it, anything else opens it. Isaac Lab's ``BinaryJointPositionAction``.
 
     Attributes:
-        hysteresis: the gripper closes below -hysteresis, opens at +hysteresis and above, and otherwise keeps its state. It starts
-            open. Otherwise noise about zero opens and closes the hand many times a second, and it never grasps by chance.
+        hysteresis: the gripper closes below -hysteresis, opens at +hysteresis and above, and keeps its state between. It starts
+            open. Without hysteresis, noise opens and closes the hand many times a second, so it never grasps by chance.
     """
 
     hysteresis: NonNegative = dataclasses.field(default=0.0, kw_only=True)

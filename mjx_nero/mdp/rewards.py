@@ -130,7 +130,7 @@ def action_rate_l2(view: View) -> Float[Array, ""]:
 
 
 def gripper_action_l2(view: View) -> Float[Array, ""]:
-    """Squared gripper action, the last entry. Only the sign of a binary gripper's action matters, so its size is wasted."""
+    """Squared gripper action, the last entry. A binary gripper obeys only its sign."""
     return jnp.square(view.action[-1])
 
 
