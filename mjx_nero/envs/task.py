@@ -16,8 +16,7 @@ from mjx_nero.types import TARGET, UserError
 
 
 def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
-    """Lists action terms: one entry per arm joint (``home + scale * entry`` [rad]), and one for the gripper, if any (negative
-    closes).
+    """Lists action terms: ``home + scale * entry`` [rad] per arm joint, and one entry for a gripper (negative closes).
 
     Without ``gripper``, the gripper stays at home.
     """

@@ -233,8 +233,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
 
 
 def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
-    """Returns, for the controller, which axis of each object lies across the hand's opening, and the number of equivalent
-    turns."""
+    """Says which axis of each object lies across the hand's opening, and in how many equivalent turns."""
     lying = {"box": 0, "can": 0, "sphere": 0, "capsule": 2}
     turns = {"box": 2, "can": 0, "sphere": 0, "capsule": 2}
     square = {name for name, item in scene.objects.items() if item.shape == "box" and item.size[0] == item.size[1]}

@@ -125,8 +125,7 @@ class Episodes:
         return ~(self.metrics["nan"] > 0) & np.isfinite(self.returns)
 
     def recorded(self, which: np.ndarray) -> "Episodes":
-        """Returns the same episodes with only the records that ``which`` names; ``which``: int [any], indices of recorded
-        ones."""
+        """Returns the same episodes with only the records at the indices ``which``: int [any]."""
         return dataclasses.replace(self, record=self.record[:, which])
 
 
