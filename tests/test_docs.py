@@ -205,7 +205,7 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     done = subprocess.run(build, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     site = tmp_path / "site"
-    assert "Ctrl-C saves and says how to go on" in (site / "index.html").read_text()
+    assert "Ctrl-C saves and prints how to resume" in (site / "index.html").read_text()
     assert "lab/learning.html" not in (site / "guides" / "runs.html").read_text()  # out of the table of contents
     reference = (site / "generated" / "commands.html").read_text()
     assert all(f'id="{name}"' in reference for name in COMMANDS) and "--num-timesteps" in reference

@@ -72,7 +72,7 @@ class Body:
     """A robot's links. Arrays of postures are [k, n] along ``joints`` [rad or m]; frames are those of the world.
 
     Args:
-        description: what ``sim.description.body`` made.
+        description: what ``interop.description.body`` made.
         joints: in the order of all joint vectors.
         base: of the robot, where positions that are observed count from [m].
 

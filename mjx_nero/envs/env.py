@@ -213,8 +213,7 @@ class ManipulationEnv(Env):
         return Bank(start, jnp.zeros((), bool))
 
     def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
-        """Builds qpos: joints within their ranges, linkages closed, objects in place, rescaled ones still resting on the
-        table."""
+        """Builds qpos: joints within their ranges, linkages closed, objects in place, rescaled ones on the table."""
         joints = jnp.clip(start.joint_pos, *self._range)
         qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints)
         for coupling in self._coupled:

@@ -1,5 +1,4 @@
-"""Applies the drives that ``python -m mjx_nero identify`` measured on a real arm to a task: gains, ranges to draw from, and a
-delay."""
+"""Applies drives that ``identify`` measured on a real arm to a task: gains, ranges to draw from, and a delay."""
 
 import dataclasses
 import math

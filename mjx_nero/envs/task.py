@@ -8,16 +8,15 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, success
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, RewardTerm, Term
+from mjx_nero.mdp import actions, observations, success
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import TARGET, UserError
 
 
 def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
-    """Lists action terms: one entry per arm joint (``home + scale * entry`` [rad]), and one for the gripper, if any (negative
-    closes).
+    """Lists action terms: ``home + scale * entry`` [rad] per arm joint, and one entry for a gripper (negative closes).
 
     Without ``gripper``, the gripper stays at home.
     """
@@ -51,6 +50,16 @@ CALM = {**QUIET, "change_cost": 0.03}
 def drive_targets() -> dict[str, Term]:
     """Lists the one action term of controllers: a position target per drive [rad or m]. The controller limits their speed."""
     return {"drives": Term(actions.DriveTargets)}
+
+
+def arm_state() -> dict[str, ObservationTerm]:
+    """Lists the observations of the arm itself: joints, how far targets lead them, and the grasp point."""
+    return {
+        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
+        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
+        "target_error": ObservationTerm(observations.target_error),
+        "ee_position": ObservationTerm(observations.ee_position),
+    }
 
 
 @dataclasses.dataclass(frozen=True)

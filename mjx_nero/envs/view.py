@@ -84,8 +84,7 @@ class Viewer:
         )
 
     def _encoder_bias(self, sim: Sim) -> Float[Array, " nj"] | None:
-        """Recovers the bias from the drives, which pull with stiffness * (target - joint - bias) - ...
-        (``randomization.encoder_bias``)."""
+        """Recovers the bias of ``randomization.encoder_bias``: drives pull with stiffness * (target - joint - bias) - ..."""
         if "actuator_biasprm" not in sim.fields:
             return None
         gain = sim.fields.get("actuator_gainprm", self._gain)

@@ -13,10 +13,9 @@ import numpy as np
 
 from mjx_nero.config.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import need
+from mjx_nero.interop import description, need
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.runs.folder import versions
-from mjx_nero.sim import description
 from mjx_nero.types import UserError
 
 OPSET = 17  # of 2021: what embedded runtimes know, too

@@ -1,5 +1,4 @@
-"""The header of a policy or checkpoint. A stranger may have made the file, so its header is read with limits before any library
-sees it."""
+"""The header of a policy or checkpoint, which may be a stranger's: read with limits, before any library sees the file."""
 
 import math
 import pathlib

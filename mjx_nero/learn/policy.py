@@ -107,7 +107,7 @@ def load_for(
     path = pathlib.Path(path or shipped(env_name, preset))
     if path == shipped(env_name, preset) and not path.is_file():
         command = f"python train.py --env {env_name}" + (f" --robot {robot}" if robot else "")
-        raise UserError(f"no policy ships for {env_name}: train one ({command}) and pass --policy PATH")
+        raise UserError(f"there is no bundled policy for {env_name}: train one ({command}) and pass --policy PATH")
     policy = checkpoint_policy(path)
     here = describe(env, env_name, preset, policy.meta.get("learner", "ppo"), {})
     if fault := misfit(policy.meta, here, any_robot):

@@ -109,8 +109,7 @@ class Plain:
         return -np.ones(len(self.home), np.float32), np.ones(len(self.home), np.float32)
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Computes the entries whose targets come nearest to ``act.targets``. Actions take effect up to ``late`` control steps
-        late."""
+        """Computes the entries whose targets come nearest to ``act.targets``. Actions act up to ``late`` control steps late."""
         return jnp.zeros((*next(iter(act.targets.values())).shape[:-1], 0))
 
 
@@ -142,8 +141,10 @@ class Gripper(Plain):
 
 @dataclasses.dataclass(frozen=True)
 class JointPosition(Joints):
-    """One entry per joint: ``target = home + scale * entry`` [rad], clipped to the joint range. Isaac Lab's
-    ``JointPositionAction``."""
+    """One entry per joint: ``target = home + scale * entry`` [rad], clipped to the joint range.
+
+    Isaac Lab's ``JointPositionAction``.
+    """
 
     scale: float = dataclasses.field(kw_only=True)
 
@@ -171,8 +172,7 @@ class JointPosition(Joints):
 
 @dataclasses.dataclass(frozen=True)
 class JointVelocity(Joints):
-    """One entry per joint: the speed of its set-point, where +-1 is the drive's full speed. Targets lead the set-point by the
-    drives' lag.
+    """One entry per joint: the speed of its set-point. +-1 is the drive's full speed; targets lead by the drive's lag.
 
     If absolute targets get noise wider than the speed limit, the policy learns that only their signs matter. Without the noise
     such a policy throws its targets from limit to limit, and one step of delay ruins it. Here noise is a share of the limit, and
@@ -250,8 +250,8 @@ class BinaryGripper(Gripper):
     """One entry, if there is a gripper: negative closes it, anything else opens it. Isaac Lab's ``BinaryJointPositionAction``.
 
     Attributes:
-        hysteresis: the gripper closes below -hysteresis, opens at +hysteresis and above, and otherwise keeps its state. It starts
-            open. Otherwise noise about zero opens and closes the hand many times a second, and it never grasps by chance.
+        hysteresis: the gripper closes below -hysteresis, opens at +hysteresis and above, and keeps its state between. It starts
+            open. Without hysteresis, noise opens and closes the hand many times a second, so it never grasps by chance.
     """
 
     hysteresis: NonNegative = dataclasses.field(default=0.0, kw_only=True)
@@ -409,8 +409,7 @@ class Noise(Plain):
 
 @dataclasses.dataclass(frozen=True)
 class LowPass(Plain):
-    """Smooths the action for the terms after this one: a first-order filter of time constant ``time`` [s] at steps of ``dt``
-    [s]."""
+    """Smooths the action for later terms: a first-order filter of time constant ``time`` [s] at steps of ``dt`` [s]."""
 
     time: Positive = dataclasses.field(kw_only=True)
     dt: Positive = dataclasses.field(kw_only=True)

@@ -1,5 +1,4 @@
-"""Curriculum terms: (step count, level, weight, *, params) -> weight of a reward term. Also what makes episodes harder as
-training goes on.
+"""Curriculum terms: (step count, level, weight, *, params) -> weight of a reward term; and levels of difficulty.
 
 A level is the share of all episode-to-episode differences that an episode gets (``types.LEVEL``). None, outside of training: all
 of them.
@@ -19,8 +18,10 @@ Level = Float[Array, ""] | None
 
 
 def step_weight(count: Int[Array, ""], level: Level, weight: float, *, to: float, num_steps: int) -> Float[Array, ""]:
-    """Changes the weight at once, after ``num_steps`` control steps of every environment. Isaac Lab's
-    ``modify_reward_weight``."""
+    """Changes the weight at once, after ``num_steps`` control steps of every environment.
+
+    Isaac Lab's ``modify_reward_weight``.
+    """
     return jnp.where(count > num_steps, to, weight)
 
 

@@ -14,12 +14,19 @@ from mjx_nero.types import Key, View
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Grasped:
-    """1 if the object has been held since the start (see ``rewards.held``)."""
+class _Holding:
+    """Base of metrics about a held object (see ``rewards.held``)."""
 
     minimal_height: Heights
     grasp_radius: Positive
     object: str = "cube"
+
+    def _held(self, view: View) -> Bool[Array, ""]:
+        return held(view, **dataclasses.asdict(self))
+
+
+class Grasped(_Holding):
+    """1 if the object has been held since the start."""
 
     def init(self, key: Key, view: View) -> Bool[Array, ""]:
         """Starts with False."""
@@ -27,17 +34,12 @@ class Grasped:
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Becomes true when the object is held."""
-        memory = memory | held(view, **dataclasses.asdict(self))
+        memory = memory | self._held(view)
         return memory, memory
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GraspTime:
-    """Time at which the object was first held (see ``rewards.held``) [s]; 0 if it never was."""
-
-    minimal_height: Heights
-    grasp_radius: Positive
-    object: str = "cube"
+class GraspTime(_Holding):
+    """Time at which the object was first held [s]; 0 if it never was."""
 
     def init(self, key: Key, view: View) -> Float[Array, ""]:
         """Starts with infinity, for never."""
@@ -45,7 +47,7 @@ class GraspTime:
 
     def step(self, memory: Float[Array, ""], view: View) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Keeps the earliest time."""
-        memory = jnp.minimum(memory, jnp.where(held(view, **dataclasses.asdict(self)), view.time, jnp.inf))
+        memory = jnp.minimum(memory, jnp.where(self._held(view), view.time, jnp.inf))
         return memory, jnp.where(jnp.isfinite(memory), memory, 0.0)
 
 

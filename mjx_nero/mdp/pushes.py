@@ -1,5 +1,4 @@
-"""Pushes: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, velocity)``, the velocity to add to an object's
-[m/s]."""
+"""Pushes of objects: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, added velocity [m/s])``."""
 
 import dataclasses
 

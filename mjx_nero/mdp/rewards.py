@@ -112,8 +112,10 @@ def object_goal_pose(
 
 
 def object_goal_turn(view: View, *, std: Positive, fold: Count = 1, object: str = "cube") -> Float[Array, ""]:
-    """1 - tanh(angle / std), from the object's orientation to the goal's [rad], wherever the object is (see
-    ``success.object_turn``)."""
+    """1 - tanh(angle / std), from the object's orientation to the goal's [rad], wherever the object is.
+
+    See ``success.object_turn``.
+    """
     return 1.0 - jnp.tanh(jnp.linalg.norm(success.object_turn(view, fold=fold, object=object)) / std)
 
 
@@ -130,7 +132,7 @@ def action_rate_l2(view: View) -> Float[Array, ""]:
 
 
 def gripper_action_l2(view: View) -> Float[Array, ""]:
-    """Squared gripper action, the last entry. Only the sign of a binary gripper's action matters, so its size is wasted."""
+    """Squared gripper action, the last entry. A binary gripper obeys only its sign."""
     return jnp.square(view.action[-1])
 
 

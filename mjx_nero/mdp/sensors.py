@@ -1,5 +1,4 @@
-"""Sensors stand between the true state and the policy: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory,
-view)``.
+"""Sensors: what stands between state and policy. ``init(key, view) -> memory``, ``step(memory, view) -> (memory, view)``.
 
 They apply in the task's order, before the observation terms, so all terms of a group see the same wrong world. An object seen a
 centimetre too far left is that much farther from the gripper and that much nearer to the goal.

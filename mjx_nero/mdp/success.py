@@ -1,5 +1,7 @@
-"""Success terms: (View, *, params) -> whether the task is done at this step. Also the distances they judge, and how long success
-must hold."""
+"""Success terms: (View, *, params) -> whether the task is done at this step.
+
+Also the distances that they judge, and how long success must hold.
+"""
 
 import dataclasses
 

@@ -55,8 +55,7 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """One object to move: the vector to its place [m], whether the objects below stand, whether it is over its place, and whether
-    it stands."""
+    """One object to move: its way to its place [m], and whether the objects below stand, it is over its place, and it stands."""
 
     object: str
     below: str

@@ -38,8 +38,8 @@ class Parser(argparse.ArgumentParser):
         """
         self.add_load()
         self.add_argument("--env", default=default, help=f"environment: {', '.join(names)} (default: %(default)s)")
-        self.add_argument("--preset", default="default", help="of the environment's presets (default: %(default)s)")
-        self.add_argument("--robot", help="another robot: a name or an imported robot's folder (default: the environment's own)")
+        self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
+        self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
 
     def add_load(self) -> None:
         """``--load``: outside code, run before the other flags are read for what they name."""
@@ -48,12 +48,12 @@ class Parser(argparse.ArgumentParser):
             action="append",
             default=[],
             metavar="FILE_OR_MODULE",
-            help="Python code that registers environments, robots, ... of its own (mjx_nero.register); may be given again",
+            help="Python code that registers its own environments, robots, ... (mjx_nero.register); repeatable",
         )
 
     def add_impl(self) -> None:
         """``--impl``: who computes the physics."""
-        text = "physics: warp or jax, which are MJX, or native, MuJoCo's C library (default: the fastest of this machine's)"
+        text = "physics: warp or jax (both MJX), or native, MuJoCo's C library (default: the fastest on this machine)"
         self.add_argument("--impl", default="auto", help=text)
 
     def add_seed(self, default: int, several: bool = False) -> None:
@@ -61,7 +61,7 @@ class Parser(argparse.ArgumentParser):
         group = self.add_mutually_exclusive_group()
         group.add_argument("--seed", type=seed, default=default, help="random seed (default: %(default)s)")
         if several:
-            text = "several, as in 0-7 or 0,3,5: a run each, one after another, and a table"
+            text = "several seeds, as in 0-7 or 0,3,5: one run for each, and a table"
             group.add_argument("--seeds", type=seeds, help=text)
 
     def add_fields(self, cls: type) -> None:
@@ -83,8 +83,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_video(self) -> None:
         """Adds flags of videos. The defaults give the best video that the machine draws within half a minute."""
-        self.add_argument("--video-size", type=size, help="width and height in pixels, as in 1280x720 (default: by the machine)")
-        text = "frames a second (default: 25, or what the machine draws)"
+        self.add_argument("--video-size", type=size, help="size in pixels, as in 1280x720 (default: chosen by the machine)")
+        text = "frames per second (default: 25, or as many as the machine draws)"
         self.add_argument("--video-fps", type=positive_float, default=0.0, help=text)
         text = "robots side by side in one picture (default: one by one)"
         self.add_argument("--video-envs", type=at_most(256), default=1, help=text)

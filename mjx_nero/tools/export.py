@@ -25,9 +25,9 @@ def main(argv: Sequence[str]) -> None:
         description="Writes a policy as ONNX: normalisation and network as a graph, joints, terms, limits and rates as metadata.",
     )
     parser.add_load()
-    parser.add_argument("policy", help=f"policy file, or an environment whose policy ships ({', '.join(_shipped())})")
+    parser.add_argument("policy", help=f"policy file, or name of a bundled policy ({', '.join(_shipped())})")
     parser.add_argument("--out", type=cli.path(".onnx"), required=True, metavar="FILE", help="ONNX file to write")
-    parser.add_argument("--robot", help="imported robot's folder, where the policy was trained with one")
+    parser.add_argument("--robot", help="folder of the imported robot that the policy was trained with")
     args, dotted = parser.parse(argv, prefixes=("env",))
     onnx_package = need("onnx", "onnx")
     files.check_writable(args.out)

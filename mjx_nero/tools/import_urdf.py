@@ -18,8 +18,8 @@ from mjx_nero.urdf.units import Units
 MOST_LINES = 12  # of warnings shown; report.json has all
 
 _EPILOG = """\
-Files are read from the URDF's folder, from the package that it lies in (a package.xml up to five folders above; without one the
-folder above urdf/, robots/ or xacro/), from packages that it names which lie beside these, and from those given with --package.
+Files are read from the URDF's folder, from its package (a package.xml up to five folders above, or else the folder above urdf/,
+robots/ or xacro/), from packages beside these that it names, and from those given with --package.
 
   python -m mjx_nero import-urdf my_arm.urdf --out my_arm
   python -m mjx_nero import-urdf urdf/arm.urdf --out arm --package arm_description=. --gripper finger_joint --ee tcp
@@ -72,31 +72,30 @@ def _parser() -> cli.Parser:
     parser.add_argument("file", type=cli.path(), help="URDF or xacro file")
     parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to make")
     parser.add_argument(
-        "--package", action="append", default=[], metavar="[NAME=]DIR", help="where package://NAME/ lies; again for more"
+        "--package", action="append", default=[], metavar="[NAME=]DIR", help="folder of package://NAME/; repeatable"
     )
-    parser.add_argument(
-        "--arg", action="append", default=[], metavar="NAME:=VALUE", help="argument of a xacro file; again for more"
-    )
+    parser.add_argument("--arg", action="append", default=[], metavar="NAME:=VALUE", help="argument of a xacro file; repeatable")
     parser.add_argument("--gains", type=cli.path(), metavar="FILE", help="YAML: joint -> stiffness, damping, effort, speed")
-    parser.add_argument("--chain", metavar="BASE:TIP", help="the arm of a robot that is more than one: the rest is held still")
-    parser.add_argument("--fix", action="append", default=[], metavar="JOINT[=VALUE]", help="hold a joint still; again for more")
+    parser.add_argument("--chain", metavar="BASE:TIP", help="selects one arm of a larger robot; the rest is held still")
+    parser.add_argument("--fix", action="append", default=[], metavar="JOINT[=VALUE]", help="hold a joint still; repeatable")
     parser.add_argument(
-        "--gripper", metavar="J1,J2", help="joints that drive the gripper; none for an arm without (default: guessed)"
+        "--gripper", metavar="J1,J2", help="joints that drive the gripper; none: there is no gripper (default: guessed)"
     )
-    parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point, in metres (default: amid the fingers' ends)")
-    parser.add_argument("--open", metavar="J=VALUE,...", help="where the gripper's joints are when it is open [rad, m]")
-    parser.add_argument("--closed", metavar="J=VALUE,...", help="and when it is closed (default: where its shapes meet)")
+    parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point [m] (default: between the fingers' ends)")
+    parser.add_argument("--open", metavar="J=VALUE,...", help="the gripper's joints when open [rad, m] (default: measured)")
+    parser.add_argument("--closed", metavar="J=VALUE,...", help="positions when closed [rad, m] (default: where its shapes meet)")
     parser.add_argument("--home", metavar="J=VALUE,...", help="home positions of some joints [rad, m] (default: guessed)")
+    parser.add_argument("--degrees", action="store_true", help="read limits and velocities of hinges in degrees")
     parser.add_argument(
-        "--degrees", action="store_true", help="the URDF gives the limits and velocities of its hinges in degrees"
+        "--scale",
+        type=cli.positive_float,
+        metavar="FACTOR",
+        help="factor of lengths except the meshes': 0.001 for millimetres",
     )
-    parser.add_argument(
-        "--scale", type=cli.positive_float, metavar="FACTOR", help="of all lengths but the meshes': 0.001 for millimetres"
-    )
-    parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="of the meshes, besides their own")
+    parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="factor of meshes, on top of their own")
     parser.add_argument("--tries", type=cli.at_most(1000), metavar="N", help="tries of the self-test (default: 8)")
-    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="do not try the robot in simulation")
-    parser.add_argument("--strict", action="store_true", help="a warning is an error")
+    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test in simulation")
+    parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
     return parser
 

@@ -32,19 +32,17 @@ def _parser() -> cli.Parser:
     )
     parser.add_environment(registry.list_envs())
     parser.add_argument("--learner", default="ppo", help=f"one of {', '.join(learner.names())} (default: %(default)s)")
-    parser.add_argument("--num-envs", type=cli.positive, help="environments (default: 8192 on a GPU, 256 on a CPU)")
+    parser.add_argument("--num-envs", type=cli.positive, help="number of environments (default: 8192 on a GPU, 256 on a CPU)")
     parser.add_argument(
         "--num-timesteps",
         type=cli.positive,
-        help="env steps in all (default: env.budget.steps; on a CPU env.budget.steps_on_cpu, in 10 minutes at most)",
+        help="total env steps (default: env.budget.steps; on a CPU env.budget.steps_on_cpu, for at most 10 minutes)",
     )
     parser.add_seed(0, several=True)
     parser.add_impl()
     parser.add_fields(RunCfg)
-    parser.add_argument(
-        "--trust", action="store_true", help="read files that the config of --restore names outside of that folder"
-    )
-    parser.add_argument("--resume", choices=("auto",), help="go on with the run in --out, or start it if there is none yet")
+    parser.add_argument("--trust", action="store_true", help="read files that the config of --restore names outside its folder")
+    parser.add_argument("--resume", choices=("auto",), help="resume the run in --out, or start it if there is none")
     parser.add_argument("--no-video", dest="video", action="store_false", help="do not render the trained policy")
     parser.add_video()
     return parser

@@ -10,12 +10,12 @@ from typing import Any
 from mjx_nero import console
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
-from mjx_nero.learn.runs import resume, seeds, track, training
+from mjx_nero.learn.runs import resume, track, training
 from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.learn.runs.checkpoints import saved
 from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.sim import render
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, seeds
 
 
 def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], flags: Collection[str]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.envs import registry
-from mjx_nero.sim import description
+from mjx_nero.interop import description
 
 
 def metadata(name, dt=0.02):

@@ -9,7 +9,8 @@ import pytest
 
 from mjx_nero.deploy import body as bodies
 from mjx_nero.envs import registry
-from mjx_nero.sim import description, kinematics, linkage, scene
+from mjx_nero.interop import description
+from mjx_nero.sim import kinematics, linkage, scene
 
 ROBOTS = registry.list_robots()
 

@@ -42,7 +42,7 @@ def test_logs_that_cannot_be_written(train, at_row, tmp_path):
 
     at_row(2, spoil)
     code, out, err = train("--out", "run")
-    assert code == 0 and err.count("warning: cannot write metrics.jsonl in run (Is a directory): training goes on") == 1
+    assert code == 0 and err.count("warning: cannot write metrics.jsonl in run (Is a directory): training continues") == 1
     lost = json.loads((tmp_path / "run" / "summary.json").read_text())["lost"]
     assert lost["metrics.jsonl"] == 9 and "9 x metrics.jsonl" in out
 
@@ -263,7 +263,7 @@ def test_divergence_stops_with_a_line(train, monkeypatch, tmp_path, spoil, what)
     code, _, err = train("--out", "run")
     *_, line = err.splitlines()
     assert code == 2 and line.startswith("error: ") and what in line and "is not finite after 320 steps: training stopped" in line
-    assert "The last finite checkpoint is that of 256 steps" in line and "--on-nan rewind" in line
+    assert "The last finite checkpoint is at 256 steps" in line and "--on-nan rewind" in line
     assert last(tmp_path / "run")[0] == "000000000256.safetensors"
 
 

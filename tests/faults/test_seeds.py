@@ -9,7 +9,8 @@ import pytest
 from faults_run import STEPS, last, rows
 
 from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import loop, seeds, track
+from mjx_nero.learn.runs import loop, track
+from mjx_nero.tools import seeds
 
 
 def test_each_seed_is_the_run_that_it_is_alone(train, tmp_path):
@@ -121,7 +122,7 @@ def test_a_tracker_that_fails_costs_nothing_else(train, tmp_path, monkeypatch, b
     monkeypatch.setitem(track.TRACKERS, "wandb", Tracker)
     monkeypatch.setattr(track, "check", lambda name: None)
     code, out, err = train("--out", "run", "--track", "wandb")
-    assert code == 0 and err.count("warning: cannot write track in run (no network): training goes on") == 1
+    assert code == 0 and err.count("warning: cannot write track in run (no network): training continues") == 1
     assert len(rows(tmp_path / "run")) == 11 and "x track" in out
 
 

@@ -16,9 +16,9 @@ import server
 
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import checkpoints, logs, resume, seeds, training, trust
+from mjx_nero.learn.runs import checkpoints, logs, resume, training, trust
 from mjx_nero.learn.runs import folder as run_folder
-from mjx_nero.tools import train_run
+from mjx_nero.tools import seeds, train_run
 from mjx_nero.tools.view import agents
 from mjx_nero.tools.view import command as view_command
 

@@ -39,9 +39,14 @@ from mjx_nero.envs import identified, registry  # noqa: E402
 from mjx_nero.identify import log as arm_log  # noqa: E402
 from mjx_nero.learn import checkpoint, header  # noqa: E402
 from mjx_nero.learn.runs import cfg as run_cfg  # noqa: E402
-from mjx_nero.learn.runs import logs, resume, seeds, training  # noqa: E402
+from mjx_nero.learn.runs import logs, resume, training  # noqa: E402
 from mjx_nero.sim import model_file, robot_file  # noqa: E402
-from mjx_nero.tools import public_robots, results, train_run  # noqa: E402
+from mjx_nero.tools import (  # noqa: E402
+    public_robots,
+    results,
+    seeds,
+    train_run,
+)
 from mjx_nero.tools.robustness import command as robustness  # noqa: E402
 from mjx_nero.tools.view import command as view_command  # noqa: E402
 from mjx_nero.urdf import drives, import_urdf, meshes, xacro  # noqa: E402

@@ -59,7 +59,7 @@ def test_too_many_environments_are_told_how_many_fit(monkeypatch):
     with pytest.raises(UserError, match="pass --num-envs 100 or fewer"):
         device_memory.check(learner(num_envs=104))
     monkeypatch.setattr(device_memory, "_limit", lambda _: fixed)
-    with pytest.raises(UserError, match="too little for 4 even"):
+    with pytest.raises(UserError, match="too little even for 4"):
         device_memory.check(small)
 
 

@@ -110,10 +110,10 @@ def test_shared_flags_read_alike_in_every_command(call):
     for program in (["train"], ["eval"], ["benchmark"], ["mjx_nero", "view"]):
         code, out, _ = call(*program, "--help")
         said = " ".join(out.split())
-        assert code == 0 and "--load FILE_OR_MODULE Python code that registers environments" in said
+        assert code == 0 and "--load FILE_OR_MODULE Python code that registers its own environments" in said
         assert "--env ENV environment: cobotta_lift, " in said
-        assert "--preset PRESET of the environment's presets (default: default)" in said
-        assert "--robot ROBOT another robot: a name or an imported robot's folder (default: the environment's own)" in said
+        assert "--preset PRESET preset of the environment (default: default)" in said
+        assert "--robot ROBOT name of another robot, or folder of an imported one (default: the environment's own)" in said
 
 
 def test_what_a_run_came_to_is_said_before_its_video_is_drawn(call, monkeypatch):

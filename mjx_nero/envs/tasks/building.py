@@ -102,8 +102,7 @@ class Tower:
         return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
-        """Rewards reaching, grasping, lifting, aligning, lowering, releasing and leaving; each step keeps the rewards of the ones
-        before.
+        """Rewards reaching, grasping, lifting, aligning, lowering, releasing and leaving; each stage keeps the earlier rewards.
 
         It rewards opening targets and penalises large gripper actions; otherwise single noisy steps never show that releasing
         pays.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
 from mjx_nero.mdp.terms import (
     ONCE,
@@ -155,10 +155,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
     held = {"minimal_height": heights, "grasp_radius": setup.grasp_radius, **commanded}
     center = scene.table_center
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         "ee_orientation": ObservationTerm(observations.ee_orientation),
         "ee_to_object": ObservationTerm(observations.ee_to_object, params=commanded, noise=0.002),
         "object_orientation": ObservationTerm(observations.object_orientation, params=commanded, noise=0.01),
@@ -233,8 +230,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
 
 
 def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
-    """Returns, for the controller, which axis of each object lies across the hand's opening, and the number of equivalent
-    turns."""
+    """Says which axis of each object lies across the hand's opening, and in how many equivalent turns."""
     lying = {"box": 0, "can": 0, "sphere": 0, "capsule": 2}
     turns = {"box": 2, "can": 0, "sphere": 0, "capsule": 2}
     square = {name for name, item in scene.objects.items() if item.shape == "box" and item.size[0] == item.size[1]}

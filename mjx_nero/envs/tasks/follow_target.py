@@ -13,8 +13,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 @dataclasses.dataclass(frozen=True)
 class FollowTargetSetup:
-    """Numbers that differ from robot to robot: the frame that follows, and the box about ``center`` where targets are drawn
-    [m]."""
+    """Numbers that differ from robot to robot: the frame that follows, and the targets' box about ``center`` [m]."""
 
     frame: str
     center: tuple[float, float, float]

@@ -9,7 +9,7 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, velocity_actions
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
 from mjx_nero.mdp.terms import (
@@ -130,10 +130,7 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     """The preset that learns to grasp. Height and tracking count only for a held cube, and relative positions are observed."""
     recipe, held = isaac(robot, setup), setup.held
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         "ee_to_object": ObservationTerm(observations.ee_to_object, noise=0.002),
         "object_to_goal": ObservationTerm(observations.object_to_goal, noise=0.002),
         "target_object_position": ObservationTerm(observations.command),

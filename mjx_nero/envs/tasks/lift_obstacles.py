@@ -13,26 +13,17 @@ from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import curriculum, metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, MetricTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.sim.scene import SceneCfg
 
 
-@dataclasses.dataclass(frozen=True)
-class LiftObstaclesSetup:
-    """Numbers that differ from robot to robot. None: derived from the robot's ``pick``, ``hold`` and gripper.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LiftObstaclesSetup(reach_obstacles.ObstaclesSetup):
+    """A setup with a cube.
 
     Attributes:
         cube: ``x`` and ``y`` of the cube at the start [m], world frame.
-        goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
-        room: free space around start and goal [m].
-        top: greatest height of an obstacle above the robot's foot [m].
-        scene: the cube, cameras and table.
     """
 
     cube: tuple[Range, Range] | None = None
-    goal: tuple[Range, Range, Range] | None = None
-    room: float | None = None
-    top: float | None = None
-    scene: SceneCfg | None = None
 
 
 def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:

@@ -13,8 +13,7 @@ from mjx_nero.sim.scene import SceneCfg
 
 @dataclasses.dataclass(frozen=True)
 class PickPlaceSetup:
-    """Numbers that differ from robot to robot: where the cube starts and must go, how high it travels [m], and the time limit
-    [s]."""
+    """Numbers that differ from robot to robot: the cube's start and goal, its travel height [m], and a time limit [s]."""
 
     scene: SceneCfg
     cube: tuple[Range, Range]

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import QUIET, Budget, EnvCfg, Presets, joint_actions
+from mjx_nero.envs.task import QUIET, Budget, EnvCfg, Presets, arm_state, joint_actions
 from mjx_nero.envs.tasks.building import Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
@@ -29,10 +29,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle, lifted=_lifted(box))
     named = {"object": "box"}
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         "ee_to_object": ObservationTerm(observations.ee_to_object, params=named, noise=0.002),
         "ee_turn_to_object": ObservationTerm(towers.turn_to_object, params={"down": robot.down, **named}, noise=0.01),
         "object_to_goal": ObservationTerm(observations.object_to_goal, params=named, noise=0.002),

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
@@ -37,10 +37,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     back = round(box.size[0] / 2 + robot.pad[0] / 2, 4)  # distance of the hand from the centre, when beside the box
     place, at_goal = box.rest_height - dz, {"threshold": 0.02, "angle": ANGLE, "fold": FOLD, **object}
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         "ee_orientation": ObservationTerm(observations.ee_orientation),
         "ee_to_object": ObservationTerm(observations.ee_to_object, params=object, noise=0.002),
         "object_heading": ObservationTerm(observations.object_heading, params=object, noise=0.02),

@@ -6,7 +6,7 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
 from mjx_nero.envs.tasks.reach import BUDGET
 from mjx_nero.mdp import commands, events, metrics, observations, obstacles, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
@@ -19,23 +19,32 @@ SHARE = 0.3  # share of the region's width, at either side, that start and goal 
 HAND = 0.08  # [m] from a finger's pad to the far side of the hand, with a margin
 
 
-@dataclasses.dataclass(frozen=True)
-class ReachObstaclesSetup:
-    """Numbers that differ from robot to robot. None: derived from the robot's ``workspace`` and gripper.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObstaclesSetup:
+    """Numbers that differ from robot to robot. None: derived from the robot's regions and gripper.
 
     Attributes:
-        start: ``x`` and ``y`` that the arm points at when an episode starts [m], robot root frame.
         goal: ``x``, ``y`` and ``z`` of the commanded point [m], robot root frame.
         room: free space around start and goal [m].
         top: greatest height of an obstacle above the robot's foot [m].
-        scene: cameras and table.
+        scene: cameras, table and object.
     """
 
-    start: tuple[float, float] | None = None
     goal: tuple[Range, Range, Range] | None = None
     room: float | None = None
     top: float | None = None
     scene: SceneCfg | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReachObstaclesSetup(ObstaclesSetup):
+    """A setup with a start.
+
+    Attributes:
+        start: ``x`` and ``y`` that the arm points at when an episode starts [m], robot root frame.
+    """
+
+    start: tuple[float, float] | None = None
 
 
 def completed(robot: RobotCfg, setup: ReachObstaclesSetup) -> ReachObstaclesSetup:
@@ -87,10 +96,7 @@ def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:
     setup = completed(robot, setup)
     assert setup.goal is not None and setup.scene is not None
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         "ee_to_goal": ObservationTerm(observations.ee_to_goal),
         "goal_position": ObservationTerm(observations.command),
         **seen(),

@@ -6,7 +6,7 @@ The preset ``three`` adds a third cube on top.
 import dataclasses
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, velocity_actions
+from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, arm_state, velocity_actions
 from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.actions import ContinuousGripper
@@ -41,10 +41,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     fingers = {"open": robot.gripper.open, "hold": grasp.opened(robot, edge).gripper.open}
     leaving = RewardTerm(towers.left_with_open_fingers, weight=10.0, params={**tower.place, **fingers})
     state = {
-        "joint_pos": ObservationTerm(observations.joint_pos_rel, noise=0.01),
-        "joint_vel": ObservationTerm(observations.joint_vel_rel, noise=0.01),
-        "target_error": ObservationTerm(observations.target_error),
-        "ee_position": ObservationTerm(observations.ee_position),
+        **arm_state(),
         **_each(objects, "ee_to_{}", observations.ee_to_object, noise=0.002),
         **{
             f"{name}_to_{below}": ObservationTerm(towers.way, params={"below": below, "object": name, "rise": edge}, noise=0.002)

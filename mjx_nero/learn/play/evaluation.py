@@ -28,8 +28,10 @@ BACKENDS = ("auto", "mjx", "mujoco")
 
 
 def agent(cfg: "EvalCfg", env: ManipulationEnv) -> tuple[rollout.Act, Any]:
-    """Returns an agent's act function and parameters. ``policy`` is deterministic, ``random`` uniform in +-1, ``zero`` stays
-    home."""
+    """Returns an agent's act function and parameters.
+
+    ``policy`` is deterministic, ``random`` uniform in +-1, and ``zero`` stays at home.
+    """
     if cfg.agent in (None, "policy"):
         trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, cfg.any_robot, cfg.preset)
         return lambda params, obs, key: trained.act(obs), None
@@ -164,8 +166,7 @@ def _impl(backend: str, impl: str) -> str:
 
 
 def tracking(distance: np.ndarray, last: int) -> dict[str, float]:
-    """Distances to the goal over the last ``last`` steps, and over the second half of the episodes, when the robot has settled
-    [m].
+    """Computes distances to the goal [m] over the last ``last`` steps, and over the second half, when the robot has settled.
 
     Args:
         distance: ``Episodes.distance`` [steps, episodes].

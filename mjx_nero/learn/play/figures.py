@@ -31,8 +31,9 @@ def _figure(term: MetricTerm, metrics: Mapping[str, np.ndarray], name: str, whol
 
 
 def of_sums(terms: Terms, sums: Mapping[str, float], episodes: float) -> Iterator[tuple[str, float]]:
-    """Yields (name, figure) of the episodes that ended while metrics were summed: rates under the metric's name, means under the
-    figure's.
+    """Yields (name, figure) of the episodes that ended while metrics were summed.
+
+    Rates have the metric's name, means the figure's.
 
     Args:
         sums: name -> sum over all steps and environments.

@@ -62,9 +62,9 @@ class Episodes:
     Attributes:
         metrics: name -> sums over each episode's steps [n] (see ``ManipulationEnv.finish``).
         returns: returns of the episodes [n].
-        lengths: lengths of the episodes [n, control steps].
+        lengths: lengths of the episodes in control steps [n].
         record: records of the first k episodes [steps, k, ...], if asked for; an ended episode stands still.
-        distance: the distance that success judges [steps, n; m]; an ended episode's stays.
+        distance: the distance that success judges, in m [steps, n]; an ended episode's stays.
         memory: the agent's memory after the last step.
         terms: the task's metric terms, which say how metrics become figures.
     """
@@ -125,8 +125,7 @@ class Episodes:
         return ~(self.metrics["nan"] > 0) & np.isfinite(self.returns)
 
     def recorded(self, which: np.ndarray) -> "Episodes":
-        """Returns the same episodes with only the records that ``which`` names; ``which``: int [any], indices of recorded
-        ones."""
+        """Returns the same episodes with only the records at the indices ``which``: int [any]."""
         return dataclasses.replace(self, record=self.record[:, which])
 
 

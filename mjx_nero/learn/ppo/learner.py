@@ -205,8 +205,10 @@ class Learner:
         return 2.0 * (device_memory.size(state) - own), own / cfg.num_envs + 1.1 * cfg.unroll_length * step + max(rollout, update)
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
-        """Makes ``iterations`` rollouts and updates; metrics are means over them. Jit with static ``iterations``, and donate
-        ``state``."""
+        """Makes ``iterations`` rollouts and updates; metrics are means over them.
+
+        Jit with static ``iterations``, and donate ``state``.
+        """
         run = functools.partial(self._run, iterations=iterations)
         if self._axis:  # unchecked, because no check sees through calls of physics outside JAX
             run = jax.shard_map(run, mesh=self._mesh, in_specs=(_SPECS,), out_specs=(_SPECS, _HERE), check_vma=False)

@@ -28,8 +28,7 @@ class Asked:
 
 @dataclasses.dataclass(frozen=True)
 class RunCfg:
-    """One training run; the flags of train.py are made from it. A resumed run may change ``free`` fields, but not ``kept``
-    ones."""
+    """One training run, from which train.py makes its flags. Resuming may change ``free`` fields, but not ``kept`` ones."""
 
     env_name: str
     preset: str

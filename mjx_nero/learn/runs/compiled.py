@@ -46,8 +46,10 @@ class Compiled:
 
 
 class Evaluator:
-    """Evaluates the deterministic policy without observation noise, in unseen episodes. Uses MuJoCo's C library, or Warp if
-    training does."""
+    """Evaluates the deterministic policy in unseen episodes, without observation noise.
+
+    It uses MuJoCo's C library, or Warp if training does.
+    """
 
     def __init__(self, run: RunCfg, learner: Learner):
         impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"

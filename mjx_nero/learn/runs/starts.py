@@ -63,8 +63,10 @@ def none(seed: int) -> None:
 
 
 def maker(learner: Learner, say: Callable[[str], None]) -> Make:
-    """Returns a function that makes the bank of a learner's environments from a seed; None, with a line that says why, if it
-    cannot."""
+    """Returns a function that makes the bank of a learner's environments from a seed.
+
+    It returns None, and says why in a line, if there can be none.
+    """
     env = learner.env
     player = functools.cache(lambda: _player(env.unwrapped, learner.num_envs))
 
@@ -87,8 +89,7 @@ def maker(learner: Learner, say: Callable[[str], None]) -> Make:
 
 
 def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
-    """Draws ``n`` states. Row i belongs to phase 1 + i % ``phases``, from any episode and any step within that part of its
-    way."""
+    """Draws ``n`` states. Row i is from phase 1 + i % ``phases`` of any episode."""
     rng, phases = np.random.default_rng(seed), min(phases, n)
     episode = rng.choice(np.flatnonzero(way.ends), n)
     begin, end = way.begins[episode], way.ends[episode]
@@ -97,8 +98,7 @@ def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
 
 
 def playground(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task as the expert plays it: drive targets, the arm's weight carried, and no randomization, delays or
-    obstacles.
+    """Returns the task for the expert: drive targets, the arm's weight carried, no randomization, delays or obstacles.
 
     Its states are valid states of the task itself.
     """

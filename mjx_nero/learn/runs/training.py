@@ -31,8 +31,7 @@ __all__ = ["RunCfg", "carry_out", "describe", "film", "fit_machine", "learner_cf
 
 @dataclasses.dataclass(frozen=True)
 class Ended:
-    """The end of a run's loop: ``finished``, ``time limit`` or ``interrupted``, the signal's exit status, and what the logs
-    lost."""
+    """The end of a run's loop: why (``finished``, ``time limit``, ``interrupted``), the exit status, and what the logs lost."""
 
     why: str
     code: int

@@ -116,23 +116,25 @@ def _parser() -> cli.Parser:
     )
     parser.add_environment(registry.list_envs())
     parser.add_argument(
-        "--num-envs", type=_sizes, help=f"list (default: {_SIZES}; for learning the one number that train.py takes here)"
+        "--num-envs", type=_sizes, help=f"list of numbers (default: {_SIZES}; learning: the number that train.py would take)"
     )
-    parser.add_argument("--learner", default="ppo", help="who trains for ppo and learning (default: %(default)s)")
+    parser.add_argument("--learner", default="ppo", help="learner for ppo and learning (default: %(default)s)")
     parser.add_argument(
-        "--num-devices", type=cli.positive, default=1, help="GPUs for ppo and learning to spread over (default: %(default)s)"
+        "--num-devices", type=cli.positive, default=1, help="number of GPUs for ppo and learning (default: %(default)s)"
     )
     parser.add_argument("--impl", default="auto", help=f"list of {', '.join(impls())} (default: %(default)s)")
     parser.add_argument("--what", default="step", help="list, see below (default: %(default)s)")
-    parser.add_argument("--steps", type=cli.positive, default=100, help="control steps a measurement (default: %(default)s)")
+    parser.add_argument("--steps", type=cli.positive, default=100, help="control steps per measurement (default: %(default)s)")
     parser.add_argument(
-        "--repeats", type=cli.positive, default=5, help="measurements, of which the median counts (default: %(default)s)"
+        "--repeats", type=cli.positive, default=5, help="number of measurements; the median counts (default: %(default)s)"
     )
-    parser.add_argument("--batch", type=_sizes, default="1,100,1000,2000,10000", help="list, poses of ik (default: %(default)s)")
-    parser.add_argument("--seeds", type=cli.positive, default=8, help="how many to train for learning (default: %(default)s)")
-    parser.add_argument("--target", type=cli.share, default=0.95, help="success that ends learning (default: %(default)s)")
-    parser.add_argument("--num-timesteps", type=cli.positive, help="env steps of a seed at most (default: what train.py takes)")
-    parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 a run)")
+    parser.add_argument(
+        "--batch", type=_sizes, default="1,100,1000,2000,10000", help="numbers of poses for ik (default: %(default)s)"
+    )
+    parser.add_argument("--seeds", type=cli.positive, default=8, help="number of seeds for learning (default: %(default)s)")
+    parser.add_argument("--target", type=cli.share, default=0.95, help="success rate that ends learning (default: %(default)s)")
+    parser.add_argument("--num-timesteps", type=cli.positive, help="greatest number of env steps per seed (default: train.py's)")
+    parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
     parser.add_argument("--json", type=cli.path(".json"), help="write the rows, the machine and all versions as JSON")
     parser.add_argument("--plot", type=cli.path(".png"), help="picture (PNG) of rates and memory over the number of environments")
     return parser

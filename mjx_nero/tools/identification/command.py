@@ -50,7 +50,7 @@ def identify_main(argv: Sequence[str]) -> None:
     parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/guides/identification.md)")
     _add_robot(parser)
     parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML for make(identified=...) and --env.identified")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of what remains unexplained")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of the remaining error")
     args, _ = parser.parse(argv)
     for path in filter(None, (args.out, args.plot)):
         files.check_writable(path)
@@ -69,8 +69,8 @@ def identify_main(argv: Sequence[str]) -> None:
 
 
 def _add_robot(parser: cli.Parser) -> None:
-    parser.add_argument("--robot", required=True, help="name, or folder of an imported robot")
-    parser.add_argument("--dt", type=cli.positive_float, default=_DT, help="physics step, s (default: %(default)s)")
+    parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
+    parser.add_argument("--dt", type=cli.positive_float, default=_DT, help="physics step [s] (default: %(default)s)")
 
 
 def _plain(truth) -> dict[str, object]:

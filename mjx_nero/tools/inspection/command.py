@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero import console, files
-from mjx_nero.sim.motion import moves
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tools import cli, self_test
 from mjx_nero.tools.inspection.report import environments, find, inspect, picture
 from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
+from mjx_nero.tools.motion import moves
 
 
 def main(argv: Sequence[str]) -> None:
@@ -18,14 +18,12 @@ def main(argv: Sequence[str]) -> None:
     parser = cli.Parser(prog=cli.called_as("inspect"), description="Shows what a robot or an environment is made of.")
     parser.add_load()
     parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
-    parser.add_argument("--preset", help="of the environment (default: its first)")
-    parser.add_argument("--robot", help="for the environment, or by itself: name, or folder of an imported robot")
-    parser.add_argument(
-        "--no-self-test", dest="self_test", action="store_false", help="do not try an imported robot in simulation again"
-    )
-    parser.add_argument("--move", action="store_true", help="move every joint to its limits and the gripper open and closed")
+    parser.add_argument("--preset", help="preset of the environment (default: the first)")
+    parser.add_argument("--robot", help="robot of the environment, or to inspect alone: a name, or an imported one's folder")
+    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
+    parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
-    parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="everything, for programs")
+    parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, _ = parser.parse(argv)
     for path in filter(None, (args.render, args.json)):
         files.check_writable(path)

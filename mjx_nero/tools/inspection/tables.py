@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.console import Table
-from mjx_nero.sim.motion import Move
 from mjx_nero.tools.inspection.report import Environment, Report, Task
+from mjx_nero.tools.motion import Move
 
 
 def tables(report: Report) -> list[Table]:

@@ -26,14 +26,14 @@ def main(argv: Sequence[str]) -> None:
         description="Plays a policy over the range of each parameter of the world, one at a time and all at once.",
     )
     parser.add_environment(registry.list_envs())
-    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the one that ships for the environment)")
-    parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="of each setting (default: %(default)s)")
+    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled one)")
+    parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting (default: %(default)s)")
     parser.add_seed(90210)
     parser.add_impl()
-    parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="parameters with this in their name; again")
+    parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only parameters with this text; repeatable")
     parser.add_argument("--json", type=cli.path(".json"), help="write the figures as JSON")
     parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write the curves")
-    parser.add_argument("--beside", type=cli.path(".json"), help="figures of another policy (--json), for the same picture")
+    parser.add_argument("--beside", type=cli.path(".json"), help="figures of another policy (--json), to plot beside")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     for path in filter(None, (args.json, args.plot)):
         files.check_writable(path)

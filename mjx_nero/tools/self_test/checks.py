@@ -20,9 +20,10 @@ from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.mdp import rewards
 from mjx_nero.mdp.actions import rate_limit
-from mjx_nero.sim import motion, scene, touch
+from mjx_nero.sim import scene, touch
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tools import motion
 from mjx_nero.tools.self_test.play import play
 from mjx_nero.tools.self_test.result import Result
 from mjx_nero.types import View

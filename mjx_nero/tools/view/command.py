@@ -30,15 +30,15 @@ def main(argv: Sequence[str]) -> None:
     """
     parser = cli.Parser(prog=cli.called_as("view"), description="Shows environments in a browser: watch them, and take part.")
     parser.add_environment(registry.list_envs())
-    parser.add_argument("--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint; again for more")
-    parser.add_argument("--agent", help="who acts first: a controller, zero, random, or 'joint sliders' (default: a policy)")
+    parser.add_argument("--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint; repeatable")
+    parser.add_argument("--agent", help="first agent: a controller, zero, random, or 'joint sliders' (default: a policy)")
     parser.add_argument(
-        "--run", type=pathlib.Path, metavar="FOLDER", help="follow a training: its environment, its newest checkpoint"
+        "--run", type=pathlib.Path, metavar="FOLDER", help="run folder to follow: its environment, with its newest checkpoint"
     )
-    parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="side by side (default: %(default)s)")
+    parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
-    parser.add_argument("--port", type=cli.at_most(65535), default=8080, help="(default: %(default)s)")
+    parser.add_argument("--port", type=cli.at_most(65535), default=8080, help="port to listen at (default: %(default)s)")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     given = parser.given(argv)  # else what the run says
     serve(
