@@ -34,6 +34,8 @@ def main(argv: Sequence[str]) -> None:
     args, _ = parser.parse(argv)
     if args.arm == "sim" and args.emulate:
         parser.error("--emulate is for real arms' protocols: --arm sim is simulated already")
+    if args.arm == "lerobot" and args.emulate:
+        parser.error("--emulate is for the protocols that are spoken here: --arm lerobot is LeRobot's")
     if args.arm != "sim" and not (args.port or args.emulate):
         parser.error(f"--arm {args.arm} needs --port, or --emulate")
     for path in filter(None, (args.log,)):
@@ -61,7 +63,7 @@ def _parser() -> cli.Parser:
     add("policy", type=cli.path(".onnx"), help="file that export wrote")
     add("--arm", choices=drivers.KINDS, required=True, help="which arm")
     add("--port", help="of an SO-ARM a serial port, of a Piper or Nero INTERFACE:CHANNEL of python-can, as in socketcan:can0")
-    add("--calibration", type=cli.path(".json"), help="LeRobot's calibration file of the SO-ARM")
+    add("--calibration", type=cli.path(".json"), help="SO-ARM: LeRobot's file; lerobot: which joint is which motor")
     add("--emulate", action="store_true", help="in place of the arm, a program that speaks its protocol, with MuJoCo behind it")
     add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")
     text = "where the object is: X,Y,Z, a JSON file, udp://HOST:PORT to listen at, or tcp://HOST:PORT to listen to"

@@ -112,14 +112,14 @@ def test_the_arm_goes_where_it_is_told(bench):
 def test_speeds_and_loads_are_read(bench):
     bench.start()
     home = np.array(bench.told["joints"]["home"])
-    seen = []
     for k in range(30):
         due = bench.clock.now() + 0.02
-        seen.append((bench.guard.read(), bench.plant.velocity()))
+        feedback = bench.guard.read()
+        np.testing.assert_allclose(feedback.velocity[:5], bench.plant.velocity()[:5], atol=2e-3)  # a count a second, and more
+        np.testing.assert_allclose(feedback.load, np.clip(bench.plant.load(), -1, 1), atol=1e-3)
         bench.guard.command(home + np.array([0.02 * k, 0, 0, 0, 0, 0]))
         bench.clock.sleep_until(due)
-    fast = np.mean([feedback.velocity[0] for feedback, _ in seen[10:]])
-    assert fast == pytest.approx(1.0, rel=0.3)
+    assert feedback.velocity[0] > 0.5
 
 
 def test_torque_comes_only_when_the_goal_is_where_the_servo_is(bench):

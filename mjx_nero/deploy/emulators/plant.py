@@ -147,6 +147,11 @@ class Plant:
         """Shares of the torque that the drives have, signed."""
         return self.data.actuator_force[self._act] / self._effort
 
-    def target(self, targets: np.ndarray) -> None:
-        """New targets of the drives, in force after what ``faults.late`` says [rad or m]."""
-        self._waiting.append((self._clock.now() - self._begun + self.faults.late, np.array(targets, float)))
+    @property
+    def time(self) -> float:
+        """Since its beginning, now [s]."""
+        return self._clock.now() - self._begun
+
+    def target(self, targets: np.ndarray, later: float = 0.0) -> None:
+        """New targets of the drives [rad or m], in force after what ``faults.late`` says, and ``later`` [s]."""
+        self._waiting.append((self.time + self.faults.late + later, np.array(targets, float)))
