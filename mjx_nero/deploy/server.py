@@ -22,6 +22,7 @@ from mjx_nero.deploy import drivers, setup
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.deploy.fence import FenceCfg
 from mjx_nero.deploy.guard import Dry, Guard, WallClock, urgent
+from mjx_nero.deploy.identified import Offset
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Fault, SafetyCfg
 from mjx_nero.errors import UserError
@@ -39,6 +40,7 @@ class Spec:
         safety, fence: fields of ``SafetyCfg`` and ``FenceCfg``.
         log: file of the log; empty: none.
         dry: nothing is sent.
+        offsets: of the encoders, along the joints [rad or m]; none: all zero.
         notes: lines for the log's head.
     """
 
@@ -50,6 +52,7 @@ class Spec:
     log: str = ""
     dry: bool = False
     notes: tuple[str, ...] = ()
+    offsets: tuple[float, ...] = ()
 
 
 class Server:
@@ -64,6 +67,8 @@ class Server:
         self.cfg = SafetyCfg(**spec.safety)
         self.dt = float(spec.metadata["control_dt"])
         arm = drivers.make(spec.kind, spec.options, spec.metadata, self.clock)
+        if any(spec.offsets):
+            arm = Offset(arm, np.array(spec.offsets))
         self._arm = Dry(arm) if spec.dry else arm
         self._arm.connect()
         safety = setup.safety_of(spec.metadata, self.cfg, FenceCfg(**spec.fence), self._arm.ranges())

@@ -1,5 +1,6 @@
 """Ways in which a person stops an arm: Ctrl-C, SIGTERM, a key, or a file that nobody touches any more."""
 
+import collections
 import contextlib
 import os
 import pathlib
@@ -13,6 +14,7 @@ from mjx_nero.deploy.loop import Stop
 from mjx_nero.deploy.safety import Fault
 
 KEYS = b" q\x1b"  # space, q, escape
+typed: collections.deque[str] = collections.deque(maxlen=16)  # other keys, for who asks questions
 FRESH = 0.5  # [s] a dead man's file has to be younger
 
 
@@ -62,6 +64,7 @@ def _key() -> str:
             return ""
         if hit := next((k for k in pressed if k in KEYS), None):
             return {" ": "space", "\x1b": "escape"}.get(chr(hit), chr(hit))
+        typed.extend(pressed.decode("ascii", "ignore"))
     return ""
 
 

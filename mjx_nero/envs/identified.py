@@ -35,13 +35,13 @@ class Numbers:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """The measured parameters of a joint's drive (see ``identify.plant.Drives``)."""
+    """The measured parameters of a joint's drive (see ``identify.plant.Drives``); ``deploy --check`` measures offsets alone."""
 
-    stiffness: Positives
-    damping: Positives
-    armature: Positives
-    friction: Positives
     offset: Numbers
+    stiffness: Positives | None = None
+    damping: Positives | None = None
+    armature: Positives | None = None
+    friction: Positives | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,10 @@ def read(path: pathlib.Path) -> Identified:
 
 def _numbers(found: Identified) -> dict[str, Any]:
     return {
-        f"joints.{j}.{f.name}": getattr(joint, f.name) for j, joint in found.joints.items() for f in dataclasses.fields(joint)
+        f"joints.{j}.{f.name}": number
+        for j, joint in found.joints.items()
+        for f in dataclasses.fields(joint)
+        if (number := getattr(joint, f.name)) is not None
     }
 
 
@@ -92,13 +95,18 @@ def applied(cfg: EnvCfg) -> EnvCfg:
             f"{path} is of {found.robot} with joints {', '.join(found.joints)}: this task's robot is {cfg.robot.name}"
         )
     joints = [found.joints[name] for name in arm.joints]
+    late = dataclasses.replace(cfg, actions=_late(cfg, found.delay))
     names = ("stiffness", "damping", "armature", "friction")
+    known = [n for n in names if all(getattr(j, n) is not None for j in joints)]
+    if not known:
+        return late
+    if len(known) < len(names):
+        raise UserError(f"{path} needs {', '.join(names)} of every joint, or of none")
     ranges = {n: tuple((getattr(j, n).low, getattr(j, n).high) for j in joints) for n in names}
     gains: dict[str, Any] = {n: tuple(getattr(j, n).value for j in joints) for n in ("stiffness", "damping")}
     return dataclasses.replace(
-        cfg,
+        late,
         robot=dataclasses.replace(cfg.robot, arm=dataclasses.replace(arm, **gains)),
-        actions=_late(cfg, found.delay),
         randomization={"identified": Term(randomization.drives, params={"joints": arm.joints, **ranges}), **cfg.randomization},
     )
 

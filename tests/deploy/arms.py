@@ -17,19 +17,21 @@ def metadata(name, dt=0.02):
 
 
 class Clock:
-    """Time passes where somebody waits; every 5 ms of it all in ``ticks`` happens."""
+    """Time passes where somebody waits; after every ``period`` of it all in ``ticks`` happens."""
 
-    def __init__(self):
-        self.time, self.ticks = 100.0, []
+    def __init__(self, period=0.005):
+        self.time, self.ticks, self._period, self._due = 100.0, [], period, 100.0
 
     def now(self):
         return self.time
 
     def sleep_until(self, time):
-        while self.time < time:
-            self.time = min(self.time + 0.005, time)
+        while self.ticks and self._due <= time:
+            self.time = max(self.time, self._due)
             for tick in self.ticks:
                 tick()
+            self._due += self._period
+        self.time = max(self.time, time)
 
 
 class Bench:

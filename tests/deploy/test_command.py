@@ -37,6 +37,13 @@ def test_home_first(call, policy):
     assert status == 0 and out.startswith("the arm is at home")
 
 
+def test_a_check_is_a_go_and_its_file_is_taken(call, policy, tmp_path):
+    status, out, err = call("mjx_nero", "deploy", policy, "--arm", "sim", "--check", "found.yaml")
+    assert (status, err) == (0, "") and "go: next --dry-run" in out and out.count("go    ") == 6
+    taken = ("--identified", "found.yaml", "--seconds", "0.5")
+    assert call("mjx_nero", "deploy", policy, "--arm", "sim", *taken)[0] == 0
+
+
 def test_an_object_that_nobody_sees_is_a_fault(call, policy):
     status, out, err = call("mjx_nero", "deploy", policy, "--arm", "sim", *FAST, "--object", "udp://127.0.0.1:0")
     assert (status, err) == (3, "") and "the arm holds: nobody has said where the cube is" in out
@@ -48,6 +55,9 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
         (("--arm", "so101"), "--arm so101 needs --port, or --emulate"),
         (("--arm", "toaster"), "--arm"),
         (("--arm", "sim", "--emulate"), "--arm sim is simulated already"),
+        (("--arm", "lerobot", "--emulate"), "--arm lerobot is LeRobot's"),
+        (("--arm", "sim", "--check", "found.yaml", "--dry-run"), "--check moves the arm"),
+        (("--arm", "sim", "--identified", "none.yaml"), "none.yaml"),
         (("--arm", "sim", "--goal", "1,2"), "--goal takes 3 or 7 numbers"),
         (("--arm", "sim", "--goal", "1,2,nan"), "--goal takes 3 or 7 numbers"),
         (("--arm", "sim", "--workspace", "0,1,0,1,1,0"), "--workspace takes ranges from low to high"),

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import time
 
 import arms
 import numpy as np
@@ -76,8 +77,21 @@ class Bench(arms.Bench):
         self.port = emulated.Port(self.servos)
         self.arm = so_arm.of(kind, told, clock, self.port.name, str(self.calibration))
         self.guard = Guard(self.arm, setup.safety_of(told), clock)
-        self.told, self.clock = told, clock
+        self.told, self.clock, self.asked, self._heard = told, clock, 0, 0
+        self._answer, self.servos.answer = self.servos.answer, self._hear
+        clock.ticks = [self._wait]
         self.serve()
+
+    def _hear(self, request):
+        answer = self._answer(request)
+        self._heard += 1
+        return answer
+
+    def _wait(self):
+        """Time passes when all that was sent has arrived."""
+        end = time.monotonic() + 2.0
+        while self._heard < self.asked and time.monotonic() < end:
+            time.sleep(1e-4)
 
     def close(self):
         self.stop()
@@ -89,7 +103,13 @@ class Bench(arms.Bench):
 @pytest.fixture
 def bench(tmp_path, told, lift, monkeypatch):
     monkeypatch.setattr(so_arm, "_WAIT", 0.5)  # whoever answers may have to wait for a processor
-    made = Bench(tmp_path, told, lift)
+    made, send = Bench(tmp_path, told, lift), feetech.Bus._send
+
+    def counted(bus, request):
+        send(bus, request)
+        made.asked += 1
+
+    monkeypatch.setattr(feetech.Bus, "_send", counted)
     yield made
     assert made.servos.eeprom_writes == 0 and made.servos.torque_cuts == 0
     made.close()
@@ -112,14 +132,14 @@ def test_the_arm_goes_where_it_is_told(bench):
 def test_speeds_and_loads_are_read(bench):
     bench.start()
     home = np.array(bench.told["joints"]["home"])
-    seen = []
     for k in range(30):
         due = bench.clock.now() + 0.02
-        seen.append((bench.guard.read(), bench.plant.velocity()))
+        feedback = bench.guard.read()
+        np.testing.assert_allclose(feedback.velocity[:5], bench.plant.velocity()[:5], atol=2e-3)  # a count a second, and more
+        np.testing.assert_allclose(feedback.load, np.clip(bench.plant.load(), -1, 1), atol=1e-3)
         bench.guard.command(home + np.array([0.02 * k, 0, 0, 0, 0, 0]))
         bench.clock.sleep_until(due)
-    fast = np.mean([feedback.velocity[0] for feedback, _ in seen[10:]])
-    assert fast == pytest.approx(1.0, rel=0.3)
+    assert feedback.velocity[0] > 0.5
 
 
 def test_torque_comes_only_when_the_goal_is_where_the_servo_is(bench):
@@ -200,8 +220,8 @@ def test_one_damaged_answer_is_asked_for_again(bench):
 def test_a_late_answer_is_not_taken_for_the_next_one(bench):
     """An answer that comes after its time was over belongs to nobody."""
     bench.start()
-    bench.arm._bus._port.timeout = 0.03
-    bench.servos.faults.turnaround = 0.04  # of one servo
+    bench.arm._bus._port.timeout = 0.15
+    bench.servos.faults.turnaround = 0.2  # of one servo
     with pytest.raises(ArmError, match="servo 1 does not answer"):
         bench.arm._bus.read(1, "homing_offset")
     bench.servos.faults.turnaround, bench.arm._bus._port.timeout = 0.0, 0.5

@@ -7,10 +7,10 @@ from mjx_nero.deploy.arm import Arm, Clock
 from mjx_nero.deploy.executor import Lag
 from mjx_nero.errors import UserError
 
-KINDS = ("sim", "so101", "so100", "piper", "nero")
+KINDS = ("sim", "so101", "so100", "piper", "nero", "cobotta", "lerobot")
 
 
-_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper", "nero": "nero"}
+_ROBOTS = {"so101": "so_arm101", "so100": "so_arm100", "piper": "piper", "nero": "nero", "cobotta": "cobotta_pro_900"}
 
 
 def check(kind: str, metadata: Mapping[str, Any]) -> None:
@@ -30,7 +30,9 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
 
     Args:
         options: of the driver, as plain values: ``model`` and ``tracker`` of the simulated arm, ``port`` and ``calibration`` of
-            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper and the Nero.
+            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper and the
+            Nero, ``port`` and ``gripper`` (``HOST:PORT``) of the Cobotta,
+            ``port`` (``TYPE:field=value,...``) and ``calibration`` of LeRobot's.
 
     Raises:
         UserError: there is no such arm, a package or file is missing, or it is another robot than the policy's.
@@ -45,6 +47,14 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
         from mjx_nero.deploy.drivers import so_arm
 
         return so_arm.of(kind, metadata, clock, **options)
+    if kind == "lerobot":
+        from mjx_nero.deploy.drivers import lerobot
+
+        return lerobot.of(metadata, clock, **options)
+    if kind == "cobotta":
+        from mjx_nero.deploy.drivers import cobotta
+
+        return cobotta.of(metadata, clock, **options)
     from mjx_nero.deploy.drivers import agilex
 
     return agilex.of(kind, metadata, clock, **options)

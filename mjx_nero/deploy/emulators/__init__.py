@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from mjx_nero.deploy import children
 from mjx_nero.errors import UserError
 
-_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "agilex"}
+_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "agilex", "cobotta": "bcap"}
 
 
 @contextlib.contextmanager
@@ -35,9 +35,9 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": children.environment()}
     with subprocess.Popen(argv, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         try:
-            if not (port := process.stdout.readline().strip()):
+            if not (said := process.stdout.readline().strip()):
                 raise UserError(f"the emulated {kind} did not start")
-            yield {"port": port, **driver}
+            yield {**json.loads(said), **driver}
         finally:
             process.stdin.close()
             process.wait(10)
@@ -52,7 +52,7 @@ class Port(Protocol):
 
 
 def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
-    """An emulator's process: makes the plant that ``started`` describes, says its port, and serves until its input ends."""
+    """An emulator's process: makes the plant that ``started`` describes, says its ports, and serves until its input ends."""
     import dataclasses
 
     import numpy as np
@@ -70,5 +70,6 @@ def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
     plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
     urgent()
     port = port_of(plant, told)
-    print(port.name, flush=True)
+    gripper = getattr(port, "gripper", None)
+    print(json.dumps({"port": port.name, **({"gripper": gripper} if gripper else {})}), flush=True)
     port.serve(other=sys.stdin.fileno())

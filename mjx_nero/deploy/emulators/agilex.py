@@ -20,6 +20,7 @@ from mjx_nero.deploy.drivers import agilex
 from mjx_nero.deploy.emulators.plant import Plant
 
 PERIOD = 0.005  # [s] between feedbacks
+_WAY, _STEPS = 0.02, 8  # [s] to a new target; steps on the way
 
 
 @dataclasses.dataclass
@@ -46,7 +47,7 @@ class Arm:
 
     def __init__(self, plant: Plant, model: agilex.Model):
         self.plant, self.faults, self.torque_cuts, self._model = plant, BusFaults(), 0, model
-        self._goal = plant.position()
+        self._goal, self._told = plant.position(), plant.position()
         plant.powered[:] = False
         plant.stiffen()
 
@@ -71,8 +72,11 @@ class Arm:
             self.torque_cuts += 1
 
     def _aim(self) -> None:
+        """Goes straight to new targets. How the real arm's planner does it is not known."""
         self.plant.advance()
-        self.plant.target(self._goal)
+        for k in range(1, _STEPS + 1):
+            self.plant.target(self._told + (self._goal - self._told) * k / _STEPS, _WAY * k / _STEPS)
+        self._told = self._goal.copy()
 
     def frames(self) -> list[tuple[int, bytes]]:
         """All of one round."""

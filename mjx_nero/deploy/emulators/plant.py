@@ -91,6 +91,9 @@ class Plant:
         stiffness = np.where(soft, 10 * self._gain, self._gain)
         damping = np.where(soft, 2 * np.sqrt(stiffness * inertia), -self._bias[:, 2])
         self._gain, self._bias[:, 1], self._bias[:, 2] = stiffness, -stiffness, -damping
+        fastest = float(np.sqrt(stiffness / inertia)[soft].max(initial=0.0))
+        while fastest * self.model.opt.timestep > 1:
+            self.model.opt.timestep /= 2  # a servo's swing takes some steps of physics
 
     def _couple(self) -> None:
         """Joints that follow others, where these have them."""
@@ -147,6 +150,11 @@ class Plant:
         """Shares of the torque that the drives have, signed."""
         return self.data.actuator_force[self._act] / self._effort
 
-    def target(self, targets: np.ndarray) -> None:
-        """New targets of the drives, in force after what ``faults.late`` says [rad or m]."""
-        self._waiting.append((self._clock.now() - self._begun + self.faults.late, np.array(targets, float)))
+    @property
+    def time(self) -> float:
+        """Since its beginning, now [s]."""
+        return self._clock.now() - self._begun
+
+    def target(self, targets: np.ndarray, later: float = 0.0) -> None:
+        """New targets of the drives [rad or m], in force after what ``faults.late`` says, and ``later`` [s]."""
+        self._waiting.append((self.time + self.faults.late + later, np.array(targets, float)))

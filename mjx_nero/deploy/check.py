@@ -1,0 +1,197 @@
+"""A walk through an arm before a policy has it: small safe moves of one joint after another, what was read, what a person saw.
+
+A move goes a few degrees from home and back, through the safety layer, at a fifth of the joints' speeds. What it shows of a
+joint: which reading followed (order), which way (sign), by how much (scale), what the reading says beside the command at rest
+(offset), and how late it came (delay, with what the drive adds to it).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Clock
+from mjx_nero.deploy.body import Body
+from mjx_nero.deploy.guard import Guarded
+from mjx_nero.deploy.loop import Stop
+from mjx_nero.deploy.safety import Fault, Limits
+
+ANGLE, SHARE = 0.1, 0.2  # of a move [rad]; of the speeds
+SLIDE = 0.02  # of a move of a joint that slides [m]
+_REST, _SAMPLE = 0.4, 0.005  # [s] at each end; between readings
+_LATEST = 0.3  # [s] of a delay
+_SAME, _SCALE, _OFFSET = 0.5, 0.1, 0.05  # share of the move that counts as following; how far scale and offset may be off
+
+Ask = Callable[[str], "bool | None"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Move:
+    """What was told to a joint and read of all of them; times since its beginning [s].
+
+    Attributes:
+        sent, told: when targets were sent, and which [rad or m].
+        times, read: when readings were made, and which [k, n].
+    """
+
+    sent: np.ndarray
+    told: np.ndarray
+    times: np.ndarray
+    read: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """What a move showed of a joint.
+
+    Attributes:
+        name: of the joint.
+        follows: the joint whose reading moved most.
+        scale: how far the reading moved, over how far the command did.
+        offset: of the reading beside the command at rest [rad or m].
+        delay: from a command to the reading that follows it [s].
+        seen: whether a person saw it move as was said; None: nobody was asked.
+        there: whether the whole move could be made.
+    """
+
+    name: str
+    follows: str
+    scale: float
+    offset: float
+    delay: float
+    seen: bool | None = None
+    there: bool = True
+
+    def wrong(self, grips: bool) -> list[str]:
+        """What speaks against letting a policy have it."""
+        out = [] if self.there else ["the fence does not let it move here"]
+        if self.follows != self.name:
+            out.append(f"the reading of {self.follows} moved instead: the order of the joints is wrong")
+        elif abs(self.scale) < _SAME:
+            out.append("its reading hardly moved: is it powered, and free?")
+        elif self.scale < 0:
+            out.append("its reading moved the other way: its sign is wrong")
+        elif abs(self.scale - 1) > _SCALE and not grips:
+            out.append(f"its reading moved {self.scale:.2f} times as far: its scale is wrong, or it does not follow")
+        if not out and abs(self.offset) > _OFFSET and not grips:
+            out.append(f"at rest it is read {self.offset:+.3f} beside its command: its zero is off, or it sags")
+        if self.seen is False:
+            out.append("nobody saw it move as was said: its sign, zero or order differs from the model's")
+        return out
+
+
+def move(arm: Guarded, joint: int, step: float, limits: Limits, clock: Clock, stop: Stop) -> Move:
+    """A joint goes ``step`` [rad or m] and back; the others stay. Stops where somebody says so, or something fails."""
+    begun, here = clock.now(), arm.read().position
+    target, sent, told, times, read = here.copy(), [], [], [], []
+    pace = limits.speed[joint] * SHARE * limits.dt
+    way = np.concatenate([np.zeros(5), np.arange(pace, abs(step), pace), np.full(round(_REST / limits.dt), abs(step))])
+    way = np.concatenate([way, np.arange(abs(step), 0, -pace), np.zeros(round(_REST / limits.dt))]) * math.copysign(1, step)
+    for k, moved in enumerate(way):
+        if ending := stop():
+            arm.hold(ending)
+        if arm.fault:
+            break
+        target[joint] = here[joint] + moved
+        command = arm.command(target)
+        sent.append(arm.sent or clock.now())
+        told.append(command.position[joint])
+        while (next_ := clock.now() + _SAMPLE) < begun + (k + 1) * limits.dt:
+            clock.sleep_until(next_)
+            seen = arm.read()
+            times.append(seen.time)
+            read.append(seen.position)
+        clock.sleep_until(begun + (k + 1) * limits.dt)
+    return Move(*(np.array(x) for x in (sent, told, times, read)))
+
+
+def judged(made: Move, joint: int, names: tuple[str, ...], step: float) -> Joint:
+    """What a move says."""
+    far = np.abs(made.told - made.told[0]).max() > 0.8 * abs(step)
+    settled = (made.times > made.sent[0]) & (np.abs(np.interp(made.times, made.sent, made.told) - made.told[0]) < 1e-6)
+    start = made.read[made.times < made.sent[5]].mean(axis=0)
+    top = made.told[int(np.abs(made.told - made.told[0]).argmax())]
+    high = np.abs(np.interp(made.times, made.sent, made.told) - top) < 1e-6
+    late = made.times > made.times[high][0] + _REST / 2 if high.any() else high
+    reached = made.read[high & late].mean(axis=0) if (high & late).any() else made.read[-1]
+    moved = reached - start
+    most, way = int(np.abs(moved).argmax()), top - made.told[0]
+    ends = settled & ((made.times < made.sent[5]) | (made.times > made.sent[-1] - _REST / 2))
+    offset = float(made.read[ends, joint].mean() - made.told[0]) if ends.any() else 0.0
+    scale = float(moved[joint] / way) if way else 0.0
+    return Joint(names[joint], names[most], scale, offset, delay_of(made, joint), None, bool(far))
+
+
+def delay_of(made: Move, joint: int) -> float:
+    """How late the reading follows the command: where the two differ least, but for scale and offset [s]."""
+    seen, best = made.read[:, joint], (math.inf, 0.0)
+    for delay in np.arange(0.0, _LATEST, 0.001):
+        last = np.clip(np.searchsorted(made.sent, made.times - delay, side="right") - 1, 0, None)
+        columns = np.stack([made.told[last], np.ones(len(seen))], axis=1)
+        rest = np.linalg.lstsq(columns, seen, rcond=None)[0]
+        best = min(best, (float(np.sum((columns @ rest - seen) ** 2)), float(delay)))
+    return best[1]
+
+
+def described(body: Body, position: np.ndarray, joint: int, step: float) -> str:
+    """What a person sees when a joint moves by ``step``: where the end effector goes."""
+    before, turn = body.ee(position)
+    there = position.copy()
+    there[joint] += step
+    after, turned = body.ee(there)
+    way = after - before
+    axis = int(np.abs(way).argmax())
+    words = (("forwards, along +x", "backwards, along -x"), ("to +y, its left", "to -y, its right"), ("up", "down"))
+    if abs(way[axis]) > 0.003:
+        return f"the hand goes {1e3 * abs(way[axis]):.0f} mm {words[axis][int(way[axis] < 0)]}"
+    cosine = min(1.0, abs(float(turn @ turned)))
+    return f"the hand turns by {math.degrees(2 * math.acos(cosine)):.0f} degrees on the spot"
+
+
+def walk(
+    arm: Guarded, limits: Limits, body: Body, clock: Clock, stop: Stop, ask: Ask, say: Callable[[str], None] = print
+) -> tuple[list[Joint], Fault | None]:
+    """Moves each joint of an arm that is at home.
+
+    Returns:
+        what was found, and why it stopped short, if it did.
+    """
+    found: list[Joint] = []
+    for joint, name in enumerate(limits.names):
+        at = arm.read().position
+        size = ANGLE if limits.upper[joint] - limits.lower[joint] > 0.5 else SLIDE
+        up = limits.upper[joint] - at[joint] >= at[joint] - limits.lower[joint]
+        step = min(size, 0.4 * (limits.upper[joint] - limits.lower[joint])) * (1 if up else -1)
+        said = described(body, at, joint, step) if limits.arm[joint] else "the fingers move"
+        say(f"{name} moves by {step:+.2f}: {said}")
+        made = move(arm, joint, step, limits, clock, stop)
+        if arm.fault or len(made.times) < 10:
+            return found, arm.fault or Fault("stop", "too few readings")
+        one = judged(made, joint, limits.names, step)
+        seen = ask(f"did {name} do that, and nothing else?")
+        if arm.fault:
+            return found, arm.fault
+        found.append(dataclasses.replace(one, seen=seen))
+    return found, None
+
+
+def yaml_of(robot: str, found: list[Joint], arm: Sequence[str]) -> str:
+    """What ``deploy --identified`` and ``--env.identified`` read: offsets and the delay, each with the range that joints showed.
+
+    Args:
+        arm: names of the arm's joints.
+    """
+    mine = [joint for joint in found if joint.name in arm]
+    delays = sorted(joint.delay for joint in mine)
+    middle = delays[len(delays) // 2]
+    lines = [
+        f"# What deploy --check read on a {robot}: offsets [rad or m] and the delay [s], which has in it what the drives add.",
+        f"robot: {robot}",
+        f"delay: {{value: {middle:.4f}, low: {delays[0]:.4f}, high: {delays[-1]:.4f}}}",
+        "joints:",
+    ]
+    for joint in mine:
+        value = f"{joint.offset:.5f}"
+        lines.append(f"  {joint.name}: {{offset: {{value: {value}, low: {value}, high: {value}}}}}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,188 @@
+"""DENSO Cobotta Pro 900 over b-CAP, in slave mode: the controller (RC9) takes the joints' targets every 8 ms.
+
+The sequence is that of DENSORobot/denso_robot_ros (``denso_robot_core``): connect to ``CaoProv.DENSO.VRC9``, TakeArm, Motor,
+slvSendFormat, slvRecvFormat, slvChangeMode 0x202 (angles, and each slvMove waits for its turn), then slvMove with eight angles in
+degrees, whose answer is where the joints are. A thread does that; between two targets of the policy it goes straight, smoothed
+over three cycles, and with none it stays where it is. Nothing here switches motors off, gives the arm away or clears an error.
+"""
+
+import collections
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import ArmError, Clock, Feedback
+from mjx_nero.deploy.drivers import bcap, rg6
+from mjx_nero.errors import UserError
+
+CYCLE = 0.008  # [s]
+ANGLES, SLAVE, NORMAL = 0x0002, 0x0202, 0
+_SMOOTH = 3  # cycles
+_PATIENCE = 0.5  # [s] for an answer
+_AXES = 8  # that a target has
+_JOINTS = 6
+
+
+class Cobotta:
+    """The arm, and its RG6.
+
+    Args:
+        host: ``HOST`` or ``HOST:PORT`` of the controller.
+        gripper: None: there is none to talk to, and it seems to be where it is told.
+    """
+
+    def __init__(self, metadata: Mapping[str, Any], host: str, gripper: rg6.Rg6 | None, clock: Clock):
+        self.joints = tuple(metadata["joints"]["names"])
+        self._address, (self._host, _, port) = host, host.partition(":")
+        self._port, self._clock, self._gripper = int(port or bcap.PORT), clock, gripper
+        self._dt = float(metadata["control_dt"])
+        self._lock, self._over, self._error = threading.Lock(), threading.Event(), ""
+        self._grip = np.array(metadata["joints"]["home"], float)[_JOINTS:]
+        self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque(maxlen=4)
+        self._thread: threading.Thread | None = None
+        self._engaged = False
+
+    def ranges(self) -> None:
+        """See ``Arm``: the model's, which are the maker's."""
+
+    def connect(self) -> None:
+        """See ``Arm``."""
+        try:
+            self._call = bcap.Client(self._host, self._port, _PATIENCE)
+        except OSError as error:
+            raise UserError(f"no controller answers at {self._address}: {error}") from None
+        try:
+            self._call(bcap.SERVICE_START, "")
+            self._controller = self._call(bcap.CONNECT, "", "CaoProv.DENSO.VRC9", "localhost", "")
+            names = self._call(bcap.ROBOT_NAMES, self._controller, "") or ["Arm"]
+            self._robot = self._call(bcap.GET_ROBOT, self._controller, names[0], "")
+            self._remember(self._angles(self._do("HighCurJntEx")[1:]))
+        except ArmError as error:
+            raise UserError(
+                f"the controller at {self._address} lets nobody in: {error}. Its executable token has to be Ethernet's, "
+                "with this computer's address"
+            ) from None
+        if self._gripper:
+            self._gripper.connect()
+
+    def _do(self, command: str, argument: Any = None) -> Any:
+        return self._call(bcap.EXECUTE, self._robot, command, argument)
+
+    def _angles(self, degrees: Any) -> np.ndarray:
+        """The arm's joints out of an answer [rad].
+
+        Raises:
+            ArmError: they are not in it.
+        """
+        if not isinstance(degrees, list) or len(degrees) < _JOINTS or not all(isinstance(x, float) for x in degrees):
+            raise ArmError("the controller's answer has no angles")
+        return np.radians(degrees[:_JOINTS])
+
+    def _remember(self, angles: np.ndarray) -> None:
+        with self._lock:
+            self._past.append((self._clock.now(), angles))
+
+    def engage(self) -> None:
+        """See ``Arm``: motors on, then targets where the joints are, cycle for cycle."""
+        self._do("TakeArm", [0, 1])
+        self._do("Motor", [1, 0])
+        self._do("slvSendFormat", 0)
+        self._do("slvRecvFormat", ANGLES)
+        here = self._angles(self._do("HighCurJntEx")[1:])
+        self._remember(here)
+        self._from, self._to, self._since = here, here, self._clock.now()
+        self._sent = collections.deque([here] * _SMOOTH, maxlen=_SMOOTH)
+        self._do("slvChangeMode", SLAVE)
+        self._engaged = True
+        if self._gripper:
+            self._gripper.engage()
+        self._start()
+
+    def _start(self) -> None:
+        """Lets cycles run; the controller sets their pace."""
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._over.is_set() and not self._error:
+            self.turn()
+
+    def turn(self) -> None:
+        """What the thread does, again and again; what fails is told by ``read`` and ``command``."""
+        try:
+            if not self._error:
+                self.cycle()
+        except ArmError as error:
+            self._error = str(error)
+
+    def cycle(self) -> None:
+        """One target, and the answer to it."""
+        with self._lock:
+            self._sent.append(self._path(self._clock.now()))
+        degrees = np.degrees(np.mean(self._sent, axis=0)).tolist()
+        answer = self._do("slvMove", degrees + [0.0] * (_AXES - _JOINTS))
+        self._remember(self._angles(answer[0] if answer and isinstance(answer[0], list) else answer))
+
+    def _path(self, now: float) -> np.ndarray:
+        """Where the joints are to be: on the straight way to the last target, there after a control step."""
+        share = min(max((now - self._since) / self._dt, 0.0), 1.0)
+        return self._from + share * (self._to - self._from)
+
+    def read(self) -> Feedback:
+        """See ``Arm``: the newest answer; velocities are differences over some cycles."""
+        if self._error:
+            raise ArmError(self._error)
+        if not self._engaged:
+            self._remember(self._angles(self._do("HighCurJntEx")[1:]))
+        with self._lock:
+            (first, before), (now, at) = self._past[0], self._past[-1]
+        speed = (at - before) / (now - first) if now - first > CYCLE / 2 else np.zeros(_JOINTS)
+        grip = self._grip
+        if self._gripper:
+            left = rg6.angle(self._gripper.read())
+            grip = np.array([left, -left])
+        return Feedback(now, np.concatenate([at, grip]), np.concatenate([speed, np.zeros(2)]))
+
+    def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """See ``Arm``: the thread goes there within a control step."""
+        if self._error:
+            raise ArmError(self._error)
+        with self._lock:
+            now = self._clock.now()
+            self._from, self._to, self._since = self._path(now), position[:_JOINTS].copy(), now
+        self._grip = position[_JOINTS:].copy()
+        if self._gripper:
+            self._gripper.command(rg6.width(float(position[_JOINTS] - position[_JOINTS + 1]) / 2))
+        return position
+
+    def close(self) -> None:
+        """See ``Arm``: leaves slave mode at rest. The controller holds the arm, with its motors on."""
+        self._over.set()
+        try:
+            if self._engaged:
+                if self._thread is not None:
+                    self._thread.join(1.0)
+                for _ in range(_SMOOTH):
+                    self.cycle()
+                self._do("slvChangeMode", NORMAL)
+        except ArmError:
+            pass  # it has left by itself
+        if self._gripper:
+            self._gripper.close()
+        self._call.close()
+
+
+def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, gripper: str | None = None, **_: Any) -> Cobotta:
+    """The arm at an address.
+
+    Raises:
+        UserError: it is none.
+    """
+    assert port
+    for flag, address in (("--port", port), ("--gripper", gripper)):
+        host, colon, number = (address or "x").partition(":")
+        if not host or (colon and not (number.isdecimal() and int(number) < 65536)):
+            raise UserError(f"{flag} of a Cobotta is HOST or HOST:PORT, got {address!r}")
+    return Cobotta(metadata, port, rg6.Rg6(gripper) if gripper else None, clock)

@@ -1,0 +1,142 @@
+"""Any arm that LeRobot drives, through its ``Robot`` (huggingface/lerobot, ``src/lerobot/robots/robot.py``).
+
+``--port TYPE:field=value,...`` names its configuration, as in ``so101_follower:port=/dev/ttyACM0,id=mine``; packages named
+``lerobot_robot_*`` are found as LeRobot finds them. ``get_observation`` and ``send_action`` have ``MOTOR.pos`` in degrees, and
+of a gripper 0, closed, to 100, open. Where an arm differs, ``--calibration`` is a JSON by joint:
+
+    {"joint1": {"motor": "shoulder", "scale": 0.017453, "offset": 0.0}}      position = scale * (MOTOR.pos) + offset [rad or m]
+
+``disconnect`` is never called, as it can switch torque off; what ``connect`` does to the motors is LeRobot's affair: some of its
+robots switch torque off for a moment there, so support the arm.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import ArmError, Clock, Feedback
+from mjx_nero.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """What ``MOTOR.pos`` means for a joint: ``position = scale * pos + offset`` [rad or m]."""
+
+    motor: str
+    scale: float
+    offset: float
+
+
+def motors_of(metadata: Mapping[str, Any], path: pathlib.Path | None) -> list[Motor]:
+    """Of the joints: by a file, or by LeRobot's habits.
+
+    Raises:
+        UserError: there is no such file, or it says something else.
+    """
+    own = metadata["joints"]
+    if path is None:
+        out = []
+        for name, low, high in zip(own["names"], own["lower"], own["upper"], strict=True):
+            grips = name in metadata["gripper"]
+            out.append(Motor(name, (high - low) / 100, low) if grips else Motor(name, math.pi / 180, 0.0))
+        return out
+    try:
+        found = json.loads(path.read_bytes()[:100_000])
+        made = [Motor(str(found[j]["motor"]), float(found[j]["scale"]), float(found[j]["offset"])) for j in own["names"]]
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise UserError(f"{path} needs motor, scale and offset for each of {', '.join(own['names'])}") from None
+    if not all(math.isfinite(m.scale) and math.isfinite(m.offset) and m.scale for m in made):
+        raise UserError(f"{path}: scale takes a number that is not zero, and offset one")
+    return made
+
+
+class LeRobotArm:
+    """A robot of LeRobot's.
+
+    Args:
+        robot: with ``connect``, ``get_observation``, ``send_action``, ``disconnect`` and ``is_connected``.
+    """
+
+    def __init__(self, metadata: Mapping[str, Any], robot: Any, motors: list[Motor], clock: Clock):
+        self.joints = tuple(metadata["joints"]["names"])
+        self._robot, self._clock = robot, clock
+        self._keys = [f"{motor.motor}.pos" for motor in motors]
+        self._scale, self._offset = (np.array([getattr(m, name) for m in motors]) for name in ("scale", "offset"))
+        self._last: tuple[float, np.ndarray] | None = None
+        with contextlib.suppress(AttributeError):
+            robot.config.disable_torque_on_disconnect = False
+        robot.disconnect = lambda: None  # its destructor calls it, too
+
+    def ranges(self) -> None:
+        """See ``Arm``: LeRobot does not say."""
+
+    def connect(self) -> None:
+        """See ``Arm``."""
+        known = {*self._robot.action_features, *self._robot.observation_features}
+        if missing := [key for key in self._keys if key not in known]:
+            raise UserError(
+                f"the robot has no {', '.join(missing)}, it has {', '.join(sorted(map(str, self._robot.action_features)))}: "
+                "say which joint is which by --calibration"
+            )
+        try:
+            if not self._robot.is_connected:
+                self._robot.connect(calibrate=False)
+        except Exception as error:  # each robot has kinds of its own
+            raise UserError(f"LeRobot cannot connect: {error}") from None
+
+    def engage(self) -> None:
+        """See ``Arm``: where it is becomes its target."""
+        self.command(self.read().position, np.zeros(len(self.joints)))
+
+    def read(self) -> Feedback:
+        """See ``Arm``: velocities are differences."""
+        try:
+            seen = self._robot.get_observation()
+            at = np.array([float(seen[key]) for key in self._keys]) * self._scale + self._offset
+        except Exception as error:
+            raise ArmError(f"LeRobot cannot read the arm: {error}") from None
+        now = self._clock.now()
+        before, self._last = self._last, (now, at)
+        passed = now - before[0] if before else 0.0
+        return Feedback(now, at, (at - before[1]) / passed if before and passed > 0 else np.zeros(len(at)))
+
+    def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """See ``Arm``."""
+        values = (position - self._offset) / self._scale
+        try:
+            sent = self._robot.send_action(dict(zip(self._keys, values.tolist(), strict=True)))
+            return np.array([float(sent[key]) for key in self._keys]) * self._scale + self._offset
+        except Exception as error:
+            raise ArmError(f"LeRobot cannot move the arm: {error}") from None
+
+    def close(self) -> None:
+        """See ``Arm``: it stays connected, and under torque, until this process ends."""
+
+
+def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, calibration: str | None, **_: Any) -> LeRobotArm:
+    """The robot that ``TYPE:field=value,...`` names.
+
+    Raises:
+        UserError: LeRobot has none such.
+    """
+    assert port
+    from lerobot.robots import make_robot_from_config
+    from lerobot.robots.config import RobotConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    kind, rest = (port.partition(":")[k] for k in (0, 2))
+    fields = dict(part.split("=", 1) for part in rest.split(",") if "=" in part)
+    try:
+        robot = make_robot_from_config(RobotConfig.get_choice_class(kind)(**fields))
+    except Exception as error:
+        raise UserError(f"LeRobot has no robot {port!r}: {error}") from None
+    return LeRobotArm(metadata, robot, motors_of(metadata, pathlib.Path(calibration) if calibration else None), clock)

@@ -1,0 +1,200 @@
+"""A Cobotta Pro's controller and its RG6 in software: b-CAP and Modbus over TCP.
+
+    python -m mjx_nero.deploy.emulators.bcap '{"model": "scene.mjb", ...}'
+
+prints both addresses and serves until its input ends. In slave mode a target is taken every 8 ms; three wait for their turn, the
+fourth one's sender has to. Where targets stop coming the controller leaves slave mode and stands. What a runtime must not do is
+counted: ``torque_cuts``.
+"""
+
+import contextlib
+import dataclasses
+import os
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.drivers import bcap, cobotta, rg6
+from mjx_nero.deploy.emulators.plant import Plant
+
+_BUFFER, _LATE = 3, 4  # cycles: targets that wait; how late the next one may be
+_FAIL, _TOO_LATE = 0x80004005 - (1 << 32), 0x84201482 - (1 << 32)
+_ARM = 6
+_FASTEST = 3.0  # times the model's speed, from one target to the next
+
+
+@dataclasses.dataclass
+class BusFaults:
+    """What can go wrong, to be set while it runs.
+
+    Attributes:
+        cut: nobody answers.
+        corrupt: answers lose their last byte.
+        closed: connections are closed at the next request.
+        error: result of every slvMove; 0: none.
+        tripped: a safety switch of the gripper is.
+    """
+
+    cut: bool = False
+    corrupt: bool = False
+    closed: bool = False
+    error: int = 0
+    tripped: bool = False
+
+
+class Controller:
+    """What the controller makes of requests.
+
+    Args:
+        speed: of the arm's joints, at most [rad/s].
+        wait: whether senders wait for their turn.
+    """
+
+    def __init__(self, plant: Plant, speed: np.ndarray, wait: bool = True):
+        self.plant, self.faults, self.torque_cuts, self.slave = plant, BusFaults(), 0, False
+        self._speed, self._wait, self._goal = speed, wait, plant.position()
+        self._turn = self._grip_to = 0.0
+        plant.powered[:_ARM] = False
+        plant.gears = 1e5  # brakes
+        plant.model.opt.timestep = cobotta.CYCLE / 2  # answers that come so often must not show the steps of physics
+        plant.stiffen()
+
+    def answer(self, data: bytes) -> bytes:
+        """The packet that comes back."""
+        try:
+            serial, function, values = bcap.parse(data)
+            result, value = self._do(function, values)
+        except (bcap.Damaged, IndexError, TypeError, ValueError):
+            return bcap.packet(struct.unpack_from("<H", data, 5)[0], _FAIL, [])
+        return bcap.packet(serial, result, [value])
+
+    def _do(self, function: int, values: list[Any]) -> tuple[int, Any]:
+        if function in (bcap.CONNECT, bcap.GET_ROBOT):
+            return 0, function
+        if function == bcap.ROBOT_NAMES:
+            return 0, ["Arm"]
+        if function == bcap.EXECUTE:
+            return self._execute(values[1], values[2])
+        return (0, None) if function in (bcap.SERVICE_START, bcap.SERVICE_STOP, bcap.DISCONNECT, bcap.RELEASE) else (_FAIL, None)
+
+    def _execute(self, command: str, argument: Any) -> tuple[int, Any]:
+        self.plant.advance()
+        if command == "HighCurJntEx":
+            return 0, [0.0, *self._degrees()]
+        if command == "Motor":
+            on = bool(argument[0])
+            self.torque_cuts += bool(self.plant.powered[:_ARM].any()) and not on
+            self.plant.powered[:_ARM] = on
+            self._goal[:_ARM] = self.plant.position()[:_ARM]
+            self.plant.target(self._goal)
+        elif command == "slvChangeMode":
+            self.slave, self._turn = argument == cobotta.SLAVE, self.plant.time
+        elif command == "slvMove":
+            return self._move(np.radians(argument[:_ARM]))
+        elif command == "GiveArm":
+            self.torque_cuts += 1
+        elif command not in ("TakeArm", "slvSendFormat", "slvRecvFormat"):
+            return _FAIL, None
+        return 0, None
+
+    def _degrees(self) -> list[float]:
+        return [*np.degrees(self.plant.position()[:_ARM]).tolist(), 0.0, 0.0]
+
+    def _move(self, target: np.ndarray) -> tuple[int, Any]:
+        if self.faults.error or not self.slave:
+            self.slave = False
+            return self.faults.error - (1 << 32) if self.faults.error else _FAIL, None
+        now, cycle = self.plant.time, cobotta.CYCLE
+        if now - self._turn > _LATE * cycle or np.any(np.abs(target - self._goal[:_ARM]) > _FASTEST * self._speed * cycle):
+            self.slave = False
+            return _TOO_LATE if now - self._turn > _LATE * cycle else _FAIL, None
+        self._turn = max(self._turn + cycle, now)
+        self._goal[:_ARM] = target
+        self.plant.target(self._goal, self._turn - now)
+        if self._wait and (early := self._turn - now - _BUFFER * cycle) > 0:
+            time.sleep(early)
+        self.plant.advance()
+        return 0, self._degrees()
+
+    def grip(self, request: bytes) -> bytes:
+        """The gripper's answer to a Modbus request; of functions 3 and 16."""
+        self.plant.advance()
+        head, (unit, function, first, count) = request[:4], struct.unpack(">BBHH", request[6:12])
+        here = rg6.width(float(self.plant.position()[_ARM]))
+        if function == 16 and first == rg6.FORCE and count == 3:
+            _, width, control = struct.unpack(">HHH", request[13:19])
+            if control == rg6.GRIP:
+                self._grip_to = width * 1e-4
+                angle = rg6.angle(self._grip_to)
+                self._goal[_ARM:] = angle, -angle
+                self.plant.target(self._goal)
+            body = struct.pack(">BBHH", unit, function, first, count)
+        elif function == 3 and first == rg6.WIDTH and count <= 2:
+            busy = bool(abs(self.plant.velocity()[_ARM]) > 0.02)
+            status = busy * rg6.BUSY | self.faults.tripped * 8
+            body = struct.pack(">BBB", unit, function, 2 * count)
+            body += struct.pack(">HH", max(0, round(here * 1e4)), status)[: 2 * count]
+        else:
+            body = struct.pack(">BBB", unit, function | 0x80, 2)
+        return head + struct.pack(">H", len(body)) + body
+
+
+class Port:
+    """Both at ports of this machine.
+
+    Attributes:
+        name, gripper: as ``--port`` and ``--gripper`` take them.
+    """
+
+    def __init__(self, controller: Controller):
+        self.controller = controller
+        self._arm, self._hand = (socket.create_server(("127.0.0.1", 0)) for _ in range(2))
+        self.name, self.gripper = (f"127.0.0.1:{door.getsockname()[1]}" for door in (self._arm, self._hand))
+        self._guests: dict[socket.socket, bool] = {}
+
+    def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
+        """Answers until somebody says so, or until a file descriptor ends."""
+        while not until():
+            watched: list[Any] = [self._arm, self._hand, *self._guests, *([] if other is None else [other])]
+            ready, _, _ = select.select(watched, [], [], 0.02)
+            if other in ready and not os.read(other or 0, 1000):
+                return
+            for door in {self._arm, self._hand} & set(ready):
+                guest, _ = door.accept()
+                guest.settimeout(0.5)
+                guest.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._guests[guest] = door is self._arm
+            for guest in set(self._guests) & set(ready):
+                self._serve(guest)
+
+    def _serve(self, guest: socket.socket) -> None:
+        faults, arm = self.controller.faults, self._guests[guest]
+        with contextlib.suppress(OSError, bcap.Damaged, struct.error):
+            if request := (bcap.receive(guest) if arm else guest.recv(256)):
+                if not faults.closed:
+                    answer = b"" if faults.cut else self.controller.answer(request) if arm else self.controller.grip(request)
+                    guest.sendall(answer[:-1] + b"\0" if faults.corrupt and answer else answer)
+                    return
+        del self._guests[guest]
+        guest.close()
+
+    def close(self) -> None:
+        """Closes all."""
+        for each in (self._arm, self._hand, *self._guests):
+            each.close()
+
+
+def main() -> None:
+    """The process."""
+    from mjx_nero.deploy.emulators import process
+
+    process(lambda plant, told: Port(Controller(plant, np.array(told["metadata"]["joints"]["speed"])[:_ARM])))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""What is known of an arm's drives, from a file of ``identify`` or ``deploy --check``: its delay and its encoders' offsets."""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero import files
+from mjx_nero.deploy.arm import Arm, Feedback
+from mjx_nero.errors import UserError
+
+
+def read(path: pathlib.Path, metadata: Mapping[str, Any]) -> tuple[float, list[float]]:
+    """The delay [s], and the offset of each joint [rad or m]; 0 for those that the file does not name.
+
+    Raises:
+        UserError: there is no such file, or it is of another robot, or no such file.
+    """
+    found = files.read_yaml(path)
+    try:
+        robot, joints = str(found["robot"]), found["joints"]
+        delay = _number(found["delay"])
+        offsets = {str(name): _number(joint["offset"]) for name, joint in joints.items()}
+    except (TypeError, KeyError, ValueError, AttributeError):
+        raise UserError(f"{path} is no file of identify or deploy --check: robot, delay, and joints with an offset") from None
+    names = metadata["joints"]["names"]
+    if robot != metadata["robot"] or not set(offsets) <= set(names):
+        raise UserError(f"{path} is of {robot} with joints {', '.join(offsets)}: the policy's robot is {metadata['robot']}")
+    if not 0 <= delay <= 1 or any(abs(x) > 0.5 for x in offsets.values()):
+        raise UserError(f"{path}: a delay is 0 to 1 s, and offsets beyond 0.5 are for the arm's own calibration")
+    return delay, [offsets.get(name, 0.0) for name in names]
+
+
+def _number(part: Any) -> float:
+    value = float(part["value"])
+    if not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+class Offset:
+    """An arm whose encoders read ``offset`` beside where its joints are [rad or m]; see ``Arm``."""
+
+    def __init__(self, arm: Arm, offset: np.ndarray):
+        self._arm, self._offset, self.joints = arm, offset, arm.joints
+        self.connect, self.engage, self.close = arm.connect, arm.engage, arm.close
+
+    def ranges(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """See ``Arm``."""
+        ranges = self._arm.ranges()
+        return ranges and (ranges[0] - self._offset, ranges[1] - self._offset)
+
+    def read(self) -> Feedback:
+        """See ``Arm``."""
+        seen = self._arm.read()
+        return dataclasses.replace(seen, position=seen.position - self._offset)
+
+    def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """See ``Arm``."""
+        return self._arm.command(position + self._offset, velocity) - self._offset

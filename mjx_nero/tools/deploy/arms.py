@@ -1,0 +1,167 @@
+"""From flags to an arm: which one, where it is, its limits, and, where it is emulated or simulated, its scene."""
+
+import argparse
+import contextlib
+import dataclasses
+import pathlib
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from mjx_nero.deploy import drivers
+from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
+
+WARNING = (
+    "nobody has tried this on hardware: all that is known comes from the makers' and LeRobot's sources and from emulators. "
+    "Keep a hand on the power switch and people out of reach."
+)
+EXTRAS = {
+    "onnxruntime": "deploy",
+    "serial": "deploy",
+    "can": "deploy",
+    "pymodbus": "deploy",
+    "lerobot": "lerobot",
+    "cv2": "camera",
+    "pupil_apriltags": "camera",
+    "viser": "view",
+}
+KEPT = ("joints", "gripper", "body", "base", "regions", "command", "control_dt", "robot")
+
+
+def add_arm(parser: cli.Parser) -> None:
+    """Flags of the arm and its bus."""
+    add = parser.add_argument
+    add("--port", help="serial port, INTERFACE:CHANNEL, HOST, or TYPE:field=value,...: see docs/guides/deploy.md")
+    add("--gripper", metavar="HOST", help="compute box of the Cobotta's RG6 (default: its gripper is told nothing)")
+    add("--calibration", type=cli.path(".json"), help="SO-ARM: LeRobot's file; lerobot: which joint is which motor")
+    add("--emulate", action="store_true", help="in place of the arm, a program that speaks its protocol, with MuJoCo behind it")
+    text = "file of identify or deploy --check: its offsets are subtracted, and its delay is that of --delay"
+    add("--identified", type=cli.path(".yaml", ".yml"), help=text)
+
+
+def add_limits(parser: cli.Parser) -> None:
+    """Flags of the safety layer: they move limits, and switch nothing off."""
+    add = parser.add_argument
+    add("--speed", type=cli.share, default=1.0, metavar="SHARE", help="of the joints' speeds, at most (default: %(default)s)")
+    add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table's top, m (default: %(default)s)")
+    text = "box that no link may leave, m (default: about home and the task's regions, and 0.3 m on all sides)"
+    add("--workspace", metavar="X0,X1,Y0,Y1,Z0,Z1", help=text)
+    add("--apart", type=cli.non_negative, default=0.0, help="least distance between links, m (default: %(default)s)")
+    add("--hottest", type=cli.positive_float, default=60.0, metavar="CELSIUS", help="of a drive (default: %(default)s)")
+
+
+def check(parser: cli.Parser, args: argparse.Namespace) -> None:
+    """Whether the flags of an arm go together."""
+    if args.arm == "sim" and args.emulate:
+        parser.error("--emulate is for real arms' protocols: --arm sim is simulated already")
+    if args.arm == "lerobot" and args.emulate:
+        parser.error("--emulate is for the protocols that are spoken here: --arm lerobot is LeRobot's")
+    if args.arm != "sim" and not (args.port or args.emulate):
+        parser.error(f"--arm {args.arm} needs --port, or --emulate")
+
+
+@contextlib.contextmanager
+def missing() -> Iterator[None]:
+    """A package that is not there is one line, with its extra.
+
+    Raises:
+        UserError: one is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        raise UserError(f"the package {error.name} is missing: pip install 'mjx-nero[{extra}]'") from None
+
+
+def numbers(text: str | None, counts: Sequence[int], flag: str) -> list[float] | None:
+    """Numbers with commas between them.
+
+    Raises:
+        UserError: it is something else.
+    """
+    if text is None:
+        return None
+    try:
+        found = [cli.number(float)(part) for part in text.split(",")]
+    except argparse.ArgumentTypeError:
+        found = []
+    if len(found) not in counts:
+        raise UserError(f"{flag} takes {' or '.join(map(str, counts))} numbers with commas between them, got {text[:60]!r}")
+    return found
+
+
+def safety_of(args: argparse.Namespace) -> Any:
+    """``SafetyCfg`` of the flags."""
+    from mjx_nero.deploy.safety import SafetyCfg
+
+    return SafetyCfg(share=args.speed, temperature=args.hottest)
+
+
+def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping[str, Any], log: pathlib.Path | None, note: str):
+    """What the arm's process has to know, and the delay of its targets [s].
+
+    Raises:
+        UserError: a flag says something impossible.
+    """
+    from mjx_nero.deploy import identified
+    from mjx_nero.deploy.server import Spec
+
+    box = numbers(args.workspace, (6,), "--workspace")
+    pairs = [(box[k], box[k + 1]) for k in (0, 2, 4)] if box else None
+    for low, high in pairs or ():
+        if not low < high:
+            raise UserError(f"--workspace takes ranges from low to high, got {low:g} to {high:g}")
+    delay, offsets = identified.read(args.identified, metadata) if args.identified else (0.0, [])
+    fence = {"table": args.table, "box": pairs, "apart": args.apart}
+    kept = {name: metadata[name] for name in KEPT}
+    dry, out = getattr(args, "dry_run", False), str(log.absolute()) if log else ""
+    safety = dataclasses.asdict(safety_of(args))
+    return Spec(args.arm, options, kept, safety, fence, out, dry, (note,), tuple(offsets)), delay
+
+
+@contextlib.contextmanager
+def options_of(args: argparse.Namespace, metadata: Mapping[str, Any], cfg: Any, tracker: int | None = None) -> Iterator[Any]:
+    """The driver's options; an emulated arm runs meanwhile.
+
+    Args:
+        cfg: makes the config of the scene where the arm is simulated or emulated: robot, scene, sim, and where its objects start.
+        tracker: port that is told where objects are.
+    """
+    if args.arm != "sim" and not args.emulate:
+        calibration = args.calibration and str(args.calibration)
+        yield {"port": args.port, "calibration": calibration, "gripper": args.gripper}
+        return
+    with tempfile.TemporaryDirectory() as name:
+        options = {"model": _saved(cfg(), pathlib.Path(name)), "tracker": tracker, "objects": cfg().objects}
+        if not args.emulate:
+            yield options
+            return
+        from mjx_nero.deploy.emulators import started
+
+        with started(args.arm, options, metadata) as found:
+            yield found
+
+
+def _saved(cfg: Any, folder: pathlib.Path) -> str:
+    import mujoco
+
+    from mjx_nero.sim import scene
+
+    path = str(folder / "scene.mjb")
+    mujoco.mj_saveModel(scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False), path, None)
+    return path
+
+
+def warn(args: argparse.Namespace) -> None:
+    """Says what nobody has tried."""
+    if args.arm != "sim" and not args.emulate:
+        print(f"warning: {WARNING}", flush=True)
+
+
+def known(kind: str, metadata: Mapping[str, Any]) -> None:
+    """See ``drivers.check``."""
+    drivers.check(kind, metadata)

@@ -1,0 +1,147 @@
+"""The command line of ``deploy``."""
+
+import argparse
+import contextlib
+import json
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from mjx_nero import files
+from mjx_nero.config.bounds import Bounds
+from mjx_nero.deploy import drivers
+from mjx_nero.deploy.arm import ArmError
+from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
+from mjx_nero.tools.deploy import arms
+
+FAULT = 3  # exit status of a run that ended in one
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line.
+
+    Raises:
+        UserError: a wrong argument, file or port; the arm cannot start.
+        SystemExit: with ``FAULT``, where the arm holds because something failed.
+    """
+    parser = _parser()
+    args, _ = parser.parse(argv)
+    arms.check(parser, args)
+    if args.check and args.dry_run:
+        parser.error("--check moves the arm, and --dry-run does not")
+    for path in filter(None, (args.log, args.check)):
+        files.check_writable(path)
+    try:
+        with arms.missing():
+            ended = _run(args)
+    except ArmError as error:
+        raise UserError(f"the arm is lost: {error}") from None
+    if ended:
+        raise SystemExit(FAULT)
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(
+        prog=cli.called_as("deploy"),
+        description="Runs an exported policy on an arm, behind a safety layer. Every fault ends in holding, never in cutting "
+        "torque. Stop it with Ctrl-C, or with space, q or escape.",
+    )
+    add = parser.add_argument
+    add("policy", type=cli.path(".onnx"), help="file that export wrote")
+    add("--arm", choices=drivers.KINDS, required=True, help="which arm")
+    arms.add_arm(parser)
+    add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")
+    text = "where the object is: X,Y,Z, a JSON file, udp://HOST:PORT to listen at, tcp://HOST:PORT to listen to, or a camera"
+    add("--object", metavar="PLACE", help=f"{text} (default: where the simulator has it)")
+    add(
+        "--goal",
+        metavar="X,Y,Z",
+        help="commanded point, and perhaps orientation W,X,Y,Z (default: the middle of the task's region)",
+    )
+    add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts (default: %(default)s)")
+    text = "until a target is in force, s, as identify finds it: what the policy sees of its targets is then as late"
+    add("--delay", type=cli.number(Annotated[float, Bounds(0.0, 1.0)]), help=f"{text} (default: that of --identified, or 0)")
+    add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line of its joints")
+    add("--dry-run", action="store_true", help="read the arm, and show what would be sent; nothing is")
+    text = "in place of the policy, move one joint after another a little, ask what you saw, and write offsets and delay"
+    add("--check", type=cli.path(".yaml", ".yml"), metavar="FILE", help=text)
+    add("--log", type=cli.path(".csv"), help="table of what was read and sent, as identify reads it")
+    add("--alive", type=cli.path(), metavar="FILE", help="hold unless somebody touches this file every half second")
+    arms.add_limits(parser)
+    return parser
+
+
+def _brain(args: argparse.Namespace) -> Any:
+    """The policy.
+
+    Raises:
+        UserError: the file is none, or is for another arm.
+    """
+    from mjx_nero.deploy import setup
+    from mjx_nero.deploy.loop import Brain
+
+    files.read_bytes(args.policy, 100_000_000)
+    try:
+        brain = Brain(args.policy)
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # ONNX Runtime has kinds of its own
+        raise UserError(f"{args.policy} is no policy that export wrote: {error}") from None
+    setup.check(brain.metadata)
+    drivers.check(args.arm, brain.metadata)
+    return brain
+
+
+def _run(args: argparse.Namespace) -> bool:
+    """Returns whether it ended in a fault."""
+    from mjx_nero.deploy import setup
+    from mjx_nero.deploy.guard import WallClock, urgent
+    from mjx_nero.deploy.loop import go_home, run
+    from mjx_nero.deploy.observe import Observer
+    from mjx_nero.deploy.remote import Remote
+    from mjx_nero.deploy.safety import Limits
+    from mjx_nero.deploy.stop import operator
+    from mjx_nero.tools.deploy.world import places_and_options
+
+    brain = _brain(args)
+    metadata = brain.metadata
+    goal, clock, safety = arms.numbers(args.goal, (3, 7), "--goal"), WallClock(), arms.safety_of(args)
+    limits = Limits.of(metadata, safety)
+    with contextlib.ExitStack() as stack:
+        places, options = stack.enter_context(places_and_options(args, metadata))
+        observer = Observer(metadata, setup.body_of(metadata), goal, places)
+        arms.warn(args)
+        note = f"{metadata['env']} on {args.arm}{' (emulated)' if args.emulate else ''}, policy {args.policy.name}"
+        spec, delay = arms.spec(args, metadata, options, args.log, note)
+        remote = Remote(spec)
+        stack.callback(remote.close)
+        brain.warm()
+        remote.ready()
+        stop = stack.enter_context(operator(args.alive))
+        remote.start(anywhere=args.go_home, actions=brain.actions)
+        if args.go_home:
+            if fault := go_home(remote, limits, clock, stop):
+                print(f"the arm holds: {fault.text}")
+                return fault.kind != "stop"
+            print("the arm is at home")
+        urgent()
+        if args.check:
+            from mjx_nero.tools.deploy.checking import checked
+
+            return checked(remote, limits, metadata, clock, stop, args.check)
+        report = run(
+            remote, brain, observer, clock, args.seconds, stop, safety.misses, delay if args.delay is None else args.delay
+        )
+    _tell(args, report)
+    return report.fault.kind != "stop"
+
+
+def _tell(args: argparse.Namespace, report: Any) -> None:
+    """Prints how a run ended."""
+    print(f"the arm holds: {report.fault.text}")
+    print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
+    print("timing: " + json.dumps(report.timing.summary()))
+    for cycle, late in report.timing.missed[:20]:
+        print(f"  cycle {cycle} was {1e3 * late:.1f} ms late")
+    if args.log:
+        print(f"log: {args.log}")

@@ -1,0 +1,70 @@
+"""Where a policy's objects are, and the scene of a simulated or emulated arm."""
+
+import argparse
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mjx_nero.tools.deploy import arms
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What a simulated arm stands in.
+
+    Attributes:
+        robot, scene, sim: configs.
+        objects: where objects are at first, in the root frame [m].
+    """
+
+    robot: Any
+    scene: Any
+    sim: Any
+    objects: Mapping[str, Any]
+
+
+@contextlib.contextmanager
+def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Returns where objects are, and the driver's options."""
+    from mjx_nero.deploy import places
+
+    simulated = args.arm == "sim" or args.emulate
+    constant, told = args.object is not None and _is_point(args.object), None
+    if args.object is None and not simulated:
+        source: Any = places.Known()
+    elif simulated and (args.object is None or constant):  # the simulated object starts there, and is seen
+        source = places.FromSocket("udp", "127.0.0.1", 0)
+        told = source.port
+    else:
+        source = places.of(args.object)
+    with contextlib.closing(source):
+        point = args.object if constant else None
+        with arms.options_of(args, metadata, functools.partial(_world, args, metadata, point), told) as options:
+            yield source, options
+
+
+def _is_point(text: str) -> bool:
+    return "://" not in text and text[:1] in "+-.0123456789" and "," in text
+
+
+@functools.cache
+def _cfg(name: str, preset: str, robot: str | None) -> Any:
+    from mjx_nero.envs import registry
+
+    return registry.env_cfg(name, preset, robot)
+
+
+def _world(args: argparse.Namespace, metadata: dict[str, Any], point: str | None) -> World:
+    cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
+    objects: dict[str, Any] = {}
+    for name, item in cfg.scene.objects.items():
+        x, y, above = item.pos
+        event = next((t for t in cfg.events.values() if t.params.get("object", "cube") == name and "x" in t.params), None)
+        if event is not None:
+            x, y = (sum(event.params[axis]) / 2 for axis in "xy")
+        objects[name] = [x, y, item.rest_height + above]
+    if point and objects:
+        objects[next(iter(objects))] = arms.numbers(point, (3,), "--object")
+    return World(cfg.robot, cfg.scene, cfg.sim, objects)
