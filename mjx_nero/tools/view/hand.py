@@ -1,0 +1,198 @@
+"""A hand on the arm: the user drags or steers the hand, and what comes of it becomes demonstrations."""
+
+import pathlib
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero import math
+from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.data import Episode, Schema, writer
+from mjx_nero.data import episode as names
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.learn.play import rollout
+from mjx_nero.learn.play.recorder import Record
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim import kinematics
+from mjx_nero.tools.demos import making
+from mjx_nero.tools.view.session import Session
+
+NAME = "your hand"
+STEP = 0.01  # [m] of a key
+TURN = 10.0  # [degrees] of a key
+# Of an arm with few joints the place of the hand counts, and its turn as far as it can.
+_IK = IkCfg(orientation_weight=0.03, restarts=0)
+
+
+def agent(env: ManipulationEnv) -> rollout.Agent:
+    """Moves the hand to its parameters: ``pos`` [m], ``quat`` (wxyz), and ``open``, from 0 to 1, at the drives' speed."""
+    robot, ik = env.cfg.robot, InverseKinematics(env.cfg.robot, cfg=_IK)
+    n, step = len(robot.arm.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
+    opened, closed = (np.array(x, np.float32) for x in (robot.gripper.open, robot.gripper.close))
+
+    def one(asked, state):
+        view = env.view(state)
+        arm = ik.local(asked["pos"], asked["quat"], view.ctrl[:n]).q
+        fingers = closed + asked["open"] * (opened - closed)
+        targets = rate_limit(jnp.concatenate([arm, fingers]), view.ctrl, step=jnp.asarray(step))
+        return env.actions.invert(targets, view.joint_pos)
+
+    def act(asked, memory, state, key):
+        return jax.vmap(one, (None, 0))(asked, state), memory
+
+    return rollout.Agent(act, init=lambda state: ())
+
+
+class Hand:
+    """Where the user wants the hand of a session's robots.
+
+    Args:
+        take_over: called when the user steers while somebody else acts.
+    """
+
+    def __init__(self, session: Session, take_over: Callable[[], None]):
+        env = session.env
+        self._session, self._take_over = session, take_over
+        self._pose = jax.jit(kinematics.site_pose_fn(env.physics_model, env.cfg.robot.ee_site))
+        self._lock, self.held = threading.Lock(), False
+        self.pos, self.quat, self.open = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 1.0
+        self.here()
+
+    def here(self) -> None:
+        """Wants it where it is."""
+        pos, quat = self._pose(jnp.asarray(self._session.frame.qpos[0], jnp.float32))
+        with self._lock:
+            self.pos, self.quat = np.array(pos, float), np.array(quat, float)
+
+    @property
+    def asked(self) -> dict[str, jax.Array]:
+        """Parameters of the agent."""
+        with self._lock:
+            return {
+                "pos": jnp.asarray(self.pos, jnp.float32),
+                "quat": jnp.asarray(self.quat, jnp.float32),
+                "open": jnp.float32(self.open),
+            }
+
+    def move(self, to: np.ndarray) -> None:
+        """Wants it at a point of the world [m]."""
+        self._steer(lambda: setattr(self, "pos", np.asarray(to, float)))
+
+    def shift(self, by: tuple[float, float, float]) -> None:
+        """Wants it so much farther in the world [m]."""
+        self._steer(lambda: setattr(self, "pos", self.pos + by))
+
+    def turn(self, degrees: float) -> None:
+        """Wants it turned about the vertical."""
+        by = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.radians(degrees))
+        self._steer(lambda: setattr(self, "quat", np.array(math.quat_mul(by, jnp.asarray(self.quat, jnp.float32)), float)))
+
+    def grip(self, share: float) -> None:
+        """Wants the gripper so far open, from 0 to 1."""
+        self._steer(lambda: setattr(self, "open", float(np.clip(share, 0.0, 1.0))))
+
+    def _steer(self, change: Callable[[], None]) -> None:
+        if not self.held:
+            self.here()
+            self.held = True
+            self._take_over()
+        with self._lock:
+            change()
+        self._session.params = self.asked
+
+
+class Recording:
+    """Keeps what the first environment of a session does, and writes it as an episode of a data set.
+
+    Args:
+        out: folder of the data set.
+        env_name, preset: what the session plays.
+    """
+
+    def __init__(self, session: Session, out: pathlib.Path, env_name: str, preset: str, form: str = "lerobot"):
+        self._session, self._out, self._form = session, out, form
+        env = session.env
+        self._units = making.units_of(env, "auto")
+        self._pose = jax.jit(jax.vmap(kinematics.site_pose_fn(env.physics_model, env.cfg.robot.ee_site)))
+        about = {
+            "env": env_name,
+            "preset": preset,
+            "robot": env.cfg.robot.name,
+            "robot_folder": env.cfg.robot.folder,
+            "agent": NAME,
+            "through": "task",
+            "actions": "joints",
+            "holds": "all",
+            "units": self._units.to_json(),
+        }
+        robot = making.robot_type(env.cfg.robot.name, self._units)
+        kept = making.features(env, self._units, "joints")
+        self.schema = Schema(1 / env.dt, robot, making.sentence(env_name), kept, about)
+        self._steps: list[tuple[np.ndarray, Record]] = []
+        self.on = False
+        session.recorders.append(self)
+
+    def __call__(self, record: Record) -> None:
+        """Takes a step; the end of the task's episode ends the recording, too."""
+        if self.on:
+            one = jax.tree.map(lambda x: np.array(x[0]), record)
+            self._steps.append((self._session.frame.qpos[0].astype(np.float32), one))  # the frame is still that before the step
+            self.on = not one.done
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def begin(self) -> None:
+        """Records from now on."""
+        self._steps, self.on = [], True
+
+    def discard(self) -> None:
+        """Forgets what was recorded."""
+        self._steps, self.on = [], False
+
+    def save(self) -> str:
+        """Adds what was recorded to the data set; a line says so. The user's word is that it succeeded.
+
+        Raises:
+            UserError: nothing was recorded, or it cannot be written.
+        """
+        self.on = False
+        if not self._steps:
+            raise UserError("nothing was recorded: press Record first")
+        with writer(self._out, self.schema, self._form) as form:
+            number = int(form.numbers[-1]) + 1 if len(form.numbers) else 0
+            form.put([Episode(self._arrays(), True, number)])
+            count = len(form.lengths)
+        steps, self._steps = len(self._steps), []
+        return f"{steps} steps saved; {self._out} has {count} episodes"
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """As ``demonstrations.Player`` has them."""
+        env = self._session.env
+        before = np.stack([qpos for qpos, _ in self._steps])
+        record: Any = jax.tree.map(lambda *x: np.stack(x), *(one for _, one in self._steps))
+        at = [int(env.physics_model.joint(joint).qposadr[0]) for joint in env.cfg.robot.joints]
+        things = [int(env.physics_model.joint(name).qposadr[0]) for name in env.cfg.scene.objects]
+        poses = [*self._pose(before), *(before[:, i : i + 7] for i in things)]
+        poses += [record.scenery.goal_pos_w, record.scenery.goal_quat_w]
+        seen = [x.reshape(len(before), -1) for x in jax.tree.leaves(record.obs["state"])]
+        last = np.arange(len(before))[:, None] == len(before) - 1
+        told = self._units.shown(record.targets)
+        arrays = {
+            names.STATE: self._units.shown(before[:, at]),
+            names.ENVIRONMENT: np.concatenate([np.asarray(x) for x in poses], axis=1),
+            names.ACTION: told,
+            names.EXECUTED: told,
+            names.SEEN: np.concatenate(seen, axis=1),
+            names.DONE_BY: record.action,
+            names.QPOS: before,
+            names.REWARD: record.reward[:, None],
+            names.DONE: last,
+            names.SUCCESS: last,
+        }
+        return {name: np.asarray(x, self.schema.features[name].dtype) for name, x in arrays.items()}
