@@ -2,7 +2,7 @@
 
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -109,9 +109,17 @@ class ArraysForm:
             raise UserError(f"{self.path} is damaged: its steps of {name} cannot be read, make it anew") from None
         return found
 
+    def frames(self, name: str) -> Iterator[np.ndarray]:
+        """A camera's frames, one after another."""
+        for i in range(len(self._pieces)):
+            with safe_open(files.inside(self.path, *_name(i).split("/")), framework="numpy") as file:
+                part = file.get_slice(name)
+                for k in range(part.get_shape()[0]):
+                    yield part[k : k + 1][0]
+
     def dataset(self) -> Dataset:
         """What there is now."""
-        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column)
+        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
 
 def _array(episode: Episode, name: str, feature: Feature) -> np.ndarray:

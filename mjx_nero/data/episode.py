@@ -142,6 +142,7 @@ class Dataset:
         success: bool [n].
         numbers: of each episode, int [n] (``Episode.number``).
         read: name of a feature -> all its steps [steps, ...].
+        frames: name of a camera's feature -> its frames, uint8 [height, width, 3], one after another.
     """
 
     schema: Schema
@@ -149,6 +150,7 @@ class Dataset:
     success: np.ndarray
     numbers: np.ndarray
     read: Callable[[str], np.ndarray]
+    frames: Callable[[str], Iterable[np.ndarray]]
 
     def __len__(self) -> int:
         return len(self.lengths)

@@ -119,7 +119,7 @@ class LeRobotForm:
         dtype, size = (feature.dtype, feature.size) if feature else (lf.OWN[name], 1)
         try:
             if name in self._pictures:
-                return np.concatenate([video.read(self._place(lf.film(name), i)) for i in range(self._pieces)])
+                return np.stack(list(self.frames(name)))
             parts = [
                 lf.flat(parquet.read_table(self._place(lf.DATA, i), columns=[name])[name])
                 .astype(dtype, copy=False)
@@ -133,9 +133,14 @@ class LeRobotForm:
             raise UserError(f"{self.path} is damaged: its steps of {name} cannot be read, make it anew") from None
         return out
 
+    def frames(self, name: str) -> Iterator[np.ndarray]:
+        """A camera's frames, one after another."""
+        for piece in range(self._pieces):
+            yield from video.frames(self._place(lf.film(name), piece))
+
     def dataset(self) -> Dataset:
         """What there is now."""
-        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column)
+        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
     def _steps(self, episodes: Sequence[Episode]) -> pa.Table:
         for episode in episodes:

@@ -1,7 +1,7 @@
 """Videos of a data set: H.264 with a whole picture every second frame, so that any frame is near one to begin from."""
 
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ def need() -> None:
         raise UserError("pictures need PyAV, of the extra 'demos': pip install 'mjx-nero[demos]'") from None
 
 
-def write(path: pathlib.Path, frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: float) -> None:
+def write(path: pathlib.Path, pictures: Iterable[np.ndarray], shape: tuple[int, ...], fps: float) -> None:
     """Encodes frames, uint8 [height, width, 3], one after another.
 
     Args:
@@ -35,13 +35,13 @@ def write(path: pathlib.Path, frames: Iterable[np.ndarray], shape: tuple[int, ..
     with av.open(str(path), "w") as file:
         stream: Any = file.add_stream(CODEC, rate=round(fps), options=_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = *shape[:2], PIXELS
-        for frame in frames:
+        for frame in pictures:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
         file.mux(stream.encode())
 
 
-def read(path: pathlib.Path) -> np.ndarray:
-    """All frames of a file, uint8 [frames, height, width, 3].
+def frames(path: pathlib.Path) -> Iterator[np.ndarray]:
+    """The frames of a file, uint8 [height, width, 3], one after another.
 
     Raises:
         OSError, ValueError: it is none.
@@ -50,7 +50,8 @@ def read(path: pathlib.Path) -> np.ndarray:
 
     try:
         with av.open(str(path)) as file:
-            return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
+            for frame in file.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
     except av.FFmpegError as error:
         raise ValueError(str(error)) from None
 

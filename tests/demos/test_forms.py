@@ -15,6 +15,7 @@ from mjx_nero import files
 from mjx_nero.data import Episode, Feature, Schema, open_dataset, writer
 from mjx_nero.data.episode import picture
 from mjx_nero.errors import UserError
+from mjx_nero.tools.demos import inspection
 
 FORMS = ("lerobot", "arrays")
 LEROBOT = os.environ.get("MJX_NERO_LEROBOT_PYTHON", "")  # a Python that has lerobot, where it is not this one
@@ -220,7 +221,12 @@ def test_pictures_come_back(form, tmp_path):
     for part in (made[:2], made[2:]):
         with writer(tmp_path / "d", with_camera(), form) as out:
             out.put(part)
-    back = open_dataset(tmp_path / "d").column("observation.images.front")
+    found = open_dataset(tmp_path / "d")
+    back = found.column("observation.images.front")
+    np.testing.assert_array_equal(back, list(found.frames("observation.images.front")))
+    drawn = inspection.sheet(tmp_path, found)
+    assert drawn.shape == (3 * 32, 3 * 48, 3)  # a row an episode: its beginning, middle and end
+    np.testing.assert_array_equal(drawn[32:64, 48:96], back[9])
     wanted = np.concatenate([list(each.pictures["observation.images.front"]()) for each in made])
     assert back.shape == (18, 32, 48, 3) and back.dtype == np.uint8
     off = np.abs(back.astype(int) - wanted)

@@ -30,6 +30,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_fields(DemosCfg)
     parser.add_argument("--log", type=cli.path(".csv"), action="append", metavar="FILE", help=_LOG)
     parser.add_argument("--inspect", type=cli.path(), metavar="DIR", help="show what a data set holds")
+    parser.add_argument(
+        "--sheet", type=cli.path(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
+    )
     parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="play an episode of a data set again, in physics")
     parser.add_argument("--episode", type=cli.number(int), default=0, help="which one to replay, from 0 (default: %(default)s)")
     parser.add_argument("--video", type=cli.path(".mp4"), help="also draw the episode that is replayed")
@@ -41,10 +44,12 @@ def main(argv: Sequence[str]) -> None:
         raise UserError("--video is of the episode that is replayed: pass --replay, too")
     if args.log and not args.out:
         raise UserError("--log needs --out DIR, the folder to write to")
+    if args.sheet and not args.inspect:
+        raise UserError("--sheet shows what a data set has: pass --inspect, too")
     if args.inspect:
         from mjx_nero.tools.demos import inspection
 
-        return inspection.show(args.inspect)
+        return inspection.show(args.inspect, args.sheet)
     cli.setup_jax()
     if args.replay:
         from mjx_nero.tools.demos import replay

@@ -1,29 +1,63 @@
 """What a data set holds, for people."""
 
+import itertools
 import pathlib
 
+import imageio.v3 as imageio
 import numpy as np
 
-from mjx_nero import console
+from mjx_nero import console, files
 from mjx_nero.data import Dataset, open_dataset, stats
 from mjx_nero.data import episode as names
+from mjx_nero.errors import UserError
 
-BINS = 16
+BINS, SHEET = 16, 24  # of a histogram; episodes on a sheet
 _BARS = " ▁▂▃▄▅▆▇█"
 _SHOWN = (names.STATE, names.ACTION, names.ENVIRONMENT)
 
 
-def show(path: pathlib.Path) -> None:
-    """Prints counts, lengths and the distribution of states and actions.
+def show(path: pathlib.Path, picture: pathlib.Path | None = None) -> None:
+    """Prints counts, lengths and the distribution of states and actions, and draws a sheet of pictures.
 
     Raises:
-        UserError: there is no data set, or it is damaged.
+        UserError: there is no data set, it is damaged, or it has no pictures.
     """
     found, screen = open_dataset(path), console.screen()
+    if picture:
+        with files.whole(picture) as part:
+            imageio.imwrite(part, sheet(path, found))
     screen.print(overview(path, found))
     for name in _SHOWN:
         if name in found.schema.features:
             screen.print(distribution(found, name))
+    if picture:
+        console.wrote(screen, "pictures", picture)
+
+
+def sheet(path: pathlib.Path, found: Dataset) -> np.ndarray:
+    """The first episodes in rows, at their beginning, middle and end by each camera, uint8 [height, width, 3].
+
+    Raises:
+        UserError: there are no pictures.
+    """
+    cameras = [name for name, feature in found.schema.features.items() if feature.picture]
+    if not cameras:
+        raise UserError(f"{path} has no pictures: make it with --cameras")
+    lengths = found.lengths[:SHEET]
+    ends = np.cumsum(lengths)
+    wanted = {int(at): None for end, n in zip(ends, lengths, strict=True) for at in (end - n, end - n + n // 2, end - 1)}
+    columns = []
+    for name in cameras:
+        frames = enumerate(itertools.islice(found.frames(name), int(ends[-1])))
+        kept = {i: frame for i, frame in frames if i in wanted}
+        columns.append(np.stack([kept[i] for i in wanted]).reshape(len(lengths), 3, *next(iter(kept.values())).shape))
+    rows = np.concatenate(columns, axis=1)  # [episodes, cameras x 3, height, width, 3]
+    n, across, height, width, _ = rows.shape
+    beside = max(1, round((n * height / (across * width)) ** 0.5))  # so many episodes in a row make it about square
+    rows = np.concatenate([rows, np.zeros((-n % beside, *rows.shape[1:]), np.uint8)]).reshape(
+        -1, beside * across, height, width, 3
+    )
+    return rows.swapaxes(1, 2).reshape(-1, beside * across * width, 3)
 
 
 def overview(path: pathlib.Path, found: Dataset) -> console.Table:
