@@ -70,8 +70,8 @@ class ArraysForm:
         """
         for episode in episodes:
             check(episode, self.schema)
-        arrays = {
-            name: np.concatenate([_array(each, name, feature) for each in episodes])
+        arrays = {  # in the order of C: safetensors writes the memory as it lies
+            name: np.ascontiguousarray(np.concatenate([_array(each, name, feature) for each in episodes]))
             for name, feature in self.schema.features.items()
         }
         piece = {

@@ -35,6 +35,7 @@ def episode(number: int, steps: int = 5) -> Episode:
     rng = np.random.default_rng(number)
     arrays = {name: rng.normal(size=(steps, 2)).astype(np.float32) for name in ("observation.state", "action")}
     done = np.arange(steps)[:, None] == steps - 1
+    arrays["action"] = np.asfortranarray(arrays["action"])  # as a slice of something else may lie in the memory
     return Episode({**arrays, "next.reward": rng.random((steps, 1), np.float32), "next.done": done}, number % 3 > 0, number)
 
 

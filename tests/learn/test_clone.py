@@ -33,16 +33,16 @@ def demonstrations(tmp_path, monkeypatch):
 
 
 SIZES = ["--learner", "clone", "--env.episode_length_s", 0.1, "--num-envs", 4, "--eval-every", 10**9, "--no-video"]
-SMALL = ["--clone.minibatch_size", 64, "--clone.updates", 50, "--clone.network.actor", "32"]
+SMALL = ["--clone.minibatch_size", 64, "--clone.updates", 50, "--clone.network.actor", "64,64"]
 
 
 def test_the_action_for_what_was_seen_is_learnt(demonstrations, call, tmp_path):
-    argv = [*SIZES, *SMALL, "--clone.data", "d", "--num-timesteps", 64 * 50 * 40]
+    argv = [*SIZES, *SMALL, "--clone.data", "d", "--num-timesteps", 64 * 50 * 120]
     code, out, err = call("train", *argv, "--out", "run")
     assert code == 0, err
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     losses = [row["clone/loss"] for row in rows if "clone/loss" in row]
-    assert losses[0] > 0.1 and losses[-1] < 0.01
+    assert losses[0] > 0.1 and losses[-1] < 0.02
     trained = policy.checkpoint_policy(tmp_path / "run" / "policy.safetensors")
     seen = np.random.default_rng(1).normal(size=(200, len(demonstrations))).astype(np.float32) + 3
     wanted = np.clip((seen - 3) @ demonstrations, -1, 1)  # an arm cannot do more

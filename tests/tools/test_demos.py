@@ -51,7 +51,7 @@ def test_labels_stand_beside_what_noise_made_of_them(made):
     off = found.column(names.EXECUTED) - found.column(names.ACTION)
     assert np.abs(off[:, :7]).max() > 1e-3 and np.abs(off[:, 7:]).max() == 0
     draws = off.reshape(6, 10, 9)[:, 0]
-    assert len(np.unique(draws[:, 0])) == 6  # each episode has its own
+    assert len(np.unique(draws, axis=0)) == 6  # each episode has its own
 
 
 def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):

@@ -15,7 +15,7 @@ def table(rows: list[tuple]) -> str:
     """Rows of (time, targets or None, positions or None, whether the policy acted, fault)."""
     head = ["time", *(f"{what}.{j}" for what in ("target", "position", "velocity") for j in JOINTS)]
     head += ["inferring", "inferred", "limited", "held", "action.0"]
-    lines = ["# so_arm101_reach on so101", ",".join(head)]
+    lines = ["# so101_reach on so101", ",".join(head)]
     for time, told, at, acted, held in rows:
         cells = [str(time)]
         for values in (told, at, None):
@@ -54,7 +54,7 @@ def test_logs_become_a_data_set_once(call, tmp_path):
     for i, shift in enumerate((0.0, 0.001)):
         rows = [(t, a and a + shift, b and b + shift, c, d) for t, a, b, c, d in ROWS]
         (tmp_path / f"log{i}.csv").write_text(table(rows))
-    argv = ["demos", "--env", "so_arm101_reach", "--form", "arrays", "--out", "real"]
+    argv = ["demos", "--env", "so101_reach", "--form", "arrays", "--out", "real"]
     code, out, err = call("mjx_nero", *argv, "--log", "log0.csv")
     assert code == 0 and "real: 1 episodes, 3 steps; 1 new ones of 1 logs" in out, err
     code, out, err = call("mjx_nero", *argv, "--log", "log0.csv", "--log", "log1.csv")
@@ -79,6 +79,6 @@ def test_logs_become_a_data_set_once(call, tmp_path):
 )
 def test_what_is_wrong_with_a_log(text, message, call, tmp_path):
     (tmp_path / "log.csv").write_text(text)
-    code, _, err = call("mjx_nero", "demos", "--env", "so_arm101_reach", "--out", "real", "--log", "log.csv")
+    code, _, err = call("mjx_nero", "demos", "--env", "so101_reach", "--out", "real", "--log", "log.csv")
     assert code == 2 and message in err and err.count("\n") == 1
     assert not (tmp_path / "real").exists()

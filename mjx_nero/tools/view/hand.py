@@ -35,17 +35,16 @@ def agent(env: ManipulationEnv) -> rollout.Agent:
     n, step = len(robot.arm.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
     opened, closed = (np.array(x, np.float32) for x in (robot.gripper.open, robot.gripper.close))
 
-    def one(asked, state):
-        view = env.view(state)
-        arm = ik.local(asked["pos"], asked["quat"], view.ctrl[:n]).q
+    def one(asked, point):
+        arm = ik.local(asked["pos"], asked["quat"], point[:n]).q
         fingers = closed + asked["open"] * (opened - closed)
-        targets = rate_limit(jnp.concatenate([arm, fingers]), view.ctrl, step=jnp.asarray(step))
-        return env.actions.invert(targets, view.joint_pos)
+        return rate_limit(jnp.concatenate([arm, fingers]), point, step=jnp.asarray(step))
 
-    def act(asked, memory, state, key):
-        return jax.vmap(one, (None, 0))(asked, state), memory
+    def act(asked, points, state, key):  # of their own, as targets may lead joints by much
+        points = jax.vmap(one, (None, 0))(asked, points)
+        return points, points
 
-    return rollout.Agent(act, init=lambda state: ())
+    return rollout.through_actions(env, rollout.Agent(act, init=jax.vmap(lambda state: env.view(state).joint_pos)))
 
 
 class Hand:
