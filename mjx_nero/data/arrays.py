@@ -50,12 +50,12 @@ class ArraysForm:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Of each episode."""
+        """Number of each episode."""
         return self._column("numbers")
 
     @property
     def success(self) -> np.ndarray:
-        """Of each episode, bool."""
+        """Success of each episode, bool."""
         return self._column("success").astype(bool)
 
     def tidy(self) -> None:
@@ -91,7 +91,7 @@ class ArraysForm:
         self._pieces = pieces
 
     def finish(self) -> None:
-        """Nothing is left to write."""
+        """Does nothing: all is written."""
 
     def column(self, name: str) -> np.ndarray:
         """All steps of a feature, one episode after another [steps, numbers], or [steps, height, width, 3]."""
@@ -118,7 +118,7 @@ class ArraysForm:
                     yield part[k : k + 1][0]
 
     def dataset(self) -> Dataset:
-        """What there is now."""
+        """The data set as it is."""
         return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
 

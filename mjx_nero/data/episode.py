@@ -38,18 +38,18 @@ class Feature:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of its array in a step."""
+        """Shape of its array in a step."""
         return (*self.picture, 3) if self.picture else (len(self.names),)
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Count of its numbers."""
         return math.prod(self.shape)
 
 
 @dataclasses.dataclass(frozen=True)
 class Schema:
-    """What the steps of a data set hold.
+    """The contents of a data set's steps.
 
     Attributes:
         fps: control steps a second.

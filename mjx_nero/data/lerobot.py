@@ -139,7 +139,7 @@ class LeRobotForm:
             yield from video.frames(self._place(lf.film(name), piece))
 
     def dataset(self) -> Dataset:
-        """What there is now."""
+        """The data set as it is."""
         return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
     def _steps(self, episodes: Sequence[Episode]) -> pa.Table:

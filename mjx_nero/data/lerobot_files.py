@@ -1,4 +1,4 @@
-"""What the files of a LeRobotDataset v3.0 are called, and what stands in them."""
+"""Names and contents of the files of a LeRobotDataset v3.0."""
 
 import json
 from collections.abc import Mapping
@@ -83,7 +83,7 @@ def tasks(sentence: str) -> pa.Table:
 
 
 def per_channel(found: stats.Stats) -> dict[str, Any]:
-    """As LeRobot has them of pictures: [3, 1, 1]."""
+    """Statistics of pictures in LeRobot's shape, [3, 1, 1]."""
     return {what: x.tolist() if what == "count" else [[[float(c)]] for c in x] for what, x in found.items()}
 
 

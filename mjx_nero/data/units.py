@@ -12,7 +12,7 @@ LEROBOT = {"so_arm100": "so100_follower", "so_arm101": "so101_follower"}  # robo
 
 @dataclasses.dataclass(frozen=True)
 class Units:
-    """What joints' positions are shown as: ``factor * position + offset``.
+    """Units of joints' positions: a data set has ``factor * position + offset``.
 
     Attributes:
         kind: one of ``KINDS``.

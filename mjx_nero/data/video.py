@@ -57,7 +57,7 @@ def frames(path: pathlib.Path) -> Iterator[np.ndarray]:
 
 
 def describe(shape: tuple[int, ...], fps: float) -> dict[str, object]:
-    """What the index says of a video."""
+    """Describes a video for the index."""
     return {
         "video.height": shape[0],
         "video.width": shape[1],

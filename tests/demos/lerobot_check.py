@@ -33,7 +33,7 @@ def step_picture(frame):
 
 def main(folder: pathlib.Path) -> None:
     """Prints what was compared, as JSON; fails where something differs."""
-    found = LeRobotDataset("mjx_nero/demos", root=folder)
+    found = LeRobotDataset("mjx_nero/demos", root=folder, video_backend="pyav")
     info = found.meta.info
     names = [name for name, feature in found.features.items() if feature["dtype"] in ("float32", "bool")]
     together = {name: [] for name in names}

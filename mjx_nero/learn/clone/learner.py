@@ -145,7 +145,7 @@ class Learner:
 
 
 def _read(path: pathlib.Path, env: Env) -> tuple[np.ndarray, np.ndarray]:
-    """What was seen and done [steps, numbers], compared with what a policy here sees and does.
+    """Reads observations and actions [steps, numbers], and checks that they are those of a policy here.
 
     Raises:
         UserError: it is of something else.

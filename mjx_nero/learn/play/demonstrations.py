@@ -110,7 +110,7 @@ class Player:
         return jnp.where(at > 0, stays, 0.0) * off + self.noise * jnp.where(at > 0, np.sqrt(1 - stays**2), 1.0) * drawn
 
     def _record(self, state: State, clean: Float[Array, " na"], after: State) -> dict[str, Float[Array, " n"]]:
-        """What a step of one environment is: what was there before, what was to be done, what was done, what came of it."""
+        """Features of a step of one environment: its state before, label, what was done, and its outcome."""
         env = self.env
         view = env.view(state)
         label, told = env.targets(state, clean), after.pipeline_state.ctrl
@@ -133,7 +133,7 @@ class Player:
         return {name: found[name] for name in self.kept if name in found}
 
     def _deltas(self, view: View, targets: Float[Array, " nu"]) -> Float[Array, " n"]:
-        """From where the hand is to where the targets have it: metres, a rotation vector, both in the world; and the gripper's
+        """Way of the hand from where it is to where the targets put it (metres, rotation vector, world), and the gripper's
         targets."""
         assert self._hand
         (pos,), (quat,) = self._hand.poses(targets)

@@ -1,4 +1,4 @@
-"""What demonstrations are asked for."""
+"""The config of ``demos``."""
 
 import dataclasses
 import pathlib

@@ -1,4 +1,4 @@
-"""What a data set holds, for people."""
+"""Tables and pictures of a data set, for people."""
 
 import itertools
 import pathlib
@@ -61,7 +61,7 @@ def sheet(path: pathlib.Path, found: Dataset) -> np.ndarray:
 
 
 def overview(path: pathlib.Path, found: Dataset) -> console.Table:
-    """What it is and how much of it there is."""
+    """Lists its maker, its size and its lengths."""
     schema, lengths = found.schema, found.lengths
     about = schema.about
     table = console.Table(str(path), ("", ""), left=("",))

@@ -1,4 +1,4 @@
-"""From logs of real runs (``deploy --log``) to a data set: an episode a log, which holds what ``demos --holds arm`` does."""
+"""Episodes from logs of real runs (``deploy --log``), one a log, with the features of ``demos --holds arm``."""
 
 import csv
 import hashlib
@@ -75,7 +75,7 @@ def _episode(path: pathlib.Path, shown: making.units.Units, at: np.ndarray, told
 
 
 def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where the joints were before each step of the policy, and what the drives were told in it, up to the first fault.
+    """Reads the joints before each step of the policy, and the drives' targets in it, up to the first fault.
 
     Returns:
         positions and targets [steps, joints] [rad or m], and the length of a step [s].

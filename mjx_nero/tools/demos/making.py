@@ -1,4 +1,4 @@
-"""From what is asked for to who plays where, and the schema of what comes of it."""
+"""Makes the player of a data set and its schema."""
 
 import argparse
 import hashlib
@@ -111,7 +111,7 @@ def robot_type(robot: str, shown: units.Units) -> str:
 
 
 def sentence(env_name: str) -> str:
-    """What the robot does in an environment."""
+    """Says what the robot does in an environment."""
     return next((text for end, text in SENTENCES.items() if env_name.endswith(end)), f"Do {env_name.replace('_', ' ')}.")
 
 
@@ -129,7 +129,7 @@ def units_of(env: ManipulationEnv, kind: str) -> units.Units:
 
 
 def features(env: ManipulationEnv, shown: units.Units, actions: str) -> dict[str, Feature]:
-    """What a step holds."""
+    """Lists the features of a step."""
     joints = env.cfg.robot.joints
     targets = Feature(tuple(f"{joint}.pos" for joint in joints), shown.names)
     arm = len(env.cfg.robot.arm.joints)

@@ -48,7 +48,7 @@ def agent(env: ManipulationEnv) -> rollout.Agent:
 
 
 class Hand:
-    """Where the user wants the hand of a session's robots.
+    """The pose that the user wants the hand of a session's robots to have.
 
     Args:
         take_over: called when the user steers while somebody else acts.
@@ -171,7 +171,7 @@ class Recording:
         return f"{steps} steps saved; {self._out} has {count} episodes"
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        """As ``demonstrations.Player`` has them."""
+        """Features of the steps, as those of ``demonstrations.Player``."""
         env = self._session.env
         before = np.stack([qpos for qpos, _ in self._steps])
         record: Any = jax.tree.map(lambda *x: np.stack(x), *(one for _, one in self._steps))
