@@ -62,6 +62,11 @@ class Player:
         self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
         self._run = jax.jit(self._play)
 
+    def close(self) -> None:
+        """Frees what draws."""
+        if self._cameras:
+            self._cameras.close()
+
     def __call__(self, first: int, seed: int) -> list[Episode]:
         """The episodes of the numbers from ``first`` on."""
         numbers = np.arange(first, first + self.size)

@@ -1,5 +1,6 @@
 """The command line of ``demos``."""
 
+import contextlib
 import pathlib
 import sys
 import time
@@ -74,7 +75,7 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
 
     schema, player = making.prepare(cfg)
     screen, begun = console.screen(stderr=True), time.perf_counter()
-    with writer(out, schema, cfg.form) as form:
+    with contextlib.closing(player), writer(out, schema, cfg.form) as form:
         before, tries, none = len(form.lengths), 0, 0
         first = int(form.numbers[-1]) + 1 if before else 0
         while len(form.lengths) < cfg.episodes:
