@@ -19,7 +19,7 @@ def shown():
     env = mjx_nero.make("nero_lift", impl="native", corruption=False, episode_length_s=3.0)
     makers, taken = agents.known(env, "nero_lift", []), []
     session = Session(env, 1, makers["zero"]())
-    hand = Hand(session, lambda: taken.append(NAME))
+    hand = Hand(session, lambda: not taken and not taken.append(NAME))
     hand.maker = makers[NAME]
     return session, hand, taken
 
@@ -31,7 +31,7 @@ def test_the_hand_goes_where_it_is_wanted(shown):
     hand.turn(20.0)
     hand.grip(0.0)
     assert taken == [NAME]  # the first alone takes over
-    session.play(hand.maker(), hand.asked)
+    session.play(hand.maker(), hand.begin())
     for _ in range(80):
         session.step()
     pos, quat = hand._pose(session.frame.qpos[0].astype(np.float32))

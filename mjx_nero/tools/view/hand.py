@@ -51,14 +51,14 @@ class Hand:
     """The pose that the user wants the hand of a session's robots to have.
 
     Args:
-        take_over: called when the user steers while somebody else acts.
+        take_over: called when the user steers; True: somebody else acted till now.
     """
 
-    def __init__(self, session: Session, take_over: Callable[[], None]):
+    def __init__(self, session: Session, take_over: Callable[[], bool]):
         env = session.env
         self._session, self._take_over = session, take_over
         self._pose = jax.jit(kinematics.site_pose_fn(env.physics_model, env.cfg.robot.ee_site))
-        self._lock, self.held = threading.Lock(), False
+        self._lock, self._steered = threading.Lock(), False
         self.pos, self.quat, self.open = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 1.0
         self.here()
 
@@ -67,6 +67,13 @@ class Hand:
         pos, quat = self._pose(jnp.asarray(self._session.frame.qpos[0], jnp.float32))
         with self._lock:
             self.pos, self.quat = np.array(pos, float), np.array(quat, float)
+
+    def begin(self) -> dict[str, jax.Array]:
+        """Parameters of the agent as it begins: the hand stays where it is, unless the user began by steering it."""
+        if not self._steered:
+            self.here()
+        self._steered = False
+        return self.asked
 
     @property
     def asked(self) -> dict[str, jax.Array]:
@@ -96,13 +103,14 @@ class Hand:
         self._steer(lambda: setattr(self, "open", float(np.clip(share, 0.0, 1.0))))
 
     def _steer(self, change: Callable[[], None]) -> None:
-        if not self.held:
+        begins = self._take_over()
+        if begins:  # whoever acts now is given parameters when it begins
             self.here()
-            self.held = True
-            self._take_over()
+            self._steered = True
         with self._lock:
             change()
-        self._session.params = self.asked
+        if not begins:
+            self._session.params = self.asked
 
 
 class Recording:

@@ -30,7 +30,7 @@ class HandPanel:
     def __init__(self, server, panel: Panel, hand: Hand, recording: Recording | None, orders: Orders):
         self._panel, self._hand, self._recording, self._orders = panel, hand, recording, orders
         self._before, self._gui = panel.agent.value, server.gui
-        panel.parameters[NAME] = self._parameters
+        panel.parameters[NAME] = hand.begin
         gui = server.gui
         with gui.add_folder("Hand", expand_by_default=recording is not None):
             gui.add_markdown("drag the hand; arrows, page up and down move it, Z and X turn it, space grips")
@@ -52,15 +52,15 @@ class HandPanel:
             self._key(f"turn the hand by {degrees:g} degrees", key, lambda degrees=degrees: hand.turn(degrees))  # type: ignore[misc]
         self._key("open or close the gripper", "space", lambda: self._set_open(0.0 if hand.open > 0.5 else 1.0))
 
-    def take_over(self) -> None:
-        """The hand acts from now on."""
-        if self._panel.agent.value != NAME:
-            self._before = self._panel.agent.value
-            self._panel.agent.value = NAME
+    def take_over(self) -> bool:
+        """Lets the hand act; True if somebody else acted till now."""
+        if self._panel.agent.value == NAME:
+            return False
+        self._before, self._panel.agent.value = self._panel.agent.value, NAME
+        return True
 
     def give_back(self) -> None:
         """Whoever acted before does so again, as after a policy's error that the user has mended."""
-        self._hand.held = False
         if self._panel.agent.value == NAME and self._before != NAME:
             self._panel.agent.value = self._before
 
@@ -74,11 +74,6 @@ class HandPanel:
             self._message.content = self._recording.save()
         except UserError as error:
             self._message.content = f"**{error}**"
-
-    def _parameters(self) -> Any:
-        if not self._hand.held:
-            self._hand.here()
-        return self._hand.asked
 
     def _button(self, label: str, work: Callable[[], None]) -> None:
         self._gui.add_button(label).on_click(lambda _: self._orders.give(label, work))
