@@ -13,6 +13,7 @@ COMMANDS = {
     "train": ("mjx_nero.tools.train", "main", "train a policy"),
     "eval": ("mjx_nero.tools.eval", "main", "play and measure a policy or a controller"),
     "view": ("mjx_nero.tools.view", "main", "environments in a browser: watch them and take part"),
+    "demos": ("mjx_nero.tools.demos", "main", "a data set of demonstrations, for LeRobot or as arrays"),
     "export": ("mjx_nero.tools.export", "main", "a policy as ONNX, with all that a runtime has to know"),
     "deploy": ("mjx_nero.tools.deploy", "main", "an exported policy on an arm, real, emulated or simulated"),
     "robustness": ("mjx_nero.tools.robustness", "main", "a policy's success over the range of each parameter of the world"),

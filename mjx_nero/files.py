@@ -1,6 +1,7 @@
 """Files: written whole or not at all, and read with limits, for a stranger may have made them."""
 
 import contextlib
+import fcntl
 import json
 import math
 import os
@@ -281,9 +282,9 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)  # a link there would be written through
         yield part
-        _sync(part)
+        sync(part)
         part.replace(path)
-        _sync(path.parent)
+        sync(path.parent)
     except (OSError, ValueError) as error:  # ValueError: a kind of file that a library does not know
         if isinstance(error, UserError):
             raise
@@ -341,7 +342,36 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _sync(path: pathlib.Path) -> None:
+def lock(path: pathlib.Path) -> int:
+    """Opens a file that the system keeps locked until the handle is closed, or while this process lives.
+
+    Raises:
+        UserError: another process holds it.
+        OSError: it cannot be made.
+    """
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(handle, 100).decode(errors="replace").strip()
+            os.close(handle)
+            raise UserError(
+                f"{path.parent} is in use by {owner or 'another process'}: wait for its end, or pass another --out"
+            ) from None
+        except OSError:
+            return handle  # the file system has no locks
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(handle).st_nlink > 1:  # a hard link to someone else's file
+                path.unlink()
+            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # otherwise its owner removed it just before we locked it
+                os.truncate(handle, 0)
+                os.write(handle, f"process {os.getpid()} on {os.uname().nodename}\n".encode())
+                return handle
+        os.close(handle)
+
+
+def sync(path: pathlib.Path) -> None:
     """Waits until a file, or a folder's list of files, is on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:

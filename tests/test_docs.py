@@ -30,6 +30,7 @@ RUN = {
     "README.md": "tests/test_docs.py",
     "your_own_task.md": "tests/test_guests.py",
     "your_own_learner.md": "tests/test_guests.py",
+    "demonstrations.md": "tests/tools/test_demos.py",
     "gymnasium.md": "tests/interop/test_gymnasium.py",
     "deploy_onnx.md": "tests/interop/test_onnx.py",
     "adding_an_arm.md": "tests/test_docs.py",

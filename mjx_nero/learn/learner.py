@@ -109,7 +109,7 @@ class Kind:
 
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
-KINDS: Registry[Kind | str] = Registry("learner", {"ppo": "mjx_nero.learn.ppo"})
+KINDS: Registry[Kind | str] = Registry("learner", {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.learn.clone"})
 
 
 def names() -> tuple[str, ...]:

@@ -93,7 +93,7 @@ def test_a_disk_that_is_full_at_the_start(train, tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(files, "_sync", full)
+    monkeypatch.setattr(files, "sync", full)
     code, _, err = train("--out", "run")
     assert code == 2 and "error: cannot write run/config.json: No space left on device" in err
     assert not (tmp_path / "run").exists()

@@ -38,9 +38,9 @@ def test_who_can_act():
     def names(env_name):
         return list(agents.known(mjx_nero.make(env_name, impl="native"), env_name, []))
 
-    assert names("nero_reach") == ["policy nero_reach", "ik", "rmpflow", "joint sliders", "zero", "random"]
-    assert names("nero_lift") == ["policy nero_lift", "pick_up", "joint sliders", "zero", "random"]
-    assert names("cobotta_follow_target") == ["rmpflow", "ik", "joint sliders", "zero", "random"]
+    assert names("nero_reach") == ["policy nero_reach", "ik", "rmpflow", "joint sliders", "your hand", "zero", "random"]
+    assert names("nero_lift") == ["policy nero_lift", "pick_up", "joint sliders", "your hand", "zero", "random"]
+    assert names("cobotta_follow_target") == ["rmpflow", "ik", "joint sliders", "your hand", "zero", "random"]
 
 
 def test_the_arm_follows_a_goal_that_the_user_moves(following):

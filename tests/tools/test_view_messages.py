@@ -158,6 +158,21 @@ def test_only_choices_of_a_control_are_messages(lift):
             messages.checked(update("Speed", **updates), lift.server)
 
 
+def test_a_key_moves_the_hand_and_only_commands_that_there_are_are_heard(lift):
+    """The hand takes over from whoever acts, and gives back."""
+    commands = {handle._impl.props.label: uuid for uuid, handle in lift.server.gui._command_handle_from_uuid.items()}
+    assert {"hand up", "open or close the gripper"} <= set(commands) and "Record" not in commands  # without --demos
+    with pytest.raises(ValueError, match="no command"):
+        messages.checked(msgspec.msgpack.encode({"type": "CommandTriggerMessage", "uuid": "x"}), lift.server)
+    agent = lift.panel.agent
+    with talk(lift) as client:
+        threading.Thread(target=drain, args=(client,), daemon=True).start()
+        say(client, "CommandTriggerMessage", uuid=commands["hand up"])
+        wait(lambda: agent.value == "your hand")
+        say(client, "GuiUpdateMessage", uuid=controls(lift)["Give back"][0], updates={"value": True})
+        wait(lambda: agent.value == "zero")
+
+
 def test_of_the_orders_that_wait_the_last_is_done():
     orders, done, gate = Orders(), [], threading.Event()
     orders.give("first", gate.wait)

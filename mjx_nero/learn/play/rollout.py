@@ -55,6 +55,17 @@ def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
     return Agent(act, init=jax.vmap(lambda state: controller.init(env.view(state))))
 
 
+def through_actions(env: ManipulationEnv, agent: Agent) -> Agent:
+    """An agent of drive targets, in any environment: by the actions that give them, or come nearest."""
+
+    def act(params, memory, state, key):
+        targets, memory = agent.act(params, memory, state, key)
+        joint_pos = jax.vmap(lambda each: env.view(each).joint_pos)(state)
+        return env.actions.invert(targets, joint_pos), memory
+
+    return dataclasses.replace(agent, act=act)
+
+
 @dataclasses.dataclass(frozen=True)
 class Episodes:
     """Played episodes, one entry each.

@@ -1,7 +1,6 @@
 """The folder of a run, which one process owns at a time."""
 
 import contextlib
-import fcntl
 import importlib.metadata as metadata
 import itertools
 import os
@@ -50,7 +49,7 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
     try:
         path = path or _new(name)
         path.mkdir(parents=True, exist_ok=True)
-        lock = _lock(path)
+        lock = files.lock(path / _LOCK)
     except OSError as error:
         raise UserError(f"cannot write to {path or 'runs'}: {error.strerror or error}; pass another --out") from None
     try:
@@ -116,31 +115,6 @@ def _new(name: str) -> pathlib.Path:
             path.mkdir()
             return path
     raise AssertionError
-
-
-def _lock(folder: pathlib.Path) -> int:
-    """Opens a file that the system keeps locked while this process lives."""
-    path = folder / _LOCK
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.read(handle, 100).decode(errors="replace").strip()
-            os.close(handle)
-            raise UserError(
-                f"{folder} is in use by {owner or 'another process'}: wait for its end, or pass another --out"
-            ) from None
-        except OSError:
-            return handle  # the file system has no locks
-        with contextlib.suppress(FileNotFoundError):
-            if os.fstat(handle).st_nlink > 1:  # a hard link to someone else's file
-                path.unlink()
-            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # otherwise its owner removed it just before we locked it
-                os.truncate(handle, 0)
-                os.write(handle, f"process {os.getpid()} on {os.uname().nodename}\n".encode())
-                return handle
-        os.close(handle)
 
 
 def _tidy(folder: pathlib.Path) -> None:

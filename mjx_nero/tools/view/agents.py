@@ -1,6 +1,5 @@
 """Agents of a viewed environment: policies, controllers, and the user's own hand on the joints."""
 
-import dataclasses
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,6 +13,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.learn.runs.checkpoints import POLICY, saved
+from mjx_nero.tools.view import hand
 
 SLIDERS = "joint sliders"
 Make = Callable[[], rollout.Agent]
@@ -36,6 +36,7 @@ def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], pre
             env, control.make(name, env.cfg.robot, env.dt, fields)
         )
     found[SLIDERS] = lambda: of_targets(env)
+    found[hand.NAME] = lambda: hand.agent(env)
     found["zero"] = lambda: _always(lambda key, n: jnp.tile(jnp.asarray(env.home_action), (n, 1)))
     found["random"] = lambda: _always(lambda key, n: jax.random.uniform(key, (n, env.action_size), minval=-1, maxval=1))
     return found
@@ -48,13 +49,7 @@ def of_policy(trained: policy.Policy) -> rollout.Agent:
 
 def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollout.Agent:
     """Lets a controller act in any environment, through the action that gives its drive targets."""
-    steering = rollout.controller_agent(env, controller)
-
-    def act(params, memory, state, key):
-        targets, memory = steering.act(params, memory, state, key)
-        return env.actions.invert(targets, _joint_pos(env, state)), memory
-
-    return dataclasses.replace(steering, act=act)
+    return rollout.through_actions(env, rollout.controller_agent(env, controller))
 
 
 def of_targets(env: ManipulationEnv) -> rollout.Agent:

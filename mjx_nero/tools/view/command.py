@@ -35,6 +35,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--run", type=pathlib.Path, metavar="FOLDER", help="run folder to follow: its environment, with its newest checkpoint"
     )
+    parser.add_argument(
+        "--demos", type=cli.path(), metavar="DIR", help="record demonstrations of your own: a data set, new or one to go on with"
+    )
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
@@ -53,6 +56,7 @@ def main(argv: Sequence[str]) -> None:
         host=args.host,
         port=args.port,
         overrides=dotted["env"],
+        demos=args.demos,
     )
 
 
@@ -135,6 +139,7 @@ def open_view(
     host: str = "127.0.0.1",
     port: int = 8080,
     overrides: Mapping[str, Any] | None = None,
+    demos: pathlib.Path | None = None,
 ) -> View:
     """Serves the page, and lets the environments run.
 
@@ -143,12 +148,13 @@ def open_view(
         run: folder of a training to follow.
         host: address to listen at.
         port: the first free one from here on.
+        demos: data set to record to, of the first environment.
 
     Raises:
         UserError: as the command.
     """
     need("viser", "view")
-    from mjx_nero.tools.view import door, inner, orders, panel, scene, session
+    from mjx_nero.tools.view import door, hand, hand_panel, inner, orders, panel, scene, session
 
     described = _described(run) if run else {}
     env_name = env_name or described.get("env_name", "nero_lift")
@@ -166,8 +172,11 @@ def open_view(
         page.close()
         raise
     work = orders.Orders()
-    picture = scene.Scene(page.server, sim, env.mj_model, work)
     controls = panel.Panel(page.server, sim, makers, chosen, work)
+    recording = hand.Recording(sim, demos, env_name, preset) if demos else None
+    steered = hand.Hand(sim, lambda: hands.take_over())
+    hands = hand_panel.HandPanel(page.server, controls, steered, recording, work)
+    picture = scene.Scene(page.server, sim, env.mj_model, work, steered)
     view = View(page, guard, work, sim, controls, run, env_name)
 
     def shown(frame) -> None:

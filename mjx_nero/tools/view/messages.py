@@ -1,4 +1,4 @@
-"""Messages that a page may send to its server: three kinds, with bounds, about existing controls and things."""
+"""Messages that a page may send to its server: four kinds, with bounds, about existing controls and things."""
 
 from typing import Annotated, Literal
 
@@ -62,7 +62,13 @@ class SceneNodeDragMessage(_Said):
     owner: Literal[""]
 
 
-_DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNodeDragMessage)
+class CommandTriggerMessage(_Said):
+    """A command's key was pressed."""
+
+    uuid: _Word
+
+
+_DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNodeDragMessage | CommandTriggerMessage)
 
 
 def checked(raw: bytes, server: viser.ViserServer) -> bytes:
@@ -79,6 +85,8 @@ def checked(raw: bytes, server: viser.ViserServer) -> bytes:
         raise ValueError("no choice of a control")
     if isinstance(said, SceneNodeDragMessage) and not _is_there(server, said.name, said.instance_index):
         raise ValueError("nothing that can be dragged")
+    if isinstance(said, CommandTriggerMessage) and said.uuid not in server.gui._command_handle_from_uuid:
+        raise ValueError("no command")
     return msgspec.msgpack.encode(said)
 
 

@@ -3,8 +3,10 @@
 import contextlib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -30,6 +32,7 @@ class Panel:
     def __init__(self, server, session: Session, makers: Mapping[str, Make], chosen: str, orders: Orders):
         self._session, self._makers, self._gui = session, dict(makers), server.gui
         self._orders, self._drawn, self._drawing = orders, 0.0, threading.Lock()
+        self.parameters: dict[str, Callable[[], Any]] = {SLIDERS: self._slid_to}  # of agents that the user steers
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._status = server.gui.add_markdown("")
@@ -70,8 +73,8 @@ class Panel:
     def play(self, name: str) -> None:
         """Lets an agent act, or says why it cannot."""
         try:
-            params = jnp.array([s.value for s in self._sliders], jnp.float32) if name == SLIDERS else None
-            self._session.play(self._makers[name](), params)
+            made = self._makers[name]()
+            self._session.play(made, self.parameters[name]() if name in self.parameters else None)
             self._message.content = ""
         except UserError as error:
             self._message.content = f"**{error}**"
@@ -92,7 +95,10 @@ class Panel:
     def _slid(self) -> None:
         if self.agent.value != SLIDERS:
             self.agent.value = SLIDERS
-        self._session.params = jnp.array([s.value for s in self._sliders], jnp.float32)
+        self._session.params = self._slid_to()
+
+    def _slid_to(self) -> jax.Array:
+        return jnp.array([s.value for s in self._sliders], jnp.float32)
 
     def _tell(self, frame: Frame) -> None:
         session, env = self._session, self._session.env

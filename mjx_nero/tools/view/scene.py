@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from mjx_nero.sim.touch import OBSTACLE
+from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import Frame, Session, free_joints
 
@@ -23,10 +24,13 @@ class Scene:
         server: a ``viser.ViserServer``.
         model: with visual shapes (``ManipulationEnv.mj_model``).
         orders: where drags are done.
+        hand: what a drag of the robot's hand moves.
     """
 
-    def __init__(self, server, session: Session, model: mujoco.MjModel, orders: Orders):
-        self._orders = orders
+    def __init__(self, server, session: Session, model: mujoco.MjModel, orders: Orders, hand: Hand | None = None):
+        self._orders, self._hand = orders, hand
+        own = model.site_bodyid[model.site(session.env.cfg.robot.ee_site).id]
+        self._hands = [model.body(b).name for b in range(model.nbody) if hand and own in _above(model, b)]
         self._server, self._session, self._model, self._data = server, session, model, mujoco.MjData(model)
         across = int(np.ceil(np.sqrt(session.size)))
         self._corners = np.array([(i // across * APART, i % across * APART, 0.0) for i in range(session.size)])
@@ -93,7 +97,8 @@ class Scene:
 
     def _draggable(self, handle, body: str) -> None:
         things = free_joints(self._model)
-        if body not in things and body != "goal":
+        hand = self._hand if body in self._hands else None
+        if body not in things and body != "goal" and not hand:
             return
 
         grabbed: dict[int, np.ndarray] = {}  # by browser, from where the mouse took hold to the middle
@@ -102,16 +107,24 @@ class Scene:
         async def _(event) -> None:  # a coroutine, for these alone come in order
             i = event.instance_index or 0
             if event.phase == "start":  # later on the browser's picture is behind what it has been told
-                grabbed[event.client_id] = np.asarray(handle.batched_positions[i]) - event.start_position
+                middle = hand.pos + self._corners[i] if hand else np.asarray(handle.batched_positions[i])
+                grabbed[event.client_id] = middle - event.start_position
             if event.client_id not in grabbed:
                 return
             to = event.end_position + grabbed[event.client_id] - self._corners[i]
             if event.phase == "end":
                 del grabbed[event.client_id]
-            if body == "goal":
+            if hand:
+                self._orders.give(("hand", 0), lambda: hand.move(to))
+            elif body == "goal":
                 self._orders.give((body, i), lambda: self._session.move_goal(i, to))
             else:
                 self._orders.give((body, i), lambda: self._session.move_object(i, things[body], to))
+
+
+def _above(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those that carry it."""
+    return [body, *(_above(model, int(model.body_parentid[body])) if body else [])]
 
 
 def _meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:

@@ -1,0 +1,77 @@
+"""Data sets by their folder, whatever form they are in."""
+
+import contextlib
+import importlib
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from mjx_nero.data import folder
+from mjx_nero.data.episode import Dataset, Episode, Schema
+from mjx_nero.errors import UserError
+
+# Form -> where it is, and the file that only it has.
+FORMS = {
+    "lerobot": ("mjx_nero.data.lerobot", "LeRobotForm", "meta/info.json"),
+    "arrays": ("mjx_nero.data.arrays", "ArraysForm", "meta/pieces.json"),
+}
+
+
+class Form(Protocol):
+    """A data set that is being written."""
+
+    lengths: np.ndarray
+    success: np.ndarray
+    numbers: np.ndarray
+
+    def tidy(self) -> None: ...
+    def put(self, episodes: Sequence[Episode]) -> None: ...
+    def finish(self) -> None: ...
+    def dataset(self) -> Dataset: ...
+
+
+def _make(name: str, path: pathlib.Path, schema: Schema) -> Form:
+    module, kind, _ = FORMS[name]
+    return getattr(importlib.import_module(module), kind)(path, schema)
+
+
+def _held(path: pathlib.Path) -> str | None:
+    """The form of what a folder holds; None: nothing yet."""
+    return next((name for name, (_, _, index) in FORMS.items() if (path / index).exists()), None)
+
+
+@contextlib.contextmanager
+def writer(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> Iterator[Form]:
+    """A data set to write to: new, or going on with what the folder holds. It is finished at the end, also after an error.
+
+    Raises:
+        UserError: the folder holds something else, or cannot be written; a package is missing.
+    """
+    held = _held(path)
+    if held not in (None, form):
+        raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
+    importlib.import_module(FORMS[form][0])  # before the folder is made: it may lack a package
+    with folder.claim(path, schema):
+        made = _make(form, path, schema)
+        made.tidy()
+        try:
+            yield made
+        except BaseException:
+            with contextlib.suppress(UserError):  # the error that comes is the one to tell
+                made.finish()
+            raise
+        made.finish()
+
+
+def open_dataset(path: pathlib.Path) -> Dataset:
+    """The data set in a folder.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    schema, form = folder.schema_of(path), _held(path)
+    if form is None:
+        raise UserError(f"{path} holds no episode yet: give the command that began it again")
+    return _make(form, path, schema).dataset()

@@ -1,0 +1,131 @@
+"""The folder of a data set: one owner, one maker, and pieces that appear whole or not at all.
+
+All files of a piece are written apart, in ``.part``. They go to their places one right after another, and the index, which says
+how much there is, goes last: a process that dies before has written nothing, and the next one clears up after it.
+"""
+
+import contextlib
+import os
+import pathlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from mjx_nero import files
+from mjx_nero.config.values import short
+from mjx_nero.data.episode import Schema, from_json
+from mjx_nero.errors import UserError
+
+PART = ".part"
+ABOUT = "meta/mjx_nero.json"  # the schema, and who made the data set
+_LOCK = ".lock"
+
+Write = Callable[[pathlib.Path], Any]  # writes the file at that path
+
+
+@contextlib.contextmanager
+def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
+    """The folder of a data set, this process's alone until the end. It is made, or holds episodes of the same schema already.
+
+    Raises:
+        UserError: it holds something else, belongs to a process that runs, or cannot be written.
+    """
+    _check(path, schema)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = files.lock(path / _LOCK)
+    except OSError as error:
+        raise UserError(f"cannot write to {path}: {error.strerror or error}; pass another --out") from None
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(path / PART)
+        if not (path / ABOUT).exists():
+            files.write_json(path / ABOUT, schema.to_json())
+        yield path
+    finally:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(path / PART, ignore_errors=True)
+            (path / _LOCK).unlink()
+        os.close(lock)
+
+
+def schema_of(path: pathlib.Path) -> Schema:
+    """The schema of the data set in a folder.
+
+    Raises:
+        UserError: the folder holds none.
+    """
+    where = files.inside(path, *ABOUT.split("/"))
+    if not where.exists():
+        raise UserError(f"{path} holds no demonstrations of mjx_nero: give a folder that 'demos --out' wrote")
+    return from_json(files.read_json(where), where)
+
+
+def _check(path: pathlib.Path, schema: Schema) -> None:
+    """Is the folder free, or of the same maker?"""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise UserError(f"{path} is not a folder: pass another --out")
+    held = [entry.name for entry in os.scandir(path) if entry.name not in (_LOCK, PART)]
+    if not held:
+        return
+    if not files.inside(path, *ABOUT.split("/")).exists():
+        if held == ["meta"] and not any(not name.startswith(".") for name in os.listdir(path / "meta")):
+            return  # of a process that was killed before it had written anything
+        raise UserError(f"{path} is not empty, and holds no demonstrations: pass another --out")
+    there, here = _flat(schema_of(path).to_json()), _flat(files.finite(schema.to_json()))
+    if other := [name for name in here | there if here.get(name) != there.get(name)]:
+        name = next((name for name in other if name.startswith("about.")), other[0])
+        was, now = (short(each.get(name)) for each in (there, here))
+        raise UserError(
+            f"{path} holds other demonstrations ({name.removeprefix('about.')} was {was}, here it is {now}): "
+            "pass another --out, or the same flags as before"
+        )
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted name -> value; tuples as JSON has them."""
+    if isinstance(value, Mapping):
+        return {k: v for name, item in value.items() for k, v in _flat(item, f"{prefix}{name}.").items()}
+    return {prefix[:-1]: _plain(value)}
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def commit(path: pathlib.Path, parts: Mapping[str, Write]) -> None:
+    """Writes the files of a piece; the last one is the index.
+
+    Args:
+        parts: name within the folder -> what writes it.
+
+    Raises:
+        UserError: it cannot be written; then nothing of it is there.
+    """
+    made = []
+    try:
+        (path / PART).mkdir(exist_ok=True)
+        for i, (name, write) in enumerate(parts.items()):
+            part = path / PART / f"{i}{pathlib.Path(name).suffix}"
+            write(part)
+            files.sync(part)
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            made.append((part, path / name))
+        for part, place in made:
+            part.replace(place)
+        for folder in dict.fromkeys(place.parent for _, place in made):
+            files.sync(folder)
+    except OSError as error:
+        raise UserError(
+            f"cannot write to {path}: {_reason(error)}; what was written before is whole: "
+            "make room, and give the same command again to go on"
+        ) from None
+    finally:
+        shutil.rmtree(path / PART, ignore_errors=True)
+
+
+def _reason(error: OSError) -> str:
+    """Arrow puts a tale of its own around the system's reason."""
+    return os.strerror(error.errno) if error.errno else str(error)

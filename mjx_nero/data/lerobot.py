@@ -1,0 +1,208 @@
+"""LeRobotDataset v3.0, written and read with Arrow alone.
+
+Format: huggingface/lerobot 0.4.4, ``src/lerobot/datasets``. A piece is one Parquet file of steps (``data/``), one of
+its episodes (``meta/episodes/``), and the index (``meta/info.json``). Columns of episodes that LeRobot does not know of are ours:
+``success`` and ``number``.
+"""
+
+import json
+import pathlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_nero import files
+from mjx_nero.config.values import read
+from mjx_nero.data import folder, stats, video
+from mjx_nero.data import lerobot_files as lf
+from mjx_nero.data.episode import Dataset, Episode, Schema, check
+from mjx_nero.data.lerobot_files import pa, parquet
+from mjx_nero.errors import UserError
+
+
+class LeRobotForm:
+    """A data set in a folder that is claimed, or only read.
+
+    Attributes:
+        lengths, success, numbers: of the episodes there, as ``Dataset`` has them.
+
+    Raises:
+        UserError: what is there is damaged.
+    """
+
+    def __init__(self, path: pathlib.Path, schema: Schema):
+        self.path, self.schema = path, schema
+        self.lengths, self.numbers, self.success = np.zeros(0, int), np.zeros(0, int), np.zeros(0, bool)
+        self._pieces = 0
+        self._pictures = [name for name, feature in schema.features.items() if feature.picture]
+        if self._pictures:
+            video.need()
+        index = files.inside(path, *lf.INFO.split("/"))
+        if index.exists():
+            self._load(files.read_json(index), index)
+
+    def _load(self, found: Any, index: pathlib.Path) -> None:
+        """Reads the pieces up to what the index says."""
+        try:
+            total = read(int, found["total_episodes"], "total_episodes")
+            while len(self.lengths) < total:
+                table = parquet.read_table(self._place(lf.EPISODES, self._pieces), columns=["length", "number", "success"])
+                self._add(*(table[name].to_numpy() for name in table.column_names))
+            if self.lengths.sum() != found["total_frames"] or len(self.lengths) != total:
+                raise ValueError
+        except (KeyError, TypeError, ValueError, OSError, pa.ArrowException):
+            raise UserError(f"{index} does not fit the files beside it: the data set is damaged, make it anew") from None
+
+    def _add(self, lengths: np.ndarray, numbers: np.ndarray, success: np.ndarray) -> None:
+        self.lengths = np.concatenate([self.lengths, lengths])
+        self.numbers = np.concatenate([self.numbers, numbers])
+        self.success = np.concatenate([self.success, success])
+        self._pieces += 1
+
+    def _place(self, pattern: str, piece: int) -> pathlib.Path:
+        return files.inside(self.path, *lf.name_of(pattern, piece).split("/"))
+
+    def tidy(self) -> None:
+        """Removes files of a piece that the index does not know of: their process died between two renames."""
+        for pattern in (lf.DATA, lf.EPISODES, *map(lf.film, self._pictures)):
+            self._place(pattern, self._pieces).unlink(missing_ok=True)
+
+    def put(self, episodes: Sequence[Episode]) -> None:
+        """Adds a piece, whole or not at all.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        steps, of_pictures = self._steps(episodes), dict[str, list[stats.Stats]]()
+        totals = len(self.lengths) + len(episodes), int(self.lengths.sum()) + steps.num_rows
+        first = {} if self._pieces else {lf.TASKS: lambda path: parquet.write_table(lf.tasks(self.schema.task), path)}
+
+        def film(name: str) -> folder.Write:
+            feature, of_pictures[name] = self.schema.features[name], []
+            frames = _frames(name, episodes, of_pictures[name])
+            return lambda path: video.write(path, frames, feature.shape, self.schema.fps)
+
+        folder.commit(
+            self.path,
+            {
+                **first,
+                **{lf.name_of(lf.film(name), self._pieces): film(name) for name in self._pictures},
+                lf.name_of(lf.DATA, self._pieces): lambda path: parquet.write_table(steps, path),
+                lf.name_of(lf.EPISODES, self._pieces): lambda path: parquet.write_table(self._about(episodes, of_pictures), path),
+                lf.INFO: lambda path: path.write_text(json.dumps(lf.info(self.schema, *totals), indent=2)),
+            },
+        )
+        self._add(*(np.array(x) for x in zip(*((len(each), each.number, each.success) for each in episodes), strict=True)))
+
+    def finish(self) -> None:
+        """Writes the statistics of all that is there."""
+        if len(self.lengths):
+            found = {name: stats.of(self.column(name)) for name in [*self.schema.features, *lf.OWN] if name not in self._pictures}
+            plain = {name: {k: v.tolist() for k, v in each.items()} for name, each in found.items()}
+            for name in self._pictures:
+                plain[name] = lf.per_channel(stats.together(self._of_pictures(name)))
+            files.write_json(self.path / lf.STATS, plain)
+
+    def _of_pictures(self, name: str) -> list[stats.Stats]:
+        """A camera's statistics of each episode."""
+        wanted = [*stats.QUANTILES, "min", "max", "mean", "std", "count"]
+        out = []
+        for piece in range(self._pieces):
+            table = parquet.read_table(self._place(lf.EPISODES, piece), columns=[f"stats/{name}/{what}" for what in wanted])
+            out += [{what: np.ravel(row[f"stats/{name}/{what}"]) for what in wanted} for row in table.to_pylist()]
+        return out
+
+    def column(self, name: str) -> np.ndarray:
+        """All steps of a feature, one episode after another [steps, numbers], or [steps, height, width, 3]."""
+        feature = self.schema.features.get(name)
+        dtype, size = (feature.dtype, feature.size) if feature else (lf.OWN[name], 1)
+        try:
+            if name in self._pictures:
+                return np.stack(list(self.frames(name)))
+            parts = [
+                lf.flat(parquet.read_table(self._place(lf.DATA, i), columns=[name])[name])
+                .astype(dtype, copy=False)
+                .reshape(-1, size)
+                for i in range(self._pieces)
+            ]
+            out = np.concatenate([np.zeros((0, size), dtype), *parts])
+            if len(out) != self.lengths.sum():
+                raise ValueError
+        except (OSError, ValueError, KeyError, pa.ArrowException):
+            raise UserError(f"{self.path} is damaged: its steps of {name} cannot be read, make it anew") from None
+        return out
+
+    def frames(self, name: str) -> Iterator[np.ndarray]:
+        """A camera's frames, one after another."""
+        for piece in range(self._pieces):
+            yield from video.frames(self._place(lf.film(name), piece))
+
+    def dataset(self) -> Dataset:
+        """The data set as it is."""
+        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
+
+    def _steps(self, episodes: Sequence[Episode]) -> pa.Table:
+        for episode in episodes:
+            check(episode, self.schema)
+        columns = {}
+        for name, feature in self.schema.features.items():
+            if feature.picture:
+                continue
+            flat = pa.array(np.concatenate([episode.arrays[name] for episode in episodes]).reshape(-1))
+            columns[name] = flat if feature.size == 1 else pa.FixedSizeListArray.from_arrays(flat, feature.size)
+        return pa.table({**columns, **self._own(episodes)})
+
+    def _own(self, episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+        """The columns of ``_OWN``."""
+        lengths = [len(episode) for episode in episodes]
+        frame, first = np.concatenate([np.arange(n) for n in lengths]), int(self.lengths.sum())
+        return {
+            "timestamp": (frame / self.schema.fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.repeat(len(self.lengths) + np.arange(len(lengths)), lengths),
+            "index": first + np.arange(len(frame)),
+            "task_index": np.zeros(len(frame), np.int64),
+        }
+
+    def _about(self, episodes: Sequence[Episode], of_pictures: Mapping[str, Sequence[stats.Stats]]) -> pa.Table:
+        """A row an episode: where it lies, what it is, and its own statistics, which LeRobot's tools put together."""
+        chunk, file = divmod(self._pieces, lf.CHUNK)
+        rows, begin, own, fps = list[dict[str, Any]](), int(self.lengths.sum()), self._own(episodes), self.schema.fps
+        at = 0
+        for i, episode in enumerate(episodes):
+            n = len(episode)
+            values = {**episode.arrays, **{name: column[at : at + n, None] for name, column in own.items()}}
+            rows.append(
+                {
+                    "episode_index": len(self.lengths) + i,
+                    "tasks": [self.schema.task],
+                    "length": n,
+                    "data/chunk_index": chunk,
+                    "data/file_index": file,
+                    "dataset_from_index": begin + at,
+                    "dataset_to_index": begin + at + n,
+                    "success": episode.success,
+                    "number": episode.number,
+                    "meta/episodes/chunk_index": chunk,
+                    "meta/episodes/file_index": file,
+                    **lf.statistics(values),
+                }
+            )
+            for name in self._pictures:
+                place = {"chunk_index": chunk, "file_index": file, "from_timestamp": at / fps, "to_timestamp": (at + n) / fps}
+                rows[-1] |= {f"videos/{name}/{what}": x for what, x in place.items()}
+                rows[-1] |= {f"stats/{name}/{what}": x for what, x in lf.per_channel(of_pictures[name][i]).items()}
+            at += n
+        return pa.table({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def _frames(name: str, episodes: Sequence[Episode], found: list[stats.Stats]) -> Iterator[np.ndarray]:
+    """A camera's pictures of all steps, one after another; ``found`` gets the statistics of each episode."""
+    for episode in episodes:
+        wanted, kept = stats.sampled(len(episode)), []
+        for i, frame in enumerate(episode.pictures[name]()):
+            if i in wanted:
+                kept.append(frame)
+            yield frame
+        found.append(stats.of_pictures(kept))

@@ -1,0 +1,1 @@
+"""Cloning: a policy from demonstrations alone."""

@@ -1,0 +1,163 @@
+"""Demonstrations: episodes that an agent plays side by side, as a data set holds them.
+
+An episode is drawn by its number and the seed alone, so that any of them can be played again. Noise on the agent's actions brings
+it where it would not go by itself; beside what was done stands what it would have done, its label (Laskey et al. 2017, DART).
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from jaxtyping import Array, Float
+
+from mjx_nero import math
+from mjx_nero.data import Episode
+from mjx_nero.data import episode as names
+from mjx_nero.data.units import Units
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn.play.pictures import Cameras
+from mjx_nero.learn.play.rollout import Agent
+from mjx_nero.sim import kinematics
+from mjx_nero.types import Key, Scenery, View
+
+SMOOTH_S = 0.2  # [s] time constant of the noise: the drives would swallow what changes in every step
+_NOISE = 0xDA27  # folded into an episode's key
+
+
+class Player:
+    """Plays episodes by their numbers, ``size`` at a time, in one compiled program.
+
+    Args:
+        env: where.
+        agent: who.
+        units: of states and actions in the data set.
+        kept: features that episodes hold.
+        deltas: actions are steps of the hand, in place of the joints' targets.
+        noise: standard deviation of what is added to the arm's actions, in the agent's own units.
+        cameras: whose pictures episodes have.
+    """
+
+    def __init__(
+        self,
+        env: ManipulationEnv,
+        agent: Agent,
+        units: Units,
+        size: int,
+        kept: tuple[str, ...],
+        deltas: bool = False,
+        noise: float = 0.0,
+        cameras: Cameras | None = None,
+    ):
+        self._cameras = cameras
+        self.env, self.agent, self.units, self.size, self.kept, self.noise = env, agent, units, size, kept, noise
+        self._arm = len(env.cfg.robot.arm.joints)
+        robot = env.cfg.robot
+        self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
+        self._run = jax.jit(self._play)
+
+    def close(self) -> None:
+        """Frees what draws."""
+        if self._cameras:
+            self._cameras.close()
+
+    def __call__(self, first: int, seed: int) -> list[Episode]:
+        """The episodes of the numbers from ``first`` on."""
+        numbers = np.arange(first, first + self.size)
+        kept, length, success = jax.device_get(self._run(jnp.asarray(numbers), jax.random.PRNGKey(seed)))
+        arrays, qpos, scenery = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
+
+        def episode(i: int) -> Episode:
+            own = {name: x[i, : length[i]] for name, x in arrays.items()}
+            made = Episode(own, bool(success[i]), int(numbers[i]))
+            if not (cameras := self._cameras):
+                return made
+            shown = qpos[i, : length[i]], scenery[i]
+            films = {names.PICTURES + name: functools.partial(cameras.frames, name, *shown) for name in cameras.names}
+            return dataclasses.replace(made, pictures=films)
+
+        return [episode(i) for i in range(self.size)]
+
+    def _play(self, numbers: Array, key: Key) -> tuple[tuple[dict[str, Array], Array | None, Scenery | None], Array, Array]:
+        """Features, and what pictures are drawn from, leaves [steps, n, ...]; lengths and successes [n]."""
+        env, keys = self.env, _keys(numbers, key)
+        apart = jax.vmap(jax.random.fold_in, (0, None))(keys, _NOISE)
+
+        def step(carry: tuple, at: Array) -> tuple:
+            state, memory, off, alive = carry
+            clean, memory = self.agent.act(None, memory, state, key)
+            off = self._next_noise(off, apart, at)
+            action = clean.at[:, : self._arm].add(off) if self.noise else clean
+            after = jax.vmap(env.step)(state, action)
+            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state)) if self._cameras else (None, None)
+            kept = jax.vmap(self._record)(state, clean, after), *drawn
+            won = alive * (after.done > 0) * (after.metrics["success"] > 0)
+            return (after, memory, off, alive * (1 - after.done)), (kept, alive, won)
+
+        state = jax.vmap(env.reset)(keys)
+        begin = state, self.agent.init(state), jnp.zeros((self.size, self._arm)), jnp.ones(self.size)
+        played: Any = jax.lax.scan(step, begin, jnp.arange(env.episode_length))
+        _, (kept, alive, won) = played
+        return kept, alive.sum(axis=0).astype(jnp.int32), won.sum(axis=0) > 0
+
+    def _next_noise(self, off: Float[Array, "n na"], keys: Key, at: Array) -> Float[Array, "n na"]:
+        """A first-order filter's answer to white noise, of the same deviation at every step."""
+        if not self.noise:
+            return off
+        stays = np.exp(-self.env.dt / SMOOTH_S)
+        drawn = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, at), (self._arm,)))(keys)
+        return jnp.where(at > 0, stays, 0.0) * off + self.noise * jnp.where(at > 0, np.sqrt(1 - stays**2), 1.0) * drawn
+
+    def _record(self, state: State, clean: Float[Array, " na"], after: State) -> dict[str, Float[Array, " n"]]:
+        """Features of a step of one environment: its state before, label, what was done, and its outcome."""
+        env = self.env
+        view = env.view(state)
+        label, told = env.targets(state, clean), after.pipeline_state.ctrl
+        seen = state.obs["state"]
+        parts = jax.tree.leaves(seen)  # of a group that stays apart, its terms by name
+        label, told = (self._deltas(view, x) if self._hand else self.units.shown(x) for x in (label, told))
+        flags = after.done > 0, after.metrics["success"] > 0
+        found = {
+            names.STATE: self.units.shown(view.joint_pos),
+            names.ENVIRONMENT: environment_state(env, view),
+            names.ACTION: label,
+            names.EXECUTED: told,
+            names.SEEN: jnp.concatenate([jnp.ravel(x) for x in parts]),
+            names.DONE_BY: clean,
+            names.QPOS: state.pipeline_state.qpos,
+            names.REWARD: after.reward[None],
+            names.DONE: flags[0][None],
+            names.SUCCESS: flags[1][None],
+        }
+        return {name: found[name] for name in self.kept if name in found}
+
+    def _deltas(self, view: View, targets: Float[Array, " nu"]) -> Float[Array, " n"]:
+        """Way of the hand from where it is to where the targets put it (metres, rotation vector, world), and the gripper's
+        targets."""
+        assert self._hand
+        (pos,), (quat,) = self._hand.poses(targets)
+        turn = math.quat_log(math.quat_mul(quat, math.quat_conj(view.ee_quat_w)))
+        return jnp.concatenate([pos - view.ee_pos_w, turn, self.units.shown(targets)[self._arm :]])
+
+
+def environment_state(env: ManipulationEnv, view: View) -> Float[Array, " n"]:
+    """The hand, each object and the goal, as a pose (metres, wxyz) in the world."""
+    poses = [(view.ee_pos_w, view.ee_quat_w)]
+    poses += [(seen.pos_w, seen.quat_w) for name, seen in view.objects.items() if name in env.cfg.scene.objects]
+    poses += [(view.goal_pos_w, view.goal_quat_w)]
+    return jnp.concatenate([x for pose in poses for x in pose])
+
+
+def start(env: ManipulationEnv, number: int, seed: int) -> State:
+    """The state that an episode begins in."""
+    return env.reset(_keys(jnp.asarray([number]), jax.random.PRNGKey(seed))[0])
+
+
+def _keys(numbers: Array, key: Key) -> Key:
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)

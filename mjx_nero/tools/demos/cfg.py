@@ -1,0 +1,65 @@
+"""The config of ``demos``."""
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from mjx_nero.config import bounds, flag
+from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Seed
+from mjx_nero.data.dataset import FORMS
+from mjx_nero.errors import UserError
+
+ACTIONS = ("joints", "hand")
+
+
+@dataclasses.dataclass(frozen=True)
+class DemosCfg:
+    """A data set to write.
+
+    Attributes:
+        robot: another than the environment's own, by name or folder.
+        agent: who demonstrates: expert, policy, or one of the task's controllers by name.
+        policy: policy file (default: the bundled one of the environment).
+        through: what an expert acts through: drives (their targets) or task (the actions that a policy takes, of which it then
+            has a label to learn from).
+        episodes: in the data set, in all.
+        all: keep episodes that fail, too.
+        noise: standard deviation of what is added to the arm's actions, smooth in time, in the unit of the action (rad for
+            experts); the clean action stands beside what was done.
+        actions: joints (targets of all drives), or hand (steps of the hand, and targets of the gripper).
+        holds: all of a step, or arm: only what a real arm knows, too, so that both go together.
+        units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
+        cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
+        picture: width and height of a picture in pixels, even numbers.
+        form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).
+        task: sentence that says what the robot does (default: the environment's).
+        side_by_side: episodes played at a time; each time is written as one piece.
+    """
+
+    env_name: str
+    preset: str = "default"
+    robot: str | None = None
+    seed: Seed = 0
+    env_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    agent: str = flag("expert")
+    policy: pathlib.Path | None = flag(None)
+    through: Annotated[str, OneOf("drives", "task")] = flag("drives")
+    episodes: Annotated[int, Bounds(1, 10_000_000)] = flag(1000)
+    all: bool = flag(False)
+    noise: NonNegative = flag(0.0)
+    actions: Annotated[str, OneOf(*ACTIONS)] = flag("joints")
+    holds: Annotated[str, OneOf("all", "arm")] = flag("all")
+    units: Annotated[str, OneOf("auto", "si", "lerobot")] = flag("auto")
+    cameras: str = flag("")
+    picture: str = flag("128x128")
+    form: Annotated[str, OneOf(*FORMS)] = flag("lerobot")
+    task: str = flag("")
+    side_by_side: Annotated[int, Bounds(1, 65536)] = flag(256)
+
+    def __post_init__(self):
+        bounds.check(self)
+        if self.policy and self.agent != "policy":
+            raise UserError("--policy needs --agent policy")
+        if self.agent == "policy" and self.through != "drives":
+            raise UserError("--through is of experts: a policy acts through the task's actions anyway")

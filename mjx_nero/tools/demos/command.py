@@ -1,0 +1,93 @@
+"""The command line of ``demos``."""
+
+import contextlib
+import pathlib
+import sys
+import time
+from collections.abc import Sequence
+
+from mjx_nero import console
+from mjx_nero.envs import registry
+from mjx_nero.errors import UserError
+from mjx_nero.tools import cli
+from mjx_nero.tools.demos.cfg import DemosCfg
+
+_LOG = "write a run of 'deploy --log' on a real arm as an episode, in place of simulated ones; give those that succeeded; again"
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line.
+
+    Raises:
+        UserError: unknown names, a folder of something else, a package is missing, a full disk, or nobody succeeds.
+    """
+    parser = cli.Parser(
+        prog=cli.called_as("demos"),
+        description="Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
+    )
+    parser.add_environment(registry.list_envs())
+    parser.add_seed(0)
+    parser.add_argument("--out", type=cli.path(), metavar="DIR", help="folder to write to, or to go on with")
+    parser.add_fields(DemosCfg)
+    parser.add_argument("--log", type=cli.path(".csv"), action="append", metavar="FILE", help=_LOG)
+    parser.add_argument("--inspect", type=cli.path(), metavar="DIR", help="show what a data set holds")
+    parser.add_argument(
+        "--sheet", type=cli.path(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
+    )
+    parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="play an episode of a data set again, in physics")
+    parser.add_argument("--episode", type=cli.number(int), default=0, help="which one to replay, from 0 (default: %(default)s)")
+    parser.add_argument("--video", type=cli.path(".mp4"), help="also draw the episode that is replayed")
+    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    asked = [name for name in ("out", "inspect", "replay") if getattr(args, name)]
+    if len(asked) != 1:
+        raise UserError("demos takes one of --out DIR (write), --inspect DIR and --replay DIR (look at what is written)")
+    if args.video and not args.replay:
+        raise UserError("--video is of the episode that is replayed: pass --replay, too")
+    if args.log and not args.out:
+        raise UserError("--log needs --out DIR, the folder to write to")
+    if args.sheet and not args.inspect:
+        raise UserError("--sheet shows what a data set has: pass --inspect, too")
+    if args.inspect:
+        from mjx_nero.tools.demos import inspection
+
+        return inspection.show(args.inspect, args.sheet)
+    cli.setup_jax()
+    if args.replay:
+        from mjx_nero.tools.demos import replay
+
+        return replay.show(args.replay, args.episode, args.video)
+    cfg = DemosCfg(args.env, args.preset, args.robot, seed=args.seed, env_fields=dotted["env"], **cli.fields(args, DemosCfg))
+    if args.log:
+        from mjx_nero.tools.demos import logs
+
+        return logs.write(cfg, args.log, args.out)
+    write(cfg, args.out)
+
+
+def write(cfg: DemosCfg, out: pathlib.Path) -> None:
+    """Plays until the data set has as many episodes as it is to have, piece by piece.
+
+    Raises:
+        UserError: as the command.
+    """
+    from mjx_nero.data import writer
+    from mjx_nero.tools.demos import making
+
+    schema, player = making.prepare(cfg)
+    screen, begun = console.screen(stderr=True), time.perf_counter()
+    with contextlib.closing(player), writer(out, schema, cfg.form) as form:
+        before, tries, none = len(form.lengths), 0, 0
+        first = int(form.numbers[-1]) + 1 if before else 0
+        while len(form.lengths) < cfg.episodes:
+            played = player(first, cfg.seed)
+            kept = [episode for episode in played if episode.success or cfg.all]
+            first, tries, none = first + len(played), tries + len(played), 0 if kept else none + len(played)
+            if kept:
+                form.put(kept[: cfg.episodes - len(form.lengths)])
+                console.line(screen, f"{out}: {len(form.lengths)} of {cfg.episodes} episodes; {len(kept)}/{len(played)} kept")
+            elif none >= making.HOPELESS:
+                raise UserError(f"none of {none} episodes succeeded: try another --agent, or keep them with --all")
+        seconds = time.perf_counter() - begun
+        frames, new = int(form.lengths.sum()), len(form.lengths) - before
+    done = f"{out}: {len(form.lengths)} episodes, {frames} steps"
+    print(f"{done}; {new} new ones of {tries} that were played in {seconds:.1f} s", file=sys.stdout)

@@ -1,0 +1,131 @@
+"""Episodes from logs of real runs (``deploy --log``), one a log, with the features of ``demos --holds arm``."""
+
+import csv
+import hashlib
+import math
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+import mjx_nero
+from mjx_nero import files
+from mjx_nero.config.values import short
+from mjx_nero.data import Episode, Schema, writer
+from mjx_nero.data import episode as names
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.tools.demos import making
+from mjx_nero.tools.demos.cfg import DemosCfg
+
+MAX_BYTES = 256_000_000
+_LARGEST = 1e4  # of a number
+_JITTER = 0.2  # of a step's length: a log whose steps differ by more on average has no rate
+
+
+def write(cfg: DemosCfg, logs: Sequence[pathlib.Path], out: pathlib.Path) -> None:
+    """Writes the episodes of logs that are not in the data set yet.
+
+    Raises:
+        UserError: a log is damaged or of another arm, or the folder holds something else.
+    """
+    env = ManipulationEnv(registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot), impl="native")
+    shown, robot = making.units_of(env, cfg.units), env.cfg.robot
+    read = [steps(path, robot.joints) for path in logs]
+    dt = float(np.median([step for _, _, step in read]))
+    for path, (_, _, step) in zip(logs, read, strict=True):
+        if abs(step - dt) > _JITTER * dt:
+            raise UserError(
+                f"{path} has a step of {1000 * step:.1f} ms, and the others one of {1000 * dt:.1f} ms: write them apart"
+            )
+    rate = 1 / env.dt if abs(dt - env.dt) < _JITTER * env.dt else round(1 / dt)
+    kept = {name: each for name, each in making.features(env, shown, "joints").items() if name in making.ARM}
+    about = {
+        "env": cfg.env_name,
+        "preset": cfg.preset,
+        "robot": robot.name,
+        "agent": "deploy",
+        "holds": "arm",
+        "actions": "joints",
+        "units": shown.to_json(),
+        "version": mjx_nero.__version__,
+    }
+    schema = Schema(rate, making.robot_type(robot.name, shown), cfg.task or making.sentence(cfg.env_name), kept, about)
+    with writer(out, schema, cfg.form) as form:
+        there = set(form.numbers.tolist())
+        new = [
+            made
+            for path, (at, told, _) in zip(logs, read, strict=True)
+            if (made := _episode(path, shown, at, told)).number not in there
+        ]
+        if new:
+            form.put(new)
+        count, frames = len(form.lengths), int(form.lengths.sum())
+    print(f"{out}: {count} episodes, {frames} steps; {len(new)} new ones of {len(logs)} logs")
+
+
+def _episode(path: pathlib.Path, shown: making.units.Units, at: np.ndarray, told: np.ndarray) -> Episode:
+    """A log's number is made of what is in it, so that none comes twice."""
+    done = np.arange(len(at))[:, None] == len(at) - 1
+    state, action = (shown.shown(x).astype(np.float32) for x in (at, told))
+    number = int.from_bytes(hashlib.sha256(at.tobytes() + told.tobytes()).digest()[:6], "big")
+    arrays = {names.STATE: state, names.ACTION: action, names.EXECUTED: action, names.DONE: done}
+    return Episode(arrays, True, number)
+
+
+def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Reads the joints before each step of the policy, and the drives' targets in it, up to the first fault.
+
+    Returns:
+        positions and targets [steps, joints] [rad or m], and the length of a step [s].
+
+    Raises:
+        UserError: it is no log of these joints, or the policy made no step in it.
+    """
+    at: list[float] | None = None
+    rows: list[tuple[float, list[float], list[float]]] = []
+    for line, cells in _table(path, joints):
+        where = f"{path} line {line}"
+        if cells["position." + joints[0]]:
+            at = [_number(cells[f"position.{joint}"], where) for joint in joints]
+        if cells.get("held"):
+            break
+        if cells["target." + joints[0]] and cells.get("inferred") and at is not None:
+            rows.append((_number(cells["time"], where), at, [_number(cells[f"target.{joint}"], where) for joint in joints]))
+    if len(rows) < 2:
+        raise UserError(f"{path} has {len(rows)} steps of a policy: give the log of a run of 'deploy'")
+    times, positions, targets = (np.array(column) for column in zip(*rows, strict=True))
+    return positions, targets, float(np.median(np.diff(times)))
+
+
+def _table(path: pathlib.Path, joints: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """The rows of a log by their columns, and the line that each is in."""
+    try:
+        text = files.read_bytes(path, MAX_BYTES).decode()
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    rows = list(csv.reader(line for _, line in lines))
+    head = rows[0] if rows else []
+    for name in ["time", "inferred", *(f"{what}.{joint}" for what in ("target", "position") for joint in joints)]:
+        if head.count(name) != 1:
+            raise UserError(f"{path} needs one column {name}: its first line names {short(','.join(head))}")
+    out = []
+    for (line, _), cells in zip(lines[1:], rows[1:], strict=True):
+        if len(cells) != len(head):
+            if line == lines[-1][0]:
+                break  # its program was killed as it wrote
+            raise UserError(f"{path} line {line} has {len(cells)} cells, the first line {len(head)}")
+        out.append((line, dict(zip(head, cells, strict=True))))
+    return out
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _LARGEST:
+        raise UserError(f"{where} takes numbers up to {_LARGEST:g}, got {short(text)}")
+    return value

@@ -1,0 +1,184 @@
+"""Makes the player of a data set and its schema."""
+
+import argparse
+import hashlib
+import math
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+import mjx_nero
+from mjx_nero import config, files
+from mjx_nero.data import Feature, Schema, units
+from mjx_nero.data import episode as names
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.task import for_controllers
+from mjx_nero.errors import UserError
+from mjx_nero.learn import policy
+from mjx_nero.learn.play import evaluation, rollout
+from mjx_nero.learn.play.demonstrations import Player
+from mjx_nero.learn.play.pictures import Cameras
+from mjx_nero.sim.fingerprint import fingerprint
+from mjx_nero.tools import cli
+from mjx_nero.tools.demos.cfg import DemosCfg
+
+HOPELESS = 1000  # episodes in a row without a success
+ARM = (names.STATE, names.ACTION, names.EXECUTED, names.DONE)  # what a real arm knows
+SENTENCES = {  # by the end of an environment's name, longer ones first
+    "reach_obstacles": "Bring the hand to the goal without touching an obstacle.",
+    "lift_obstacles": "Pick up the cube and carry it past the obstacles to the goal.",
+    "pick_place": "Pick up the cube and put it down at the goal.",
+    "follow_target": "Follow the moving goal with the hand.",
+    "clutter": "Pick the commanded object out of the others and hold it at the goal.",
+    "stack": "Put the cube on top of the other cube and let go.",
+    "place": "Put the cube down at the goal and let go.",
+    "push": "Push the object to the goal.",
+    "reach": "Bring the hand to the goal.",
+    "lift": "Pick up the cube and hold it at the goal.",
+}
+
+
+def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
+    """The schema of the data set, and who plays its episodes.
+
+    Raises:
+        UserError: unknown names or fields, a policy that does not fit.
+    """
+    env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
+    env_cfg = config.override(env_cfg, cfg.env_fields)
+    acts = cfg.agent == "policy"
+    size = min(cfg.side_by_side, cfg.episodes)
+    name = next(iter(env_cfg.controllers), evaluation.EXPERT) if cfg.agent == evaluation.EXPERT else cfg.agent
+    drives = not acts and cfg.through == "drives"
+    env = ManipulationEnv(for_controllers(env_cfg) if drives else env_cfg, impl="native", num_envs=size)
+    if acts:
+        trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, preset=cfg.preset)
+        agent = rollout.policy_agent(lambda params, obs, key: trained.act(obs))
+    else:
+        steering = evaluation.controller(name, env, cfg.env_name)
+        agent = rollout.controller_agent(env, steering)
+        agent = agent if drives else rollout.through_actions(env, agent)
+    shown = units_of(env, cfg.units)
+    about = {
+        "env": cfg.env_name,
+        "preset": cfg.preset,
+        "robot": env.cfg.robot.name,
+        "robot_folder": env.cfg.robot.folder,
+        "fingerprint": fingerprint(env.cfg.robot),
+        "env_fields": {key: str(value) for key, value in cfg.env_fields.items()},
+        "agent": "policy" if acts else name,
+        "policy": _digest(cfg.policy or policy.shipped(cfg.env_name, cfg.preset)) if acts else None,
+        "through": "task" if acts else cfg.through,
+        "seed": cfg.seed,
+        "all": cfg.all,
+        "noise": cfg.noise,
+        "actions": cfg.actions,
+        "holds": cfg.holds,
+        "cameras": cfg.cameras,
+        "units": shown.to_json(),
+        "impl": env.impl,
+        "version": mjx_nero.__version__,
+    }
+    kept = {name: each for name, each in features(env, shown, cfg.actions).items() if cfg.holds == "all" or name in ARM}
+    cameras = cameras_of(env, cfg)
+    if cameras:
+        width, height = cameras.size
+        kept |= {names.PICTURES + name: names.picture(height, width) for name in cameras.names}
+    schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), kept, about)
+    return schema, Player(env, agent, shown, size, tuple(kept), cfg.actions == "hand", cfg.noise, cameras)
+
+
+def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
+    """Those that are asked for; None: none is.
+
+    Raises:
+        UserError: there is no such camera, it is no size of a picture, or the machine cannot draw.
+    """
+    found = list(dict.fromkeys(name.strip() for name in cfg.cameras.split(",") if name.strip()))
+    try:
+        size = cli.size(cfg.picture)
+    except argparse.ArgumentTypeError as error:
+        raise UserError(f"--picture {error}") from None
+    return Cameras(env, found, size) if found else None
+
+
+def robot_type(robot: str, shown: units.Units) -> str:
+    """The robot's name; LeRobot's, where units are its own."""
+    return units.LEROBOT.get(robot, robot) if shown.kind == "lerobot" else robot
+
+
+def sentence(env_name: str) -> str:
+    """Says what the robot does in an environment."""
+    return next((text for end, text in SENTENCES.items() if env_name.endswith(end)), f"Do {env_name.replace('_', ' ')}.")
+
+
+def units_of(env: ManipulationEnv, kind: str) -> units.Units:
+    """Units of an environment's joints; ``kind``: one of ``units.KINDS``, or ``auto``."""
+    robot, model = env.cfg.robot, env.physics_model
+    slides = [bool(model.joint(joint).type == 2) for joint in robot.joints]  # mjJNT_SLIDE
+    if kind == "auto":
+        kind = "lerobot" if robot.name in units.LEROBOT else "si"
+    if kind == "si":
+        return units.si(slides)
+    low, high = np.array([model.joint(joint).range for joint in robot.joints]).T
+    opens = np.array([open > close for open, close in zip(robot.gripper.open, robot.gripper.close, strict=True)])
+    return units.lerobot(robot.name, slides, low, high, opens)
+
+
+def features(env: ManipulationEnv, shown: units.Units, actions: str) -> dict[str, Feature]:
+    """Lists the features of a step."""
+    joints = env.cfg.robot.joints
+    targets = Feature(tuple(f"{joint}.pos" for joint in joints), shown.names)
+    arm = len(env.cfg.robot.arm.joints)
+    hand = tuple(f"hand.{what}" for what in ("x", "y", "z", "turn_x", "turn_y", "turn_z"))
+    steps = Feature(hand + targets.names[arm:], ("m",) * 3 + ("rad",) * 3 + shown.names[arm:])
+    things = ("hand", *env.cfg.scene.objects, "goal")
+    pose = [f"{thing}.{axis}" for thing in things for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    qpos = env.physics_model.nq
+    return {
+        names.STATE: targets,
+        names.ENVIRONMENT: Feature(tuple(pose), (("m",) * 3 + ("",) * 4) * len(things)),
+        names.ACTION: steps if actions == "hand" else targets,
+        names.EXECUTED: targets,
+        names.SEEN: Feature(_seen(env)),
+        names.DONE_BY: Feature(tuple(f"action.{i}" for i in range(env.action_size))),
+        names.QPOS: Feature(tuple(f"qpos.{i}" for i in range(qpos))),
+        names.REWARD: Feature(("reward",)),
+        names.DONE: Feature(("done",), dtype="bool"),
+        names.SUCCESS: Feature(("success",), dtype="bool"),
+    }
+
+
+def _seen(env: ManipulationEnv) -> tuple[str, ...]:
+    """Names of what a policy sees: by its terms, where their sizes add up to it."""
+    shapes = jax.eval_shape(env.named_observations, env.state_shape)["state"]
+    size = sum(
+        math.prod(shape) for shape in jax.tree.leaves(env.observation_size["state"], is_leaf=lambda x: isinstance(x, tuple))
+    )
+    terms = env.cfg.observations["state"].terms  # in their order, which a tree of JAX does not keep
+    found = [f"{name}.{i}" for name in terms for i in range(shapes[name].size)]
+    return tuple(found) if len(found) == size else tuple(f"state.{i}" for i in range(size))
+
+
+def _digest(path: pathlib.Path) -> str:
+    """Says which policy it was."""
+    return hashlib.sha256(files.read_bytes(path, 1 << 30)).hexdigest()[:16]
+
+
+def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
+    """The environment that a data set was made in.
+
+    Args:
+        drives: by drive targets, whatever the data set's agent acted through.
+
+    Raises:
+        UserError: it cannot be made here.
+    """
+    about: dict[str, Any] = dict(schema.about)
+    robot = about.get("robot_folder") or about["robot"]
+    cfg = registry.env_cfg(about["env"], about["preset"], robot).uncorrupted()
+    cfg = config.override(cfg, about["env_fields"])
+    return ManipulationEnv(for_controllers(cfg) if drives or about["through"] == "drives" else cfg, impl="native")

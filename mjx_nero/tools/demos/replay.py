@@ -1,0 +1,71 @@
+"""Plays an episode of a data set again: the drives are told what they were told, and physics has to come to the same."""
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero import console
+from mjx_nero.data import Dataset, Episode, open_dataset, units
+from mjx_nero.data import episode as names
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.learn.play.demonstrations import start
+from mjx_nero.sim import render
+from mjx_nero.tools.demos import making
+from mjx_nero.types import Scenery
+
+
+def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
+    """Says how far physics comes from what was recorded; draws the episode, if a video is asked for.
+
+    Raises:
+        UserError: there is no such episode, or the data set is not of an environment.
+    """
+    found = open_dataset(path)
+    if not 0 <= index < len(found):
+        raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
+    env, episode = making.env_of(found.schema, drives=True), _episode(found, index)
+    qpos, scenery = again(env, found, episode)
+    off = np.abs(qpos - episode.arrays[names.QPOS]).max()
+    screen = console.screen()
+    said = "succeeds" if episode.success else "fails"
+    console.line(screen, f"episode {index} (number {episode.number}): {len(episode)} steps, {said}; {found.schema.task}")
+    console.line(screen, f"played again, physics differs by at most {off:.2g} (rad, m) from what was recorded")
+    if video:
+        with console.drawing(console.screen(stderr=True), video.name) as update:
+            drawn = episode.arrays[names.QPOS].astype(np.float64)[:, None]
+            cfg = render.VideoCfg(in_turn=1)
+            render.write_episodes(video, env.mj_model, drawn, scenery[:, None], env.dt, cfg, update)
+        console.wrote(screen, "video", video)
+
+
+def _episode(found: Dataset, index: int) -> Episode:
+    """One episode with what a replay needs.
+
+    Raises:
+        UserError: the data set lacks it.
+    """
+    if names.QPOS not in found.schema.features:
+        raise UserError("this data set has no positions of the physics: it is not of an environment here")
+    return found.episodes((names.EXECUTED, names.QPOS))[index]
+
+
+def again(env: ManipulationEnv, found: Dataset, episode: Episode) -> tuple[np.ndarray, Scenery]:
+    """Positions before each step [steps, nq], and what else a picture shows, of the episode played again.
+
+    Args:
+        env: by drive targets.
+    """
+    about = found.schema.about
+    targets = units.from_json(about["units"]).positions(episode.arrays[names.EXECUTED])
+
+    @jax.jit
+    def play(targets):
+        def step(state, target):
+            return env.step(state, target), (state.pipeline_state.qpos, env.scenery(state))
+
+        return jax.lax.scan(step, start(env, episode.number, about["seed"]), targets)[1]
+
+    return jax.device_get(play(jnp.asarray(targets, jnp.float32)))

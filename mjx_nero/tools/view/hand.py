@@ -1,0 +1,205 @@
+"""A hand on the arm: the user drags or steers the hand, and what comes of it becomes demonstrations."""
+
+import pathlib
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero import math
+from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.data import Episode, Schema, writer
+from mjx_nero.data import episode as names
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.learn.play import rollout
+from mjx_nero.learn.play.recorder import Record
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim import kinematics
+from mjx_nero.tools.demos import making
+from mjx_nero.tools.view.session import Session
+
+NAME = "your hand"
+STEP = 0.01  # [m] of a key
+TURN = 10.0  # [degrees] of a key
+# Of an arm with few joints the place of the hand counts, and its turn as far as it can.
+_IK = IkCfg(orientation_weight=0.03, restarts=0)
+
+
+def agent(env: ManipulationEnv) -> rollout.Agent:
+    """Moves the hand to its parameters: ``pos`` [m], ``quat`` (wxyz), and ``open``, from 0 to 1, at the drives' speed."""
+    robot, ik = env.cfg.robot, InverseKinematics(env.cfg.robot, cfg=_IK)
+    n, step = len(robot.arm.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
+    opened, closed = (np.array(x, np.float32) for x in (robot.gripper.open, robot.gripper.close))
+
+    def one(asked, point):
+        arm = ik.local(asked["pos"], asked["quat"], point[:n]).q
+        fingers = closed + asked["open"] * (opened - closed)
+        return rate_limit(jnp.concatenate([arm, fingers]), point, step=jnp.asarray(step))
+
+    def act(asked, points, state, key):  # of their own, as targets may lead joints by much
+        points = jax.vmap(one, (None, 0))(asked, points)
+        return points, points
+
+    return rollout.through_actions(env, rollout.Agent(act, init=jax.vmap(lambda state: env.view(state).joint_pos)))
+
+
+class Hand:
+    """The pose that the user wants the hand of a session's robots to have.
+
+    Args:
+        take_over: called when the user steers; True: somebody else acted till now.
+    """
+
+    def __init__(self, session: Session, take_over: Callable[[], bool]):
+        env = session.env
+        self._session, self._take_over = session, take_over
+        self._pose = jax.jit(kinematics.site_pose_fn(env.physics_model, env.cfg.robot.ee_site))
+        self._lock, self._steered = threading.Lock(), False
+        self.pos, self.quat, self.open = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 1.0
+        self.here()
+
+    def here(self) -> None:
+        """Wants it where it is."""
+        pos, quat = self._pose(jnp.asarray(self._session.frame.qpos[0], jnp.float32))
+        with self._lock:
+            self.pos, self.quat = np.array(pos, float), np.array(quat, float)
+
+    def begin(self) -> dict[str, jax.Array]:
+        """Parameters of the agent as it begins: the hand stays where it is, unless the user began by steering it."""
+        if not self._steered:
+            self.here()
+        self._steered = False
+        return self.asked
+
+    @property
+    def asked(self) -> dict[str, jax.Array]:
+        """Parameters of the agent."""
+        with self._lock:
+            return {
+                "pos": jnp.asarray(self.pos, jnp.float32),
+                "quat": jnp.asarray(self.quat, jnp.float32),
+                "open": jnp.float32(self.open),
+            }
+
+    def move(self, to: np.ndarray) -> None:
+        """Wants it at a point of the world [m]."""
+        self._steer(lambda: setattr(self, "pos", np.asarray(to, float)))
+
+    def shift(self, by: tuple[float, float, float]) -> None:
+        """Wants it so much farther in the world [m]."""
+        self._steer(lambda: setattr(self, "pos", self.pos + by))
+
+    def turn(self, degrees: float) -> None:
+        """Wants it turned about the vertical."""
+        by = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.radians(degrees))
+        self._steer(lambda: setattr(self, "quat", np.array(math.quat_mul(by, jnp.asarray(self.quat, jnp.float32)), float)))
+
+    def grip(self, share: float) -> None:
+        """Wants the gripper so far open, from 0 to 1."""
+        self._steer(lambda: setattr(self, "open", float(np.clip(share, 0.0, 1.0))))
+
+    def _steer(self, change: Callable[[], None]) -> None:
+        begins = self._take_over()
+        if begins:  # whoever acts now is given parameters when it begins
+            self.here()
+            self._steered = True
+        with self._lock:
+            change()
+        if not begins:
+            self._session.params = self.asked
+
+
+class Recording:
+    """Keeps what the first environment of a session does, and writes it as an episode of a data set.
+
+    Args:
+        out: folder of the data set.
+        env_name, preset: what the session plays.
+    """
+
+    def __init__(self, session: Session, out: pathlib.Path, env_name: str, preset: str, form: str = "lerobot"):
+        self._session, self._out, self._form = session, out, form
+        env = session.env
+        self._units = making.units_of(env, "auto")
+        self._pose = jax.jit(jax.vmap(kinematics.site_pose_fn(env.physics_model, env.cfg.robot.ee_site)))
+        about = {
+            "env": env_name,
+            "preset": preset,
+            "robot": env.cfg.robot.name,
+            "robot_folder": env.cfg.robot.folder,
+            "agent": NAME,
+            "through": "task",
+            "actions": "joints",
+            "holds": "all",
+            "units": self._units.to_json(),
+        }
+        robot = making.robot_type(env.cfg.robot.name, self._units)
+        kept = making.features(env, self._units, "joints")
+        self.schema = Schema(1 / env.dt, robot, making.sentence(env_name), kept, about)
+        self._steps: list[tuple[np.ndarray, Record]] = []
+        self.on = False
+        session.recorders.append(self)
+
+    def __call__(self, record: Record) -> None:
+        """Takes a step; the end of the task's episode ends the recording, too."""
+        if self.on:
+            one = jax.tree.map(lambda x: np.array(x[0]), record)
+            self._steps.append((self._session.frame.qpos[0].astype(np.float32), one))  # the frame is still that before the step
+            self.on = not one.done
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def begin(self) -> None:
+        """Records from now on."""
+        self._steps, self.on = [], True
+
+    def discard(self) -> None:
+        """Forgets what was recorded."""
+        self._steps, self.on = [], False
+
+    def save(self) -> str:
+        """Adds what was recorded to the data set; a line says so. The user's word is that it succeeded.
+
+        Raises:
+            UserError: nothing was recorded, or it cannot be written.
+        """
+        self.on = False
+        if not self._steps:
+            raise UserError("nothing was recorded: press Record first")
+        with writer(self._out, self.schema, self._form) as form:
+            number = int(form.numbers[-1]) + 1 if len(form.numbers) else 0
+            form.put([Episode(self._arrays(), True, number)])
+            count = len(form.lengths)
+        steps, self._steps = len(self._steps), []
+        return f"{steps} steps saved; {self._out} has {count} episodes"
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Features of the steps, as those of ``demonstrations.Player``."""
+        env = self._session.env
+        before = np.stack([qpos for qpos, _ in self._steps])
+        record: Any = jax.tree.map(lambda *x: np.stack(x), *(one for _, one in self._steps))
+        at = [int(env.physics_model.joint(joint).qposadr[0]) for joint in env.cfg.robot.joints]
+        things = [int(env.physics_model.joint(name).qposadr[0]) for name in env.cfg.scene.objects]
+        poses = [*self._pose(before), *(before[:, i : i + 7] for i in things)]
+        poses += [record.scenery.goal_pos_w, record.scenery.goal_quat_w]
+        seen = [x.reshape(len(before), -1) for x in jax.tree.leaves(record.obs["state"])]
+        last = np.arange(len(before))[:, None] == len(before) - 1
+        told = self._units.shown(record.targets)
+        arrays = {
+            names.STATE: self._units.shown(before[:, at]),
+            names.ENVIRONMENT: np.concatenate([np.asarray(x) for x in poses], axis=1),
+            names.ACTION: told,
+            names.EXECUTED: told,
+            names.SEEN: np.concatenate(seen, axis=1),
+            names.DONE_BY: record.action,
+            names.QPOS: before,
+            names.REWARD: record.reward[:, None],
+            names.DONE: last,
+            names.SUCCESS: last,
+        }
+        return {name: np.asarray(x, self.schema.features[name].dtype) for name, x in arrays.items()}

@@ -1,0 +1,118 @@
+"""The command ``demos``: what it writes, shows and plays again. Physics is MuJoCo's, in a task of a fifth of a second."""
+
+import json
+import pathlib
+import re
+
+import numpy as np
+import pytest
+
+from mjx_nero.data import episode as names
+from mjx_nero.data import open_dataset, units
+from mjx_nero.envs import registry
+from mjx_nero.tools import cli, demos
+
+SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays", "--env.episode_length_s", 0.2]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Six episodes of ten steps, with noise, in pieces of four."""
+    where = tmp_path_factory.mktemp("demos") / "d"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "setup_jax", lambda: None)
+        demos.main([*map(str, SHORT), "--episodes", "6", "--side-by-side", "4", "--noise", "0.5", "--out", str(where)])
+    return where
+
+
+def test_what_a_step_holds(made):
+    found = open_dataset(made)
+    assert found.lengths.tolist() == [10] * 6 and found.numbers.tolist() == list(range(6)) and not found.success.any()
+    joints = [f"joint{i}.pos" for i in range(1, 8)] + ["gripper_joint1.pos", "gripper_joint2.pos"]
+    for name in (names.STATE, names.ACTION, names.EXECUTED):
+        assert list(found.schema.features[name].names) == joints
+    assert found.schema.features[names.STATE].units == ("rad",) * 7 + ("m",) * 2
+    assert found.schema.fps == pytest.approx(50) and found.schema.task == "Pick up the cube and hold it at the goal."
+    assert found.schema.about["noise"] == 0.5 and found.schema.about["env_fields"] == {"episode_length_s": "0.2"}
+    np.testing.assert_array_equal(found.column(names.STATE), found.column(names.QPOS)[:, :9])
+    seen = found.schema.features[names.SEEN]
+    assert seen.names[0] == "joint_pos.0" and seen.size == found.column(names.SEEN).shape[1]
+    home = np.array(registry.robot("nero").home, np.float32)
+    np.testing.assert_allclose(found.column(names.SEEN)[:, :9], found.column(names.STATE) - home, atol=1e-6)  # no noise on it
+    place = [found.schema.features[names.ENVIRONMENT].names.index(f"cube.{axis}") for axis in "xyz"]
+    np.testing.assert_array_equal(found.column(names.ENVIRONMENT)[:, place], found.column(names.QPOS)[:, 9:12])
+    ends = found.column(names.DONE).reshape(6, 10)
+    assert ends[:, -1].all() and not ends[:, :-1].any()
+
+
+def test_labels_stand_beside_what_noise_made_of_them(made):
+    """The arm's targets differ, the fingers' do not; a label is what a policy without noise would tell the drives there."""
+    found = open_dataset(made)
+    off = found.column(names.EXECUTED) - found.column(names.ACTION)
+    assert np.abs(off[:, :7]).max() > 1e-3 and np.abs(off[:, 7:]).max() == 0
+    draws = off.reshape(6, 10, 9)[:, 0]
+    assert len(np.unique(draws, axis=0)) == 6  # each episode has its own
+
+
+def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
+    """Whatever plays beside it; and a data set goes on where it ended."""
+    argv = [*SHORT, "--side-by-side", 4, "--noise", 0.5, "--out", "d"]
+    assert call("mjx_nero", "demos", *argv, "--episodes", 3)[0] == 0
+    code, out, err = call("mjx_nero", "demos", *argv, "--episodes", 6)
+    assert code == 0 and "3 new ones of 4 that were played" in out, err
+    one, other = open_dataset(made), open_dataset(tmp_path / "d")
+    for name in (names.QPOS, names.EXECUTED, names.SEEN):
+        np.testing.assert_array_equal(one.column(name), other.column(name))
+    code, _, err = call("mjx_nero", "demos", *argv, "--episodes", 9, "--seed", 1)
+    assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another --out" in err
+
+
+def test_it_is_shown_and_played_again(made, call):
+    code, out, err = call("mjx_nero", "demos", "--inspect", made)
+    assert code == 0, err
+    assert "6, of which 0 succeed (of 6 that were played)" in out and "60, 0.00 h" in out and "cube.z" in out
+    code, out, err = call("mjx_nero", "demos", "--replay", made, "--episode", 5)
+    assert code == 0 and "episode 5 (number 5): 10 steps, fails" in out, err
+    assert float(out.split("differs by at most ")[1].split()[0]) < 1e-4
+    code, _, err = call("mjx_nero", "demos", "--replay", made, "--episode", 6)
+    assert code == 2 and "/d has 6 episodes: --episode takes a number from 0 to 5" in err
+
+
+def test_the_guides_python_runs(made, monkeypatch, tmp_path, capsys):
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "guides" / "demonstrations.md").read_text()
+    (snippet,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "demos").mkdir()
+    (tmp_path / "demos" / "stack").symlink_to(made)
+    monkeypatch.chdir(tmp_path)
+    exec(snippet, {})
+    assert capsys.readouterr().out.startswith("6 ('joint1.pos', ")
+
+
+def test_units_of_lerobots_robots_by_hand():
+    """Of the SO-ARM101's gripper, 0 is closed and 100 open; its hinges are in degrees."""
+    low, high = np.array([-np.pi, -0.2]), np.array([np.pi, 1.8])
+    made = units.lerobot("so_arm101", [False, False], low, high, np.array([True]))
+    np.testing.assert_allclose(made.shown(np.array([np.pi / 2, 0.3])), [90, 25], rtol=1e-6)
+    assert made.names == ("deg", "%")
+    other = units.lerobot("so_arm100", [False, False], np.array([0.0, -1.8]), np.array([np.pi, 0.2]), np.array([False]))
+    np.testing.assert_allclose(other.shown(np.array([np.pi / 2, 0.2])), [0, 0], atol=1e-5)
+    back = units.from_json(json.loads(json.dumps(made.to_json())))
+    np.testing.assert_allclose(back.positions(back.shown(np.array([0.4, 1.1]))), [0.4, 1.1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ([], "demos takes one of --out DIR (write), --inspect DIR and --replay DIR"),
+        (["--out", "d", "--inspect", "d"], "demos takes one of"),
+        (["--out", "d", "--policy", "p.safetensors"], "--policy needs --agent policy"),
+        (["--out", "d", "--agent", "policy", "--through", "task"], "--through is of experts"),
+        (["--out", "d", "--agent", "juggler"], "controller 'juggler' cannot do nero_lift"),
+        (["--inspect", "d"], "d holds no demonstrations of mjx_nero: give a folder that 'demos --out' wrote"),
+        (["--video", "v.mp4", "--inspect", "d"], "--video is of the episode that is replayed"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
+    code, _, err = call("mjx_nero", "demos", *argv)
+    assert code == 2 and message in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
