@@ -107,7 +107,7 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
     """
     begun, env = time.perf_counter(), learner.env.unwrapped
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
-        waiting = [side_by_side.submit(env.physics.prepare, run.num_envs // learner.num_devices, run.num_devices)]
+        waiting = [side_by_side.submit(env.prepare, run.num_envs // learner.num_devices, run.num_devices)]
         starting = side_by_side.submit(start)
         shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
         program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
