@@ -118,6 +118,7 @@ class EnvCfg:
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
         controllers: controllers of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config
             by dotted name.
+        learner: the learner that trains the task by default.
         training: fields of the learner's config that suit the task, by dotted name.
         budget: default length of a training run.
 
@@ -145,6 +146,7 @@ class EnvCfg:
     pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     identified: str = ""
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    learner: str = "ppo"
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     budget: Budget = Budget()
 
