@@ -12,6 +12,7 @@ from mjx_nero.errors import UserError as UserError
 Key = jax.Array  # a JAX random key
 TARGET = "target"  # in ``View.objects``: the one of ``CommandTerm.targets`` that the episode commands
 LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
+LOOK = "look"  # in ``Carry.memory``: the fields of the drawn model that the episode has (``Scenery.look``); not there: none
 PHASE = "phase"  # in ``Carry.memory``: which of an expert's phases the episode began in (``Start.phase``); not there: in none
 
 

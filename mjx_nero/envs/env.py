@@ -27,14 +27,16 @@ from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import cameras, linkage, obstacles, scene, touch
+from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, PHASE, TARGET, Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, LOOK, PHASE, TARGET, Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key, so that one part's draws leave all others unchanged.
 _FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING, _VISITED = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E, 0x715173D
+_LOOK = 0x1004
 
 Starts = tuple[Bank, Float[Array, " phases"]]  # visited states, and the probabilities of their phases
 
@@ -129,7 +131,11 @@ class ManipulationEnv(Env):
         with jax.ensure_compile_time_eval():
             where, differ = self.cfg.scene, tuple(self._differing())
             kind = cameras.renderer(where.renderer, self.impl)
-            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles))
+            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), self._look.names)
+
+    @functools.cached_property
+    def _look(self) -> Look:
+        return Look(self.mj_model, self.cfg.look)
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """Prepares what steps need outside of JAX: see ``Physics.prepare``."""
@@ -220,6 +226,9 @@ class ManipulationEnv(Env):
             last = self.actions.invert(sim.ctrl, qpos[self._viewer.qpos_ids])
             memory = {**carry.memory, PHASE: start.phase}
             carry = dataclasses.replace(carry, action=jnp.where(start.phase > 0, last, carry.action), memory=memory)
+        if self.cfg.look:
+            look = self._look(jax.random.fold_in(rng, _LOOK), level)
+            carry = dataclasses.replace(carry, memory={**carry.memory, LOOK: look})
         if self.cfg.obstacles:  # drawn last, between the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
             sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
@@ -291,7 +300,8 @@ class ManipulationEnv(Env):
 
     def _scenery(self, sim: Sim, carry: Carry) -> Scenery:
         goal, _ = self._viewer.goal(carry)
-        return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._appearances(sim, carry))
+        boxes, look = self._obstacles.views(sim.fields), carry.memory.get(LOOK, {})
+        return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
 
     def _pictures(self, sim: Sim, carry: Carry) -> dict[str, Picture]:
         return self.cameras(sim, self._scenery(sim, carry))

@@ -113,6 +113,7 @@ class EnvCfg:
         randomization: draws of model fields, anew in every episode (``mdp.randomization``).
         sensors: errors between the true state and the ``sensed`` observation groups, in this order (``mdp.sensors``). Unlike
             observation noise, they are always on.
+        look: draws of what the scene's cameras see, anew in every episode (``mdp.looks``). They move nothing.
         obstacles: draws where the scene's obstacles stand, after each episode's start and goal (``mdp.obstacles``).
         pushes: sudden velocities added to objects (``mdp.pushes``).
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
@@ -142,6 +143,7 @@ class EnvCfg:
     episode_length_s: Positive = 5.0  # [s]
     randomization: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     sensors: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    look: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     obstacles: Term | None = None
     pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     identified: str = ""
@@ -160,6 +162,8 @@ class EnvCfg:
         ):
             if unknown := [name for name in names if name not in valid]:
                 raise UserError(f"{what} names {', '.join(unknown)}: not one of {', '.join(valid)}")
+        if self.look and not self.scene.cameras:
+            raise UserError(f"look.{next(iter(self.look))} changes what cameras see, and the scene has none (scene.cameras)")
         if targets and TARGET in self.scene.objects:
             raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
         for name, term in self.terms().items():

@@ -129,6 +129,8 @@ class Renderer:
         return self._renderer.render()
 
     def _forward(self, qpos: np.ndarray, scenery: Scenery) -> None:
+        for name, values in scenery.look.items():
+            getattr(self._model, name)[:] = values
         for name, look in scenery.objects.items():
             geom = self._model.geom(name)
             geom.size[:], geom.rgba[:] = look.size, look.rgba

@@ -108,6 +108,8 @@ class SceneCfg:
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
         look_at, view_distance: point that people's cameras look at, and their distance from it.
+        distractors: how many things that touch nothing cameras may see (``mdp.looks.places`` puts them somewhere).
+        backdrop: a wall stands behind the robot, for cameras alone.
         cameras: what terms and policies see through, by name; none cost nothing.
         renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: the first with
             MuJoCo's C library as physics, the second otherwise.
@@ -123,6 +125,8 @@ class SceneCfg:
     goal_edge: Positive = 0.03
     look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
     view_distance: Positive = 1.1
+    distractors: Annotated[int, Bounds(0, 100)] = 0
+    backdrop: bool = False
     cameras: Mapping[str, CameraCfg] = dataclasses.field(default_factory=dict)
     renderer: Annotated[str, OneOf("auto", "mujoco", "warp")] = "auto"
 
@@ -191,6 +195,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     if visuals:
         _add_visuals(spec, scene, goal, robot)
         cameras.add(spec, scene.cameras)
+        _add_props(spec, scene, robot)
     else:
         spec.discard_visual()
     spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
@@ -300,6 +305,27 @@ def _add_drives(spec: mujoco.MjSpec, drive) -> None:
         actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcelimited, actuator.forcerange = True, [-effort, effort]
         actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
+
+
+def _add_props(spec: mujoco.MjSpec, scene: SceneCfg, robot: RobotCfg) -> None:
+    """Things that are drawn alone, on a body that can be moved (though nobody does), as MuJoCo Warp takes others to stay."""
+    if not (scene.distractors or scene.backdrop):
+        return
+    body = spec.worldbody.add_body(name="props", mocap=True)
+    hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
+    shapes = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
+    for i, name in enumerate(distractors(scene)):
+        body.add_geom(name=name, type=shapes[i % 3], size=[0.03, 0.03, 0.03], pos=[0, 0, -10], rgba=[0.5, 0.5, 0.5, 1], **hidden)
+    if scene.backdrop:
+        x, y, _ = robot.base_pos
+        away = -1.0 if scene.table_center[0] >= x else 1.0
+        size, pos = [0.02, 4.0, 2.0], [x + away, y, 0.5]
+        body.add_geom(name="backdrop", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, rgba=[0.7, 0.72, 0.74, 1], **hidden)
+
+
+def distractors(scene: SceneCfg) -> tuple[str, ...]:
+    """Names of the geoms that ``SceneCfg.distractors`` counts."""
+    return tuple(f"distractor_{i}" for i in range(scene.distractors))
 
 
 def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) -> None:
