@@ -1,5 +1,7 @@
-"""A task seen through cameras: what is told of objects is left out, and pictures take its place. Presets ``rgb``, ``depth``,
-``rgbd``, and each with ``_fixed`` behind it. A teacher who is told where the objects are shows a student who is not (``learn.distill``).
+"""A task seen through cameras: pictures take the place of what is told of objects.
+
+Presets ``rgb``, ``depth``, ``rgbd``, and each with ``_fixed`` behind it. A teacher who is told where the objects are shows a
+student who is not (``learn.distill``).
 """
 
 import dataclasses

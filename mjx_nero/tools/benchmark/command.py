@@ -71,6 +71,7 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    args.learner = args.learner or registry.env_cfg(args.env, args.preset, args.robot).learner
     parser.only(dotted, learners.names(), args.learner)
     whats = cli.choices(args.what, "what", tuple(WHATS))
     _check_files(args.json, args.plot, whats)
@@ -115,7 +116,7 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--num-envs", type=_sizes, help=f"list (default: {_SIZES}; for learning the one number that train.py takes here)"
     )
-    parser.add_argument("--learner", default="ppo", help="who trains for ppo and learning (default: %(default)s)")
+    parser.add_argument("--learner", help="who trains for ppo and learning (default: the task's own)")
     parser.add_argument(
         "--num-devices", type=cli.positive, default=1, help="GPUs for ppo and learning to spread over (default: %(default)s)"
     )
@@ -138,7 +139,8 @@ def _parser() -> cli.Parser:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
-    return {"env": cfg, args.learner: run_cfg.learner_cfg(cfg, args.preset, args.learner)}
+    name = args.learner or cfg.learner
+    return {"env": cfg, name: run_cfg.learner_cfg(cfg, args.preset, name)}
 
 
 def _jobs(args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str]) -> list[_Job]:
