@@ -18,8 +18,8 @@ from mjx_nero.sim.cameras import opengl, places
 from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
 from mjx_nero.types import Scenery, Sim, UserError
 
-# Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 40 degrees from a metre above the table.
-ABOVE = CameraCfg(pos=(0.35, 0.1, 1.0), quat=(1.0, 0.0, 0.0, 0.0), fovy=40.0, kinds=KINDS)
+# Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 8 degrees from a metre above the table.
+ABOVE = CameraCfg(pos=(0.35, 0.1, 1.0), quat=(1.0, 0.0, 0.0, 0.0), fovy=8.0, kinds=KINDS)
 
 
 def with_cameras(found, **fields):
@@ -55,22 +55,27 @@ def test_a_camera_above_a_cube_sees_its_top(worlds, renderer):
     model, drawn = worlds
     seen = drawn[renderer]["above"]
     cube = seen.segmentation[0] == model.geom("cube").id
-    edge = 64 * 0.03 / (2 * 0.97 * math.tan(math.radians(20)))  # of the top, 0.97 m away [pixels]
-    assert cube.sum() == pytest.approx(edge**2, rel=0.35)
+    edge = 64 * 0.03 / (2 * 0.97 * math.tan(math.radians(4)))  # of the top, 0.97 m away [pixels]
+    assert cube.sum() == pytest.approx(edge**2, rel=0.1)
     rows, columns = np.nonzero(cube)
     assert rows.mean() == pytest.approx(31.5, abs=1) and columns.mean() == pytest.approx(31.5, abs=1)
     np.testing.assert_allclose(np.median(seen.depth[0][cube]), 0.97, atol=2e-3)
     np.testing.assert_allclose(seen.depth[0][0, 0], 1.0005, atol=3e-3)  # the table's top is drawn half a millimetre lower
     red, green, blue = seen.rgb[0][cube].mean(0)
-    assert red > 1.5 * green and red > 1.5 * blue
+    assert red > 1.3 * green and red > 1.3 * blue
 
 
 @pytest.mark.parametrize("camera", ["above", "front", "wrist"])
 def test_both_renderers_draw_the_same(worlds, camera):
-    """The mean difference of a colour is below 3 of 255, 1% of pixels may be another thing (edges), depths agree to 5 mm."""
+    """Colours differ by less than 4 of 255 in the mean; 4% of pixels may by more than 24, and 1% show another thing: edges. Of
+    what is the same thing, 99% of the depths agree to 5 mm.
+
+    OpenGL shades vertices, the ray tracer pixels.
+    """
     one, other = (worlds[1][name][camera] for name in ("mujoco", "warp"))
     colors = np.abs(one.rgb.astype(int) - other.rgb)
-    assert colors.mean() < 3 and (colors.max(-1) > 24).mean() < 0.02
+    assert colors.mean() < 4
+    assert (colors.max(-1) > 24).mean() < 0.04
     same = one.segmentation == other.segmentation
     assert same.mean() > 0.99
     assert np.percentile(np.abs(one.depth - other.depth)[same], 99) < 5e-3
@@ -103,7 +108,7 @@ def test_default_cameras_see_the_cube_and_the_hand():
 def pictured():
     """Two environments on MuJoCo's renderer, of episodes of three steps."""
     env = mjx_nero.make(
-        "nero_lift", "rgb", impl="native", num_envs=2, **{"episode_length_s": 0.06, "scene.cameras.front.size": (16, 16)}
+        "nero_lift", "rgb_fixed", impl="native", num_envs=2, **{"episode_length_s": 0.06, "scene.cameras.front.size": (16, 16)}
     )
     return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step_and_reset))
 

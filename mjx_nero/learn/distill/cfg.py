@@ -43,7 +43,8 @@ class DistillCfg:
     unroll_length: Annotated[int, Bounds(1, 10_000)] = 16  # control steps of every environment an iteration
     minibatch_size: Annotated[int, Bounds(1)] = 2048  # env steps of an update
     num_epochs: Annotated[int, Bounds(1, 1_000)] = 1  # times that an iteration learns from its steps
-    learning_rate: Annotated[float, Bounds(0.0, 1.0, above=True)] = 1e-3  # of Adam
+    learning_rate: Annotated[float, Bounds(0.0, 1.0, above=True)] = 1e-3  # of Adam, at first
+    last_rate: Share = 0.1  # share of it that is left in the end, when all env steps are made
     max_grad_norm: Positive = 1.0  # longer gradients are shortened to this
     teacher_share: Share = 0.1  # of the environments in which the teacher acts in the end: it shows what the student never does
     teacher_first: Annotated[int, Bounds(0, 1_000_000)] = 20  # iterations in which its share falls to that from 1

@@ -45,6 +45,7 @@ class TrainState:
     env_state: State
     key: Key
     iteration: Int[Array, ""]
+    pace: Float[Array, ""]  # factor of the learning rate, below 1 once a run has diverged
 
 
 @struct.dataclass
@@ -92,7 +93,9 @@ class Learner:
         carry = env_state.info["carry"]
         phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
         env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
-        state = TrainState(normalizer, params, self._optimizer.init(params), env_state, key, jnp.zeros((), jnp.int32))
+        state = TrainState(
+            normalizer, params, self._optimizer.init(params), env_state, key, jnp.zeros((), jnp.int32), jnp.ones(())
+        )
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)  # none weakly typed, as ``run`` gives none back
 
     def place(self, state: TrainState) -> TrainState:
@@ -104,15 +107,13 @@ class Learner:
         return state.normalizer, state.params
 
     def with_policy(self, state: TrainState, params: tuple[Any, Any]) -> TrainState:
-        """A fresh state that starts from a student; the teacher does not begin."""
+        """Starts a fresh state from a student."""
         normalizer, params = params
-        return dataclasses.replace(state, normalizer=normalizer, params=params, iteration=jnp.asarray(state.iteration))
+        return dataclasses.replace(state, normalizer=normalizer, params=params)
 
     def slower(self, state: TrainState) -> TrainState:
         """A tenth of the learning rate, and other draws."""
-        clip, adam = state.opt_state
-        adam = adam._replace(hyperparams={**adam.hyperparams, "learning_rate": 0.1 * adam.hyperparams["learning_rate"]})
-        return dataclasses.replace(state, opt_state=(clip, adam), key=jax.random.fold_in(state.key, 1))
+        return dataclasses.replace(state, pace=0.1 * state.pace, key=jax.random.fold_in(state.key, 1))
 
     def act(self, params: tuple[Any, Any], obs: Observation) -> jax.Array:
         """The student's action."""
@@ -152,7 +153,13 @@ class Learner:
         normalizer = running_statistics.update(state.normalizer, {name: batch.obs[name] for name in (SENSED, TRUTH)})
         state = dataclasses.replace(state, normalizer=normalizer)
         params, opt_state, metrics = self._update(state, batch, k_update)
-        return TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1), {**sums, **metrics}
+        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, state.pace)
+        return state, {**sums, **metrics}
+
+    def _rate(self, state: TrainState) -> Float[Array, ""]:
+        done = state.iteration * self.steps_per_iteration / max(1, self.cfg.num_timesteps)
+        left = jnp.where(self.cfg.num_timesteps > 0, jnp.clip(1.0 - done, 0.0, 1.0), 1.0)
+        return self.cfg.learning_rate * state.pace * (self.cfg.last_rate + (1.0 - self.cfg.last_rate) * left)
 
     def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
         """Acts for ``unroll_length`` steps in every environment, labelled by the teacher.
@@ -202,10 +209,12 @@ class Learner:
             updates, opt_state = self._optimizer.update(grads, opt_state)
             return (optax.apply_updates(params, updates), opt_state), metrics
 
+        clip, adam = state.opt_state
+        adam = adam._replace(hyperparams={**adam.hyperparams, "learning_rate": self._rate(state)})
         count, epochs = self.steps_per_iteration, self.cfg.num_epochs
         orders = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(key, epochs))
         orders = orders.reshape(epochs * self._minibatches, -1)
-        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.opt_state), orders)
+        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, (clip, adam)), orders)
         return params, opt_state, {name: jnp.mean(value) for name, value in metrics.items()}
 
 

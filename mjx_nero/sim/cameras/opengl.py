@@ -5,6 +5,7 @@ import contextlib
 import copy
 import itertools
 import math
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -42,6 +43,7 @@ class OpenGL:
         ]
         self._data: Any = None
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        weakref.finalize(self, _close, self._thread, self._renderers)
         self._thread.submit(self._open).result()
 
     def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
@@ -103,6 +105,14 @@ class OpenGL:
         if kind == "segmentation":
             return np.where(image[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, image[..., 0], -1)
         return image
+
+
+def _close(thread: concurrent.futures.ThreadPoolExecutor, renderers: Mapping[Any, mujoco.Renderer]) -> None:
+    """Frees contexts in the thread that made them: another may not."""
+    with contextlib.suppress(RuntimeError):  # the interpreter ends, and everything with it
+        for renderer in renderers.values():
+            thread.submit(renderer.close)
+        thread.shutdown()
 
 
 @contextlib.contextmanager

@@ -12,9 +12,10 @@ from mjx_nero.envs.task import EnvCfg
 from mjx_nero.sim.cameras import places
 from mjx_nero.types import Picture
 
-WORLDS = 8
-_STEPS, _EVERY = 40, 20  # control steps with random actions; between two of them
-_EDGE = 192  # of a picture on the sheet, about [pixels]
+WORLDS = 32
+_STEPS, _EVERY = 40, 40  # control steps with random actions; between two pictures
+_COLUMNS = 8
+_EDGE = 128  # of a picture on the sheet, about [pixels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,13 +62,13 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
 
 
 def sheet(seen: Seen) -> np.ndarray:
-    """All colour pictures in one, uint8 [height, width, 3]: a row of worlds a camera and moment."""
+    """Puts all colour pictures into one, uint8 [height, width, 3], camera after camera."""
     rows = []
     for picture in seen.pictures.values():
         times = max(1, _EDGE // max(picture.rgb.shape[1:3]))
         large = picture.rgb.repeat(times, 1).repeat(times, 2)
         large = np.pad(large, ((0, 0), (0, 4), (0, 4), (0, 0)), constant_values=255)
-        rows += [np.concatenate(list(large[at : at + WORLDS]), axis=1) for at in range(0, len(large), WORLDS)]
+        rows += [np.concatenate(list(large[at : at + _COLUMNS]), axis=1) for at in range(0, len(large), _COLUMNS)]
     width = max(row.shape[1] for row in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows])
 
