@@ -5,13 +5,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mjx_nero.errors import UserError as UserError
 
 Key = jax.Array  # a JAX random key
 TARGET = "target"  # in ``View.objects``: the one of ``CommandTerm.targets`` that the episode commands
 LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
+LOOK = "look"  # in ``Carry.memory``: the fields of the drawn model that the episode has (``Scenery.look``); not there: none
 PHASE = "phase"  # in ``Carry.memory``: which of an expert's phases the episode began in (``Start.phase``); not there: in none
 
 
@@ -122,10 +123,20 @@ class Scenery:
     goal_quat_w: Float[Array, "*n 4"]
     obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
     objects: dict[str, Appearance] = struct.field(default_factory=dict)  # by name, those that differ from the model
+    look: dict[str, Array] = struct.field(default_factory=dict)  # further fields of the drawn model, by MuJoCo's names
 
     def __getitem__(self, at: Any) -> "Scenery":
         """Selects steps or environments."""
         return jax.tree.map(lambda x: x[at], self)
+
+
+@struct.dataclass
+class Picture:
+    """What a camera saw, of each kind that it was asked for; None: it was not."""
+
+    rgb: UInt8[Array, "*n height width 3"] | None = None
+    depth: Float[Array, "*n height width"] | None = None  # along the camera's axis [m]; 0: nothing is there
+    segmentation: Int[Array, "*n height width"] | None = None  # the geom of ``ManipulationEnv.mj_model``; -1: none
 
 
 @struct.dataclass
@@ -158,6 +169,7 @@ class View:
     # What the scene's sensors measured in this step, by name. ``touch``: the strongest contact with an obstacle, or of the robot
     # with itself [N].
     readings: dict[str, Array] = struct.field(default_factory=dict)
+    cameras: dict[str, Picture] = struct.field(default_factory=dict)  # by name; what no term reads is not drawn
     # Which of ``CommandTerm.targets`` is commanded; None: there are none.
     target: Int[Array, ""] | None = None
     max_steps: int = struct.field(pytree_node=False, default=0)

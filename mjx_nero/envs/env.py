@@ -5,7 +5,7 @@ It is one long class because ``reset`` and ``step`` share all their parts, and o
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mjx_nero.sim.quiet  # noqa: F401
@@ -26,15 +26,17 @@ from mjx_nero.mdp import events, terms
 from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.success import Hold
-from mjx_nero.sim import linkage, obstacles, scene, touch
+from mjx_nero.sim import cameras, linkage, obstacles, scene, touch
+from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
-from mjx_nero.sim.physics import Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, PHASE, TARGET, Appearance, Bank, Carry, Key, Scenery, Sim, Start, UserError, View
+from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
+from mjx_nero.types import LEVEL, LOOK, PHASE, TARGET, Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key, so that one part's draws leave all others unchanged.
 _FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING, _VISITED = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E, 0x715173D
+_LOOK = 0x1004
 
 Starts = tuple[Bank, Float[Array, " phases"]]  # visited states, and the probabilities of their phases
 
@@ -84,7 +86,10 @@ class ManipulationEnv(Env):
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
-        self._viewer = Viewer(model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.command, self._obstacles)
+        sees = self._pictures if cfg.scene.cameras else None
+        self._viewer = Viewer(
+            model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.command, self._obstacles, sees
+        )
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
@@ -119,6 +124,31 @@ class ManipulationEnv(Env):
     def mj_model(self) -> mujoco.MjModel:
         """The whole scene compiled for MuJoCo, with visual shapes, lights and cameras, for rendering and inspection."""
         return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
+
+    @functools.cached_property
+    def cameras(self) -> cameras.Cameras:
+        """The scene's cameras; made when something is first drawn."""
+        with jax.ensure_compile_time_eval():
+            where, differ = self.cfg.scene, tuple(self._differing())
+            kind = cameras.renderer(where.renderer, self.impl)
+            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), self._look.names)
+
+    @functools.cached_property
+    def _look(self) -> Look:
+        return Look(self.mj_model, self.cfg.look)
+
+    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
+        """Prepares what steps need outside of JAX: see ``Physics.prepare``."""
+        self.physics.prepare(num_envs, num_devices)
+        if self.cfg.scene.cameras:
+            self.cameras.draw.prepare(num_envs, num_devices)
+
+    def footprint(self, num_devices: int = 1) -> Footprint:
+        """The memory that one environment needs outside of its state: see ``Physics.footprint``."""
+        need = self.physics.footprint(num_devices)
+        if not self.cfg.scene.cameras:
+            return need
+        return dataclasses.replace(need, outside=need.outside + self.cameras.draw.bytes())
 
     @property
     def action_size(self) -> int:
@@ -196,6 +226,9 @@ class ManipulationEnv(Env):
             last = self.actions.invert(sim.ctrl, qpos[self._viewer.qpos_ids])
             memory = {**carry.memory, PHASE: start.phase}
             carry = dataclasses.replace(carry, action=jnp.where(start.phase > 0, last, carry.action), memory=memory)
+        if self.cfg.look:
+            look = self._look(jax.random.fold_in(rng, _LOOK), level)
+            carry = dataclasses.replace(carry, memory={**carry.memory, LOOK: look})
         if self.cfg.obstacles:  # drawn last, between the start and the goal
             boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
             sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
@@ -262,17 +295,26 @@ class ManipulationEnv(Env):
 
     def scenery(self, state: State) -> Scenery:
         """Collects what a picture of the state shows besides the joint positions."""
-        sim, carry = state.pipeline_state, state.info["carry"]
+        return self._scenery(state.pipeline_state, state.info["carry"])
+
+    def _scenery(self, sim: Sim, carry: Carry) -> Scenery:
         goal, _ = self._viewer.goal(carry)
-        return Scenery(goal, carry.command_quat, self._obstacles.views(sim.fields), self._appearances(sim, carry))
+        boxes, look = self._obstacles.views(sim.fields), carry.memory.get(LOOK, {})
+        return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
+
+    def _pictures(self, sim: Sim, carry: Carry) -> dict[str, Picture]:
+        return self.cameras(sim, self._scenery(sim, carry))
+
+    def _differing(self) -> Mapping[str, Any]:
+        """The objects whose drawn size or colour differs from episode to episode."""
+        drawn = {"geom_size", "geom_rgba"} & {*self._randomization.names, *(obstacles.FIELDS if self.cfg.obstacles else ())}
+        return self.cfg.scene.objects if drawn or self.cfg.command.targets else {}
 
     def _appearances(self, sim: Sim, carry: Carry) -> dict[str, Appearance]:
         """Collects drawn sizes and colours of objects; the commanded one of the targets gets the goal's green."""
         fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
-        if not targets and not {"geom_size", "geom_rgba"} & set(fields):
-            return {}
         out = {}
-        for name in self.cfg.scene.objects:
+        for name in self._differing():
             geom = model.geom(name).id
             size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
             if name in targets:

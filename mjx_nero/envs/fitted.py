@@ -134,7 +134,7 @@ FITTING: dict[str, Presets] = {
 }
 ENVS: Envs = {
     "reach": (None, reach.presets()),
-    "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real)),
+    "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real, **lift.SEEN)),
     "follow_target": (None, _presets(_follow_target, default=follow_target.default, static=follow_target.static)),
     "pick_place": (None, {"default": _pick_place}),
     "reach_obstacles": (None, reach_obstacles.presets()),

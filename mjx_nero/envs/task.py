@@ -122,11 +122,13 @@ class EnvCfg:
         randomization: draws of model fields, anew in every episode (``mdp.randomization``).
         sensors: errors between the true state and the ``sensed`` observation groups, in this order (``mdp.sensors``). Unlike
             observation noise, they are always on.
+        look: draws of what the scene's cameras see, anew in every episode (``mdp.looks``). They move nothing.
         obstacles: draws where the scene's obstacles stand, after each episode's start and goal (``mdp.obstacles``).
         pushes: sudden velocities added to objects (``mdp.pushes``).
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
         controllers: controllers of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config
             by dotted name.
+        learner: the learner that trains the task by default.
         training: fields of the learner's config that suit the task, by dotted name.
         budget: default length of a training run.
 
@@ -150,10 +152,12 @@ class EnvCfg:
     episode_length_s: Positive = 5.0  # [s]
     randomization: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     sensors: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    look: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     obstacles: Term | None = None
     pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     identified: str = ""
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    learner: str = "ppo"
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     budget: Budget = Budget()
 
@@ -167,6 +171,8 @@ class EnvCfg:
         ):
             if unknown := [name for name in names if name not in valid]:
                 raise UserError(f"{what} names {', '.join(unknown)}: not one of {', '.join(valid)}")
+        if self.look and not self.scene.cameras:
+            raise UserError(f"look.{next(iter(self.look))} changes what cameras see, and the scene has none (scene.cameras)")
         if targets and TARGET in self.scene.objects:
             raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
         for name, term in self.terms().items():

@@ -1,6 +1,6 @@
 """Turns the physics state and the carry into the ``View`` that terms read."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from mjx_nero.mdp.terms import CommandTerm
 from mjx_nero.sim import kinematics
 from mjx_nero.sim.obstacles import Obstacles
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.types import TARGET, Carry, ObjectView, Sim, View
+from mjx_nero.types import TARGET, Carry, ObjectView, Picture, Sim, View
 
 
 class Viewer:
@@ -26,6 +26,7 @@ class Viewer:
         dt: duration of a control step [s].
         command: how the goal moves, and which objects may be commanded.
         obstacles: the scene's obstacles.
+        pictures: what the scene's cameras see; None: the scene has none.
 
     Attributes:
         objects: each object's addresses in qpos and qvel, by name.
@@ -40,6 +41,7 @@ class Viewer:
         dt: float,
         command: CommandTerm,
         obstacles: Obstacles,
+        pictures: Callable[[Sim, Carry], dict[str, Picture]] | None = None,
     ):
         self.qpos_ids = np.array([model.joint(j).qposadr[0] for j in robot.joints])
         self.dof_ids = np.array([model.joint(j).dofadr[0] for j in robot.joints])
@@ -49,7 +51,7 @@ class Viewer:
         self._default = np.asarray(robot.home, np.float32)
         self._root = np.asarray(robot.base_pos, np.float32)
         self._max_steps, self._dt, self._motion = max_steps, dt, command.motion
-        self._obstacles, self._targets = obstacles, command.targets
+        self._obstacles, self._targets, self._pictures = obstacles, command.targets, pictures
 
     def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
         """Returns the view after the step that ``action`` caused; ``carry.action`` is the action before it."""
@@ -79,6 +81,7 @@ class Viewer:
             encoder_bias=self._encoder_bias(sim),
             obstacles=self._obstacles.views(sim.fields),
             readings=sim.readings,
+            cameras=self._pictures(sim, carry) if self._pictures else {},
             target=target,
             max_steps=self._max_steps,
         )

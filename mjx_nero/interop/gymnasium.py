@@ -219,12 +219,20 @@ def _check_open(closed: bool, what: str, state: Any = ()) -> None:
 
 
 def _spaces(env: ManipulationEnv, group: Any) -> tuple[Any, Any]:
-    sizes, box = env.observation_size, gymnasium.spaces.Box
+    sizes = env.observation_size
     if group is not None and not (isinstance(group, str) and group in sizes):
         raise UserError(f"no observation group {values.short(group)}: choose one of {', '.join(sizes)}, or None for all")
-    boxes: dict[str, Any] = {name: box(-np.inf, np.inf, size, np.float32) for name, size in sizes.items()}
+    boxes = {name: _space(env.state_shape.obs[name]) for name in sizes}
     observations = gymnasium.spaces.Dict(boxes) if group is None else boxes[group]
-    return observations, box(*env.actions.bounds(), dtype=np.float32)
+    return observations, gymnasium.spaces.Box(*env.actions.bounds(), dtype=np.float32)
+
+
+def _space(obs: Any) -> gymnasium.spaces.Space:
+    """Of an observation group's shapes; pictures are whole numbers from 0 to 255."""
+    if isinstance(obs, dict):
+        return gymnasium.spaces.Dict({name: _space(each) for name, each in obs.items()})
+    low, high = (0, 255) if obs.dtype == np.uint8 else (-np.inf, np.inf)
+    return gymnasium.spaces.Box(low, high, obs.shape, obs.dtype.type)
 
 
 def _group(obs: Any, group: str | None) -> Any:

@@ -52,7 +52,7 @@ def check(learner: Learner) -> None:
         UserError: it does not.
     """
     Pool(_limit(learner.num_devices), *learner.footprint()).check(learner)
-    physics = learner.env.unwrapped.physics.footprint(learner.num_devices)
+    physics = learner.env.unwrapped.footprint(learner.num_devices)
     if physics.outside:
         Pool(physics.free, 0.0, _SCRATCH * physics.outside).check(learner)
 
@@ -71,7 +71,7 @@ def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) 
         UserError: it does not.
     """
     state = size(env.state_shape)
-    physics = env.physics.footprint()
+    physics = env.footprint()
     for need, there in (
         (kept + count * (_STATES * state + physics.in_program), _limit(1)),
         (count * _SCRATCH * physics.outside, physics.free),

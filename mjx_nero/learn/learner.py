@@ -92,6 +92,7 @@ class Kind:
         presets: its config for each preset of an environment; ``default`` for the others. A config is a frozen dataclass with at
             least ``num_envs`` and ``num_timesteps``, where 0 means chosen for the machine.
         policy: description in a policy's file -> (template of the policy's parameters, act function).
+        envs: number of environments that suits a CPU, and one that suits a GPU.
         fit: (config, devices at the run's start) -> the config with what their number decides, which the run keeps.
         held: prefix of the parameters' names in a policy's file -> their prefix in the learner's state, as in
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
@@ -102,6 +103,7 @@ class Kind:
     make: Callable[["Env", Any, int], Learner]
     presets: Mapping[str, Any]
     policy: Callable[[Mapping[str, Any]], tuple[Params, Act]]
+    envs: tuple[int, int] = (256, 8192)
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
     held: Mapping[str, str] = dataclasses.field(default_factory=dict)
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
@@ -109,7 +111,9 @@ class Kind:
 
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
-KINDS: Registry[Kind | str] = Registry("learner", {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.learn.clone"})
+KINDS: Registry[Kind | str] = Registry(
+    "learner", {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.learn.clone", "distill": "mjx_nero.learn.distill"}
+)
 
 
 def names() -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import math
 import pathlib
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import imageio.v2 as imageio
@@ -129,6 +129,8 @@ class Renderer:
         return self._renderer.render()
 
     def _forward(self, qpos: np.ndarray, scenery: Scenery) -> None:
+        for name, values in scenery.look.items():
+            getattr(self._model, name)[:] = values
         for name, look in scenery.objects.items():
             geom = self._model.geom(name)
             geom.size[:], geom.rgba[:] = look.size, look.rgba
@@ -175,12 +177,15 @@ def write_episodes(
     dt: float,
     cfg: VideoCfg = VideoCfg(),
     update: Callable[[int, int], None] = lambda done, total: None,
+    seen: Sequence[np.ndarray] = (),
 ) -> None:
     """Writes recorded episodes as an MP4 that plays in real time.
 
     Args:
         qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
         dt: time between steps [s].
+        seen: pictures to show in a corner, uint8 [steps, episodes, height, width, 3], one entry a camera; not if several robots
+            share a picture.
         update: called with the numbers of frames drawn and of all frames.
 
     Raises:
@@ -198,11 +203,22 @@ def write_episodes(
                     if together:
                         yield renderer.render_all(qpos[t], scenery[t])
                     else:
-                        yield renderer.render(qpos[t, k], scenery[t, k])
+                        yield inset(renderer.render(qpos[t, k], scenery[t, k]), [each[t, k] for each in seen])
                     done += 1
                     update(done, total)
 
     write_video(path, pictures(), fps=1 / (every * dt))
+
+
+def inset(frame: np.ndarray, pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Puts small pictures into the lower left corner of a frame, a third of its height each, side by side."""
+    frame, at = frame.copy(), 0
+    for picture in pictures:
+        times = max(1, len(frame) // 3 // len(picture))
+        large = picture.repeat(times, 0).repeat(times, 1)[: len(frame), : frame.shape[1] - at]
+        frame[len(frame) - len(large) :, at : at + large.shape[1]] = large
+        at += large.shape[1]
+    return frame
 
 
 def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> None:

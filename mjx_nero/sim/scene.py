@@ -11,6 +11,8 @@ import numpy as np
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive
 from mjx_nero.sim import robot_file, touch
+from mjx_nero.sim.cameras import cfg as cameras
+from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
@@ -105,7 +107,12 @@ class SceneCfg:
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
-        look_at, view_distance: point that the cameras look at, and their distance from it.
+        look_at, view_distance: point that people's cameras look at, and their distance from it.
+        distractors: how many things that touch nothing cameras may see (``mdp.looks.places`` puts them somewhere).
+        backdrop: a wall stands behind the robot, for cameras alone.
+        cameras: what terms and policies see through, by name; none cost nothing.
+        renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: the first with
+            MuJoCo's C library as physics, the second otherwise.
     """
 
     table_center: tuple[float, float] = (0.3, 0.0)
@@ -118,6 +125,10 @@ class SceneCfg:
     goal_edge: Positive = 0.03
     look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
     view_distance: Positive = 1.1
+    distractors: Annotated[int, Bounds(0, 100)] = 0
+    backdrop: bool = False
+    cameras: Mapping[str, CameraCfg] = dataclasses.field(default_factory=dict)
+    renderer: Annotated[str, OneOf("auto", "mujoco", "warp")] = "auto"
 
     def __post_init__(self):
         config.freeze(self)
@@ -183,6 +194,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         touch.add(spec, robot.base_link, scene.obstacles, tuple(scene.objects), pairs)
     if visuals:
         _add_visuals(spec, scene, goal, robot)
+        cameras.add(spec, scene.cameras)
+        _add_props(spec, scene, robot)
     else:
         spec.discard_visual()
     spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
@@ -294,6 +307,27 @@ def _add_drives(spec: mujoco.MjSpec, drive) -> None:
         actuator.ctrllimited, actuator.ctrlrange = True, spec.joint(name).range
 
 
+def _add_props(spec: mujoco.MjSpec, scene: SceneCfg, robot: RobotCfg) -> None:
+    """Things that are drawn alone, on a body that can be moved (though nobody does), as MuJoCo Warp takes others to stay."""
+    if not (scene.distractors or scene.backdrop):
+        return
+    body = spec.worldbody.add_body(name="props", mocap=True)
+    hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
+    shapes = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
+    for i, name in enumerate(distractors(scene)):
+        body.add_geom(name=name, type=shapes[i % 3], size=[0.03, 0.03, 0.03], pos=[0, 0, -10], rgba=[0.5, 0.5, 0.5, 1], **hidden)
+    if scene.backdrop:
+        x, y, _ = robot.base_pos
+        away = -1.0 if scene.table_center[0] >= x else 1.0
+        size, pos = [0.02, 4.0, 2.0], [x + away, y, 0.5]
+        body.add_geom(name="backdrop", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, rgba=[0.7, 0.72, 0.74, 1], **hidden)
+
+
+def distractors(scene: SceneCfg) -> tuple[str, ...]:
+    """Names of the geoms that ``SceneCfg.distractors`` counts."""
+    return tuple(f"distractor_{i}" for i in range(scene.distractors))
+
+
 def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) -> None:
     hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
     box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.goal_edge / 2
@@ -333,19 +367,9 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) ->
         world.add_light(pos=target - 1.1 * far * np.array(direction), dir=direction, diffuse=[color] * 3, castshadow=shadow)
     for name, direction in (("front", (0.71, -0.65, 0.28)), ("side", (0.07, -0.98, 0.17))):
         pos = target + far * np.array(direction)
-        world.add_camera(name=name, pos=pos, quat=_look_at(pos, target), fovy=42)
+        world.add_camera(name=name, pos=pos, quat=cameras.look_at(pos, target), fovy=42)
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     spec.visual.quality.shadowsize = 2048
     spec.stat.center, spec.stat.extent = target, far
-
-
-def _look_at(pos, target) -> np.ndarray:
-    """Orientation (wxyz) of a camera at ``pos`` that looks at ``target`` with world z up."""
-    back = np.subtract(pos, target) / np.linalg.norm(np.subtract(pos, target))
-    right = np.cross([0, 0, 1], back)
-    right /= np.linalg.norm(right)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).flatten())
-    return quat

@@ -98,7 +98,7 @@ def draw(played: evaluation.Played, path: pathlib.Path, cfg: render.VideoCfg) ->
     try:
         with console.drawing(console.screen(stderr=True), path.name) as update:
             model, what = played.env.mj_model, (episodes.qpos, episodes.scenery)
-            render.write_episodes(path, model, *what, played.env.dt, cfg, update)
+            render.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.pictures)
         console.wrote(screen, "video", path)
     except UserError as error:
         console.line(screen, str(error))

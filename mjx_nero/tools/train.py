@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero.envs import registry
+from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
 from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.tools import cli
@@ -14,6 +15,7 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learner.names()), _cfgs)
+    args.learner = _learner(args, registry.env_cfg(args.env, args.preset, args.robot))
     parser.only(dotted, learner.names(), args.learner)
     from mjx_nero.tools import train_run  # with Brax, which help does without
 
@@ -23,7 +25,13 @@ def main(argv: Sequence[str]) -> None:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
-    return {"env": cfg, args.learner: learner.cfg_for(args.learner, args.preset, cfg.training)}
+    name = _learner(args, cfg)
+    return {"env": cfg, name: learner.cfg_for(name, args.preset, cfg.training)}
+
+
+def _learner(args: argparse.Namespace, cfg: EnvCfg) -> str:
+    """The one that the user named, else the task's own."""
+    return args.learner or cfg.learner
 
 
 def _parser() -> cli.Parser:
@@ -31,7 +39,7 @@ def _parser() -> cli.Parser:
         prog=cli.called_as("train"), description="Trains a policy on thousands of environments in one compiled step."
     )
     parser.add_environment(registry.list_envs())
-    parser.add_argument("--learner", default="ppo", help=f"one of {', '.join(learner.names())} (default: %(default)s)")
+    parser.add_argument("--learner", help=f"one of {', '.join(learner.names())} (default: the task's own)")
     parser.add_argument("--num-envs", type=cli.positive, help="number of environments (default: 8192 on a GPU, 256 on a CPU)")
     parser.add_argument(
         "--num-timesteps",

@@ -226,7 +226,7 @@ def test_files_that_describe_no_policy(trained, tmp_path, changes, message):
 
 def test_no_policy_ships(env, monkeypatch):
     monkeypatch.setattr(policy, "ASSETS", pathlib.Path("/nowhere"))
-    with pytest.raises(UserError, match=r"^there is no bundled policy for nero_lift: train one \(python train.py --env nero_lift\)"):
+    with pytest.raises(UserError, match=r"^there is no bundled policy for nero_lift: train one \(python train.py --env"):
         policy.load_for(env, "nero_lift", None)
     with pytest.raises(UserError, match=r"train one \(python train.py --env reach --robot \./my_arm\)"):
         policy.load_for(env, "reach", None, robot="./my_arm")

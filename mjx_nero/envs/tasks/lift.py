@@ -10,6 +10,7 @@ from typing import Any
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, velocity_actions
+from mjx_nero.envs.tasks import seeing
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
 from mjx_nero.mdp.terms import (
@@ -173,10 +174,19 @@ def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     return sim2reals.randomized(dataclasses.replace(default(robot, setup), actions=velocity_actions()))
 
 
+def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:
+    """The default by pictures: nobody tells where the cube is. See ``seeing``."""
+    return seeing.seen(default(robot, setup), sees)
+
+
+SEEN = {name: functools.partial(seen, sees=name) for name in seeing.PRESETS}
+
+
 def presets(setup: LiftSetup) -> Presets:
     """Maps preset -> robot -> config, the default first."""
     return {
         "default": functools.partial(default, setup=setup),
         "isaac": functools.partial(isaac, setup=setup),
         "sim2real": functools.partial(sim2real, setup=setup),
+        **{name: functools.partial(factory, setup=setup) for name, factory in SEEN.items()},
     }

@@ -98,6 +98,11 @@ class Episodes:
         """Everything that a picture shows besides ``qpos`` [steps, k, ...]."""
         return self.record.scenery
 
+    @property
+    def pictures(self) -> list[np.ndarray]:
+        """What the policy's cameras saw in colour, uint8 [steps, k, height, width, 3], an entry a camera."""
+        return [np.asarray(x) for x in jax.tree.leaves(self.record.obs) if x.ndim == 5 and x.dtype == np.uint8]
+
     def episode(self, index: int) -> Record:
         """Returns a recorded episode up to its end [steps, ...]."""
         return self.record[: int(self.lengths[index]), index]

@@ -101,12 +101,13 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
     """
     on_cpu, budget = jax.default_backend() == "cpu", run.env.budget
     enough = budget.steps_on_cpu if on_cpu else budget.steps
+    kind = learner.find(run.learner)
     hyperparameters = dataclasses.replace(
         run.hyperparameters,
-        num_envs=run.num_envs or (256 if on_cpu else 8192),
+        num_envs=run.num_envs or kind.envs[not on_cpu],
         num_timesteps=run.num_timesteps or enough,
     )
-    hyperparameters = learner.find(run.learner).fit(hyperparameters, run.num_devices * jax.process_count())
+    hyperparameters = kind.fit(hyperparameters, run.num_devices * jax.process_count())
     asked, run = run.num_timesteps, dataclasses.replace(run, hyperparameters=hyperparameters)
     if not on_cpu:
         return run, ""

@@ -110,7 +110,7 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         UserError: the run does not fit into memory.
     """
     begun, env, spans = time.perf_counter(), learner.env.unwrapped, Spans()
-    prepare, start = spans.timed("physics", env.physics.prepare), spans.timed("first state", start)
+    prepare, start = spans.timed("physics", env.prepare), spans.timed("first state", start)
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
         waiting = [side_by_side.submit(prepare, run.num_envs // learner.num_devices, run.num_devices)]
         starting = side_by_side.submit(start)

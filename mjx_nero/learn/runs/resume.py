@@ -163,6 +163,8 @@ def _outside(asked: Asked) -> Iterator[str]:
     for name in _PATHS:
         if asked.env.get(name):
             yield str(asked.env[name])
+    if asked.learner.get("teacher"):
+        yield str(asked.learner["teacher"])
 
 
 def _as_stored(cfg: Any, stored: Any) -> Any:

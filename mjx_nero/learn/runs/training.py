@@ -158,7 +158,7 @@ def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
         with console.drawing(screen, "video.mp4") as update:
             played = act(None, run.seed)
             path, what = folder / "video.mp4", (played.qpos, played.scenery)
-            render.write_episodes(path, env.mj_model, *what, env.dt, video, update)
+            render.write_episodes(path, env.mj_model, *what, env.dt, video, update, played.pictures)
     except UserError as error:
         console.line(screen, str(error))
 

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -28,7 +28,7 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 
 # Warp's current device is the process's and not a thread's: whoever changes it keeps others from making anything meanwhile, as
 # kernels that find their arrays on another device than they were loaded for end the process.
-_WARP = threading.Lock()
+WARP = threading.Lock()
 
 
 class WarpPhysics:
@@ -126,7 +126,7 @@ class WarpPhysics:
             return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
 
         cfg, fields = self._cfg, 4 * sum(math.prod(shape) for shape in self._fields.values())
-        with _WARP, wp.ScopedDevice("cpu"):
+        with WARP, wp.ScopedDevice("cpu"):
             one = mujoco_warp.make_data(self.model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env)
         return size(one) + fields
 
@@ -135,7 +135,7 @@ class WarpPhysics:
         import warp as wp
 
         for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
-            with _WARP, wp.ScopedDevice(device):
+            with WARP, wp.ScopedDevice(device):
                 self._get(num_envs)
                 wp.synchronize_device(device)
 
@@ -160,7 +160,7 @@ class WarpPhysics:
         cfg = self._cfg
         with possible("MuJoCo Warp"):
             model = mujoco_warp.put_model(self.model)
-        drawn = self._world_fields(model, n)
+        drawn = world_fields(model, self._fields, n)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
         step, strongest = self._stepper(model, data)
@@ -252,19 +252,25 @@ class WarpPhysics:
 
         return strongest, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs)
 
-    def _world_fields(self, model: Any, n: int) -> Any:
-        """Replaces the drawn fields of the model by views of one array [n, numbers], one row a world. None without fields."""
-        import warp as wp
 
-        sizes = [math.prod(shape) for shape in self._fields.values()]
-        if not sizes:
-            return None
-        drawn, at = wp.zeros((n, sum(sizes)), dtype=float), 0
-        for name, size in zip(self._fields, sizes, strict=True):
-            kind, rows = getattr(model, name).dtype, self._fields[name][0]
-            row = drawn.strides[0]
-            item = drawn.strides[1] * size // rows
-            view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=(n, rows), strides=(row, item))
-            setattr(model, name, view)
-            at += size
-        return drawn
+def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:
+    """Replaces fields of the model by views of one array [n, numbers], one row a world. None without fields.
+
+    Args:
+        model: MuJoCo Warp's.
+        shapes: of the fields, by name.
+    """
+    import warp as wp
+
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    if not sizes:
+        return None
+    drawn, at = wp.zeros((n, sum(sizes)), dtype=float), 0
+    for name, size in zip(shapes, sizes, strict=True):
+        kind, rows = getattr(model, name).dtype, shapes[name][0]
+        row = drawn.strides[0]
+        item = drawn.strides[1] * size // rows
+        view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=(n, rows), strides=(row, item))
+        setattr(model, name, view)
+        at += size
+    return drawn

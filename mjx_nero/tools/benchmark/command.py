@@ -74,6 +74,7 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    args.learner = args.learner or registry.env_cfg(args.env, args.preset, args.robot).learner
     parser.only(dotted, learners.names(), args.learner)
     whats = cli.choices(args.what, "what", tuple(WHATS))
     _check_files(args.json, args.plot, whats)
@@ -118,7 +119,7 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--num-envs", type=_sizes, help=f"list of numbers (default: {_SIZES}; learning: the number that train.py would take)"
     )
-    parser.add_argument("--learner", default="ppo", help="learner for ppo and learning (default: %(default)s)")
+    parser.add_argument("--learner", help="learner for ppo and learning (default: the task's own)")
     parser.add_argument(
         "--num-devices", type=cli.positive, default=1, help="number of GPUs for ppo and learning (default: %(default)s)"
     )
@@ -143,7 +144,8 @@ def _parser() -> cli.Parser:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
-    return {"env": cfg, args.learner: run_cfg.learner_cfg(cfg, args.preset, args.learner)}
+    name = args.learner or cfg.learner
+    return {"env": cfg, name: run_cfg.learner_cfg(cfg, args.preset, name)}
 
 
 def begin() -> None:
@@ -153,6 +155,7 @@ def begin() -> None:
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     impl, sizes = resolve_impl(args.impl), args.num_envs or [0]
+    args.learner = args.learner or cfg.learner
     start.begin(spawned, imported, _run(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
 
 

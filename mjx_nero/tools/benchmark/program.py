@@ -81,5 +81,5 @@ def device_peak_mb() -> float | None:
 
 def warp_mb(env: ManipulationEnv) -> float | None:
     """The backend's own buffers for all environments, which JAX does not know of; None where it has none."""
-    outside = env.physics.footprint().outside
+    outside = env.footprint().outside
     return mb(env.num_envs * outside) if outside else None

@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero import console, files
+from mjx_nero.envs.task import EnvCfg
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tools import cli, self_test
 from mjx_nero.tools.inspection.report import environments, find, inspect, picture
@@ -23,9 +25,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
+    parser.add_argument("--cameras", type=cli.path(".png"), metavar="FILE", help="PNG of what an environment's cameras see")
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, _ = parser.parse(argv)
-    for path in filter(None, (args.render, args.json)):
+    for path in filter(None, (args.render, args.cameras, args.json)):
         files.check_writable(path)
     if args.name is None and args.robot is None:
         parser.error("name a robot, an environment or the folder of an imported robot")
@@ -49,12 +52,29 @@ def main(argv: Sequence[str]) -> None:
         with files.whole(args.render) as part:
             imageio.imwrite(part, image)
         console.wrote(screen, "picture", args.render)
+    if args.cameras:
+        if cfg is None:
+            parser.error("--cameras needs an environment: its states are what they see")
+        _see(cfg, args.cameras)
     if args.json:
         content: dict[str, Any] = {**dataclasses.asdict(report), "moves": [dataclasses.asdict(m) for m in moved]}
         content |= {"self_test": tested.json()} if tested else {}
         with files.whole(args.json) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
         console.wrote(screen, "json", args.json)
+
+
+def _see(cfg: EnvCfg, path: pathlib.Path) -> None:
+    import imageio.v3 as imageio
+
+    from mjx_nero.tools.inspection import cameras
+
+    cli.setup_jax()
+    seen, screen = cameras.see(cfg), console.screen()
+    screen.print(cameras.table(seen))
+    with files.whole(path) as part:
+        imageio.imwrite(part, cameras.sheet(seen))
+    console.wrote(screen, "cameras", path)
 
 
 def list_envs_main(argv: Sequence[str]) -> None:

@@ -1,0 +1,105 @@
+"""A task seen through cameras: pictures take the place of what is told of objects.
+
+Presets ``rgb``, ``depth``, ``rgbd``, and each with ``_fixed`` behind it. A teacher who is told where the objects are shows a
+student who is not (``learn.distill``).
+"""
+
+import dataclasses
+
+from mjx_nero.config.bounds import Range
+from mjx_nero.envs.task import Budget, EnvCfg
+from mjx_nero.mdp import images, looks, observations
+from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, Term
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.cameras import places
+from mjx_nero.sim.robot import Box
+from mjx_nero.types import UserError
+
+SIZE = (64, 64)  # pixels
+DISTRACTORS = 6
+STEPS, STEPS_ON_CPU = 20_000_000, 200_000  # env steps of a training
+_READS = {"rgb": (images.rgb, ("rgb",)), "depth": (images.depth, ("depth",)), "rgbd": (images.rgbd, ("rgb", "depth"))}
+FIXED = "_fixed"  # behind a preset's name: every episode looks the same
+PRESETS = (*_READS, *(name + FIXED for name in _READS))
+
+
+def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
+    """The task by pictures of a camera in front and one at the wrist.
+
+    Its observation groups: ``state`` has the robot and the goal alone, ``pictures`` what the cameras see, ``teacher`` what was
+    ``state`` before, and ``truth`` where the objects are.
+
+    Args:
+        sees: one of ``PRESETS``.
+
+    Raises:
+        UserError: the scene has no object, or the robot does not say where it works.
+    """
+    objects = tuple(cfg.scene.objects)
+    if not objects:
+        raise UserError(f"nothing to see: the scene of {cfg.robot.name} has no object")
+    told, (read, kinds) = cfg.observations["state"], _READS[sees.removesuffix(FIXED)]
+    cameras = places.find(cfg.robot, SIZE, kinds)
+    own = {name: term for name, term in told.terms.items() if not {"object", "objects"} & set(term.params)}
+    cfg = dataclasses.replace(
+        cfg,
+        scene=dataclasses.replace(cfg.scene, cameras=cameras),
+        observations={
+            "state": dataclasses.replace(told, terms=own),
+            "pictures": ObservationGroup({name: ObservationTerm(read, params={"camera": name}) for name in cameras}, apart=True),
+            "teacher": dataclasses.replace(told, corruption=False, sensed=False),
+            "truth": ObservationGroup(
+                {name: ObservationTerm(observations.object_position, params={"object": name}) for name in objects}, sensed=False
+            ),
+        },
+        learner="distill",
+        budget=Budget(steps=STEPS, steps_on_cpu=STEPS_ON_CPU),
+    )
+    return cfg if sees.endswith(FIXED) else randomized(cfg)
+
+
+def randomized(cfg: EnvCfg) -> EnvCfg:
+    """A task with cameras whose every episode looks different. Each range is a field of its own
+    (``--env.look.lights.params.brightness "(0.3, 2)"``, ``--env.sensors.front.params.noise 8``)."""
+    scene = dataclasses.replace(cfg.scene, distractors=DISTRACTORS, backdrop=True)
+    names, objects, there = scenes.distractors(scene), tuple(scene.objects), cfg.robot.pick or cfg.robot.workspace
+    any_color = {"change": 1.0, "shade": (0.3, 1.2)}
+    poses = {
+        f"{name}_pose": Term(
+            looks.camera_pose, params={"cameras": (name,), "offset": 0.02 if not c.link else 0.005, "turn": 0.04}
+        )
+        for name, c in scene.cameras.items()
+    }
+    beside = {
+        f"props_{side}": Term(
+            looks.places, params={"geoms": names[i::2], **_beside(there, cfg.robot.base_pos, side), "there": 0.6}
+        )
+        for i, side in enumerate(("left", "right"))
+    }
+    lens = {"exposure": (0.7, 1.3), "white_balance": 0.1, "blur": 0.5, "noise": 4.0, "delay": (0, 1), "hold": 0.9}
+    lens |= {"depth_noise": 0.005, "depth_step": 0.001, "holes": 0.02}
+    return dataclasses.replace(
+        cfg,
+        scene=scene,
+        look={
+            **cfg.look,
+            **poses,
+            "fovy": Term(looks.camera_fovy, params={"cameras": tuple(scene.cameras), "scale": (0.95, 1.05)}),
+            "lights": Term(looks.lights, params={"turn": 0.5, "brightness": (0.4, 1.4), "tint": 0.15, "dark": 0.2}),
+            "table": Term(looks.colors, params={"geoms": ("table_top",), **any_color}),
+            "backdrop": Term(looks.colors, params={"geoms": ("backdrop",), **any_color}),
+            "robot": Term(looks.materials, params={"change": 0.3, "shade": (0.6, 1.3)}),
+            "objects": Term(looks.colors, params={"geoms": objects, "change": 0.15, "shade": (0.7, 1.2)}),
+            "props_color": Term(looks.colors, params={"geoms": names, **any_color}),
+            "props_size": Term(looks.sizes, params={"geoms": names, "scale": (0.4, 1.5)}),
+            **beside,
+        },
+        sensors={**cfg.sensors, **{f"lens_{name}": Term(images.Lens, params={"camera": name, **lens}) for name in scene.cameras}},
+    )
+
+
+def _beside(there: Box, base: tuple[float, float, float], side: str) -> dict[str, Range]:
+    """A region of the table, in the world, beside the one where objects are."""
+    (low_x, high_x), (low, high), _ = there
+    y = (high + 0.06, high + 0.3) if side == "left" else (low - 0.3, low - 0.06)
+    return {"x": (base[0] + low_x - 0.15, base[0] + high_x + 0.15), "y": (base[1] + y[0], base[1] + y[1]), "z": (0.0, 0.03)}

@@ -1,0 +1,87 @@
+"""The student's networks: made by a config, rebuilt from what a policy's file says of them."""
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics, specs
+from flax import linen
+
+from mjx_nero.config.values import read
+from mjx_nero.learn.distill.cfg import StudentCfg
+from mjx_nero.learn.learner import Act, Observation
+from mjx_nero.types import Key
+
+SENSED, SEEN, TRUTH = "state", "pictures", "truth"  # observation groups: what it reads, and what else it predicts
+_MOST = 10.0  # bound on normalised observations
+
+
+class Eye(linen.Module):
+    """Convolutions that make features [..., n] of a picture [..., height, width, channels]; whole numbers are colours to 255.
+
+    They compute in bfloat16, their parameters are float32.
+    """
+
+    channels: tuple[int, ...]
+    features: int
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        scale = 1 / 255 if x.dtype == jnp.uint8 else 1.0
+        x = x.astype(jnp.bfloat16) * scale - 0.5
+        for i, count in enumerate(self.channels):
+            edge = 3 if i else 5
+            x = linen.relu(linen.Conv(count, (edge, edge), strides=2, dtype=jnp.bfloat16)(x))
+        x = x.reshape(*x.shape[:-3], -1)
+        return linen.relu(linen.Dense(self.features, dtype=jnp.bfloat16)(x)).astype(jnp.float32)
+
+
+class Student(linen.Module):
+    """(what is sensed [..., n], pictures by camera) -> action [..., na], and where the objects are.
+
+    Attributes:
+        action_size, truth_size: how many numbers these are.
+    """
+
+    cfg: StudentCfg
+    action_size: int
+    truth_size: int
+
+    @linen.compact
+    def __call__(self, sensed: jax.Array, pictures: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        cfg = self.cfg
+        features = [Eye(tuple(cfg.channels), cfg.features, name=f"eye_{name}")(pictures[name]) for name in sorted(pictures)]
+        x = jnp.concatenate([*features, sensed], axis=-1)
+        truth = linen.Dense(self.truth_size, name="truth")(linen.elu(linen.Dense(cfg.layers[-1], name="where")(x)))
+        for size in cfg.layers:
+            x = linen.elu(linen.Dense(size)(x))
+        return linen.Dense(self.action_size, kernel_init=linen.initializers.normal(0.01), name="action")(x), truth
+
+
+def init_params(net: Student, sizes: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
+    """Fresh (statistics of what is sensed and of the truth, the network's parameters)."""
+    shapes = {name: specs.Array(tuple(sizes[name]), jnp.dtype("float32")) for name in (SENSED, TRUTH)}
+    normalizer = running_statistics.init_state(shapes).replace(std_eps=jnp.float32(1e-4))
+    pictures = {name: jnp.zeros((1, *shape)) for name, shape in sizes[SEEN].items()}
+    return normalizer, net.init(key, jnp.zeros((1, *sizes[SENSED])), pictures)
+
+
+def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.Array, jax.Array]:
+    """Action, and where the objects are in units of their deviation."""
+    normalizer, variables = params
+    of_sensed = running_statistics.NestedMeanStd(mean=normalizer.mean[SENSED], std=normalizer.std[SENSED])
+    sensed = running_statistics.normalize(obs[SENSED], of_sensed, max_abs_value=_MOST)
+    return net.apply(variables, sensed, obs[SEEN])
+
+
+def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
+    """The student that a policy file describes: a template of its parameters, and how it acts."""
+    sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=lambda node: isinstance(node, list | tuple))
+    net = Student(read(StudentCfg, meta["student"], "student"), meta["action_size"], sizes[TRUTH][0])
+    template = jax.eval_shape(functools.partial(init_params, net, sizes), jax.random.PRNGKey(0))
+    return template, lambda params, obs: apply(net, params, obs)[0]

@@ -1,0 +1,51 @@
+"""Who teaches: a policy that is told what the student has to see."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.learn import checkpoint, header, policy
+from mjx_nero.sim.fingerprint import fingerprint
+from mjx_nero.sim.robot import ASSETS
+
+GROUP = "teacher"  # the observation group that it reads, as its own ``state``
+
+
+def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
+    """The teacher's policy.
+
+    Args:
+        given: its file; empty: of the bundled policies the one that reads and does the same with the same robot.
+
+    Raises:
+        UserError: there is none, or it does not fit.
+    """
+    if GROUP not in env.cfg.observations:
+        raise UserError(f"distillation needs the observation group {GROUP!r}, what the teacher is told: pass --preset rgb")
+    if given:
+        found = policy.load(pathlib.Path(given))
+        if fault := _misfit(found.meta, env):
+            raise UserError(f"{given} cannot teach here: {fault}")
+        return found
+    bundled = [(checkpoint.load_meta(path), path) for path in sorted((ASSETS / "policies").glob("*.safetensors"))]
+    able = [path for meta, path in bundled if meta["preset"] == "default" and not _misfit(meta, env)]
+    if not able:
+        raise UserError(
+            f"no bundled policy can teach {env.cfg.robot.name} this task: train one with the task's default preset, and pass "
+            "--distill.teacher RUN/policy.safetensors"
+        )
+    return policy.load(able[0])
+
+
+def _misfit(meta: Mapping[str, Any], env: ManipulationEnv) -> str:
+    """Why the policy cannot label; empty if it can."""
+    robot, told = env.cfg.robot, list(env.cfg.observations[GROUP].terms)
+    if meta.get("robot") != robot.name or meta.get("fingerprint") != fingerprint(robot):
+        return f"it is of another robot ({meta.get('robot')}; here {robot.name})"
+    if meta["observations"]["state"] != told or meta["observation_size"]["state"] != list(env.observation_size[GROUP]):
+        return f"it reads other observations (here {', '.join(told)})"
+    if meta["action_size"] != env.action_size or not header.acts_alike(meta, {"actions": env.action_kinds}):
+        return "it acts in another way"
+    return ""

@@ -1,0 +1,88 @@
+"""What an episode looks like: (key, model, *, params) -> {field: (rows, values)}, as ``mdp.randomization`` for the drawn model.
+
+Rows are cameras, lights, geoms and materials. None of it moves anything: physics has another model.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_nero import math
+from mjx_nero.config.bounds import NonNegative, PositiveRange, Range, Share
+from mjx_nero.mdp.randomization import Drawn, Model
+from mjx_nero.types import Key
+
+
+def camera_pose(key: Key, model: Model, *, cameras: tuple[str, ...], offset: NonNegative, turn: NonNegative) -> Drawn:
+    """Moves cameras by up to ``offset`` along each axis [m], and turns them by up to ``turn`` about each of their own [rad]."""
+    rows = model.rows("camera", cameras)
+    k_offset, k_turn = jax.random.split(key)
+    pos = model.fields["cam_pos"][rows] + offset * _within(k_offset, (len(rows), 3))
+    turned = jax.vmap(math.quat_exp)(turn * _within(k_turn, (len(rows), 3)))
+    quat = jax.vmap(math.quat_mul)(model.fields["cam_quat"][rows], turned)
+    return {"cam_pos": (rows, pos), "cam_quat": (rows, quat)}
+
+
+def camera_fovy(key: Key, model: Model, *, cameras: tuple[str, ...], scale: PositiveRange) -> Drawn:
+    """Multiplies the cameras' vertical fields of view by a uniform factor each."""
+    rows = model.rows("camera", cameras)
+    return {
+        "cam_fovy": (rows, model.fields["cam_fovy"][rows] * jax.random.uniform(key, rows.shape, minval=scale[0], maxval=scale[1]))
+    }
+
+
+def lights(key: Key, model: Model, *, turn: NonNegative, brightness: PositiveRange, tint: Share, dark: Share = 0.0) -> Drawn:
+    """Turns every light by up to ``turn`` about each axis [rad], multiplies its brightness by a uniform factor, and its colour by
+    one of up to 1 +- ``tint`` a channel; with the chance ``dark`` one is out."""
+    rows = np.arange(len(model.fields["light_dir"]))
+    k_turn, k_bright, k_tint, k_dark = jax.random.split(key, 4)
+    turned = jax.vmap(math.quat_exp)(turn * _within(k_turn, (len(rows), 3)))
+    direction = jax.vmap(math.rotate)(turned, model.fields["light_dir"][rows])
+    factor = jax.random.uniform(k_bright, (len(rows), 1), minval=brightness[0], maxval=brightness[1])
+    factor *= 1 - jax.random.bernoulli(k_dark, dark, (len(rows), 1))
+    color = model.fields["light_diffuse"][rows] * factor * (1 + tint * _within(k_tint, (len(rows), 3)))
+    return {"light_dir": (rows, direction), "light_diffuse": (rows, color)}
+
+
+def colors(key: Key, model: Model, *, geoms: tuple[str, ...], change: Share, shade: PositiveRange = (1.0, 1.0)) -> Drawn:
+    """Moves the colours of geoms towards random ones by a uniform share of up to ``change``, and multiplies them by ``shade``."""
+    rows = model.rows("geom", geoms)
+    return {"geom_rgba": (rows, _recolored(key, model.fields["geom_rgba"][rows], change, shade))}
+
+
+def materials(key: Key, model: Model, *, change: Share, shade: PositiveRange = (1.0, 1.0)) -> Drawn:
+    """Does the same to all materials: those of the robot."""
+    rows = np.arange(len(model.fields["mat_rgba"]))
+    return {"mat_rgba": (rows, _recolored(key, model.fields["mat_rgba"][rows], change, shade))}
+
+
+def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range, z: Range, there: Share = 1.0) -> Drawn:
+    """Puts geoms that touch nothing somewhere, turned about the vertical; those that are not ``there``, far below the table."""
+    rows = model.rows("geom", geoms)
+    k_pos, k_turn, k_there = jax.random.split(key, 3)
+    low, high = (jnp.array(ends) for ends in zip(x, y, z, strict=True))
+    pos = low + (high - low) * jax.random.uniform(k_pos, (len(rows), 3))
+    pos = pos.at[:, 2].add(jnp.where(jax.random.bernoulli(k_there, there, rows.shape), 0.0, -10.0))
+    half = jnp.pi / 2 * _within(k_turn, rows.shape)
+    zero = jnp.zeros_like(half)
+    return {"geom_pos": (rows, pos), "geom_quat": (rows, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=1))}
+
+
+def sizes(key: Key, model: Model, *, geoms: tuple[str, ...], scale: PositiveRange) -> Drawn:
+    """Multiplies each edge of drawn geoms by a uniform factor of its own."""
+    rows = model.rows("geom", geoms)
+    factor = jax.random.uniform(key, (len(rows), 3), minval=scale[0], maxval=scale[1])
+    return {"geom_size": (rows, model.fields["geom_size"][rows] * factor)}
+
+
+def _within(key: Key, shape: tuple[int, ...]) -> Array:
+    return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+
+
+def _recolored(key: Key, rgba: Float[Array, "n 4"], change: float, shade: tuple[float, float]) -> Float[Array, "n 4"]:
+    k_color, k_share, k_shade = jax.random.split(key, 3)
+    share = change * jax.random.uniform(k_share, (len(rgba), 1))
+    color = rgba[:, :3] + share * (jax.random.uniform(k_color, (len(rgba), 3)) - rgba[:, :3])
+    color *= jax.random.uniform(k_shade, (len(rgba), 1), minval=shade[0], maxval=shade[1])
+    return rgba.at[:, :3].set(jnp.clip(color, 0.0, 1.0))

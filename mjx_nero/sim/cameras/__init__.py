@@ -1,0 +1,93 @@
+"""Cameras of a scene: what they see, as arrays, for terms and policies.
+
+A drawer is one module with one class; ``make`` picks it. All of them draw the same visual model, and give the same ``Picture``.
+"""
+
+import copy
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array
+
+from mjx_nero.sim.cameras.cfg import CameraCfg
+from mjx_nero.types import Picture, Scenery, Sim
+
+_DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
+_UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
+
+
+class Drawer(Protocol):
+    """Draws what the cameras of a model see."""
+
+    def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
+        """Draws the pictures of one world, by camera; vmap it for many. Pure.
+
+        Args:
+            qpos: [nq].
+            fields: the drawn model's fields that differ from world to world, by MuJoCo's names.
+        """
+        ...
+
+    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
+        """See ``physics.Physics.prepare``."""
+        ...
+
+    def bytes(self) -> int:
+        """Returns the memory that one world takes outside of JAX's."""
+        ...
+
+
+class Cameras:
+    """What the cameras of a scene see of a world.
+
+    Args:
+        model: the scene with visual shapes, from ``scene.build``.
+        cfg: the cameras by name.
+        renderer: ``mujoco`` (OpenGL) or ``warp`` (MuJoCo Warp's ray tracer).
+        objects, obstacles: names of those whose size, place or colour differs from world to world.
+        fields: names of further fields of the model that do (``Scenery.look``).
+
+    Raises:
+        UserError: this machine cannot draw them.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        cfg: Mapping[str, CameraCfg],
+        renderer: str,
+        objects: Sequence[str] = (),
+        obstacles: Sequence[str] = (),
+        fields: Sequence[str] = (),
+    ):
+        model = copy.copy(model)
+        model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
+        self._objects = {name: int(model.geom(name).id) for name in objects}
+        self._obstacles = {name: int(model.geom(name).id) for name in obstacles}
+        names = [*(("geom_size", "geom_rgba") if objects else ()), *(("geom_pos", "geom_quat", "geom_size") if obstacles else ())]
+        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in dict.fromkeys((*names, *fields))}
+        module, kind = _DRAWERS[renderer]
+        self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
+
+    def __call__(self, sim: Sim, scenery: Scenery) -> dict[str, Picture]:
+        """Returns the pictures by camera."""
+        now = {name: jnp.asarray(scenery.look.get(name, value)) for name, value in self._nominal.items()}
+        for name, geom in self._objects.items():
+            look = scenery.objects[name]
+            now["geom_size"] = now["geom_size"].at[geom].set(look.size)
+            now["geom_rgba"] = now["geom_rgba"].at[geom].set(look.rgba)
+        for name, geom in self._obstacles.items():
+            box = scenery.obstacles[name]
+            for field, value in (("geom_pos", box.pos_w), ("geom_quat", box.quat_w), ("geom_size", box.size / 2)):
+                now[field] = now[field].at[geom].set(value)
+        return self.draw(sim.qpos, now)
+
+
+def renderer(asked: str, impl: str) -> str:
+    """Returns the renderer that ``SceneCfg.renderer`` and the physics' ``impl`` stand for."""
+    return ("mujoco" if impl == "native" else "warp") if asked == "auto" else asked

@@ -1,0 +1,111 @@
+"""Where a robot's cameras go if nobody says: found from the robot's shapes and from where it works."""
+
+import functools
+import itertools
+
+import mujoco
+import numpy as np
+
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.cameras.cfg import CameraCfg, look_at
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError
+
+Size = tuple[int, int]
+Cameras = dict[str, CameraCfg]
+
+_FRONT = np.array([1.0, -0.45, 0.75])  # from where it works towards the camera, ahead of the robot: it hides little from there
+_MARGIN = 0.04  # around where it works [m]
+_ASIDE = (0.05, 0.07, 0.09, 0.12, 0.15)  # how far from the hand's axis a camera may be [m]
+_BEHIND = (0.02, 0.06, 0.1, 0.14)  # ... and behind the grasp point
+_AHEAD = 0.03  # the wrist's camera looks at what is that far ahead of the grasp point [m]
+_CLEAR = 0.012  # what is nearer to a point than that is the point's own [m]
+_FREE = 0.01  # around a camera [m]
+_EQUAL = 4  # places that see so many points more or less are equal
+
+
+def find(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",)) -> Cameras:
+    """Finds a camera in front and one at the wrist.
+
+    Raises:
+        UserError: the robot does not say where it works.
+    """
+    return {"front": front(robot, size, kinds), "wrist": wrist(robot, size, kinds)}
+
+
+def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 45.0) -> CameraCfg:
+    """A camera in the world, opposite the robot, as near as it can be and see all of where the robot grasps and holds.
+
+    Raises:
+        UserError: the robot does not say where that is.
+    """
+    boxes = [np.array(box) for box in (robot.pick or robot.workspace, robot.hold or robot.workspace) if box]
+    if not boxes:
+        raise UserError(f"{robot.name} does not say where it works (workspace, pick, hold): give scene.cameras poses of your own")
+    low, high = np.min([b[:, 0] for b in boxes], axis=0) - _MARGIN, np.max([b[:, 1] for b in boxes], axis=0) + _MARGIN
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True)))) + robot.base_pos
+    center = corners.mean(0)
+    ahead = _FRONT * np.array([np.sign(center[0] - robot.base_pos[0]) or 1.0, 1.0, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    half = np.tan(np.deg2rad(fovy / 2))
+    for far in np.arange(0.2, 5.0, 0.01):
+        pos = center + far * ahead
+        quat = look_at(pos, center)
+        x, y, z = _rotation(quat).T @ (corners - pos).T
+        if (z < 0).all() and (np.abs(y) <= -z * half).all() and (np.abs(x) <= -z * half * size[0] / size[1]).all():
+            break
+    return CameraCfg(pos=_tuple(pos), quat=_tuple(quat), fovy=fovy, size=size, kinds=kinds)
+
+
+@functools.cache
+def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 75.0) -> CameraCfg:
+    """A camera on the hand that looks past the fingers: of many places the one that sees most of what is between and ahead of
+    them, with the fingers open and closed; of equals the highest at home, as it sees the table, then the nearest to the hand."""
+    model = scenes.robot_model(robot, whole=True)
+    site = model.site(robot.ee_site).id
+    body = int(model.site_bodyid[site])
+    grasp, turn = model.site_pos[site], _rotation(model.site_quat[site])
+    straight = turn @ _rotation(np.array(robot.down)).T  # from the world's axes with the hand pointing down to the link's
+    side, across, back = straight.T  # rows: columns of ``straight``
+    data, found = mujoco.MjData(model), []
+    for joint, position in zip(robot.joints, robot.home, strict=True):
+        data.joint(joint).qpos[0] = position
+    mujoco.mj_kinematics(model, data)
+    up = data.xmat[body].reshape(3, 3)[2]  # the world's, in the link's frame
+    for aside, behind, angle in itertools.product(_ASIDE, _BEHIND, np.arange(8) * np.pi / 4):
+        out = np.cos(angle) * side + np.sin(angle) * across
+        pos = grasp + behind * back + aside * out
+        seen = _sees(model, robot, body, pos, grasp, straight)
+        found.append((-(seen // _EQUAL), -round(float(out @ up), 1), aside + behind, float(angle), tuple(pos), tuple(out)))
+    *_, pos, out = min(found)
+    quat = look_at(np.array(pos), grasp - _AHEAD * back, up=out)
+    return CameraCfg(link=model.body(body).name, pos=_tuple(pos), quat=_tuple(quat), fovy=fovy, size=size, kinds=kinds)
+
+
+def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:
+    """How many points between and ahead of the fingers nothing hides from a camera at ``pos`` in the link's frame."""
+    data, count, hit = mujoco.MjData(model), 0, np.zeros(1, np.int32)
+    for fingers in (robot.gripper.open, robot.gripper.close):
+        for joint, position in zip(robot.joints, (*robot.arm.home, *fingers), strict=True):
+            data.joint(joint).qpos[0] = position
+        mujoco.mj_kinematics(model, data)
+        frame, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
+        eye = origin + frame @ pos
+        for local in itertools.product((-0.02, 0.0, 0.02), (-0.02, 0.0, 0.02), (0.0, -0.03, -0.06, -0.1)):
+            way = origin + frame @ (grasp + straight @ np.array(local)) - eye
+            far = float(np.linalg.norm(way))
+            first = mujoco.mj_ray(model, data, eye, way / far, None, 1, -1, hit)
+            if 0 <= first < _FREE:  # within a link
+                return -1
+            count += first < 0 or first > far - _CLEAR
+    return count
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, np.asarray(quat, float) / np.linalg.norm(quat))
+    return out.reshape(3, 3)
+
+
+def _tuple(values) -> tuple:
+    return tuple(round(float(x), 4) for x in values)

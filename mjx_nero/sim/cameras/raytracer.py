@@ -1,0 +1,164 @@
+"""MuJoCo Warp's ray tracer: all worlds at once, on an NVIDIA GPU, or on the CPU for tests and small numbers.
+
+As in ``physics.mujoco_warp``, the arrays stay in Warp: one CUDA graph computes the poses and draws, JAX copies positions in and
+pictures out. The function is pure, so what nobody reads is not drawn.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array
+
+from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
+from mjx_nero.sim.physics import possible
+from mjx_nero.sim.physics.mujoco_warp import WARP, world_fields
+from mjx_nero.types import Picture
+
+_SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
+
+
+class RayTracer:
+    """See ``cameras.Drawer``. The first pictures of a batch size on a device make the buffers, which are kept."""
+
+    def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
+        self._model, self._cfg = model, dict(cfg)
+        self._fields = {name: np.shape(getattr(model, name)) for name in fields}
+        self._pixels = {
+            kind: sum(math.prod(c.size) for c in cfg.values() if kind in c.kinds) for kind in ("rgb", "depth", "segmentation")
+        }
+        self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any]] = {}  # by device and batch size
+        self._batched = self._as_jax()
+
+    def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
+        """Draws the pictures of one world, or of as many as the leading axes say."""
+        lead = qpos.shape[:-1]
+        given = [qpos, *(fields[name].reshape(*lead, -1) for name in self._fields)]
+        rgb, depth, segmentation = self._batched(jnp.concatenate(given, axis=-1) if self._fields else qpos)
+        images = {
+            "rgb": jnp.stack([(rgb >> shift).astype(jnp.uint8) for shift in (16, 8, 0)], axis=-1),
+            "depth": depth,
+            "segmentation": segmentation[..., 0],
+        }
+        out, at = {}, dict.fromkeys(images, 0)
+        for name, cfg in self._cfg.items():
+            own = {}
+            for kind in cfg.kinds:
+                first, at[kind] = at[kind], at[kind] + math.prod(cfg.size)
+                image = jax.lax.slice_in_dim(images[kind], first, at[kind], axis=len(lead))
+                own[kind] = image.reshape(*lead, *cfg.shape, *image.shape[len(lead) + 1 :])
+            out[name] = Picture(**own)
+        return out
+
+    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
+        """See ``cameras.Drawer``."""
+        import warp as wp
+
+        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
+            with WARP, wp.ScopedDevice(device):
+                self._get(num_envs)
+                wp.synchronize_device(device)
+
+    def bytes(self) -> int:
+        """Returns the size of the pictures, of the poses, and of the tree of bounding boxes."""
+        m, sizes = self._model, {"rgb": 4, "depth": 4, "segmentation": 8}
+        pictures = sum(size * self._pixels[kind] for kind, size in sizes.items())
+        tree = 200 * m.ngeom + 120 * (m.nbody + m.ngeom + m.nsite + m.ncam + m.nlight)
+        return pictures + tree + 4 * sum(math.prod(shape) for shape in self._fields.values())
+
+    def _as_jax(self) -> Callable:
+        import warp as wp
+
+        # As in ``physics.mujoco_warp``: XLA calls this function on the stream that it computes on.
+        def draw(given, rgb_out, depth_out, segmentation_out):
+            data, drawn, seen, run, _ = self._get(given.shape[0])
+            nq = data.qpos.shape[1]
+            wp.copy(data.qpos, given[:, :nq] if drawn is not None else given)
+            if drawn is not None:
+                wp.copy(drawn, given[:, nq:])
+            run()
+            for kind, out, made in (
+                ("rgb", rgb_out, seen.rgb_data),
+                ("depth", depth_out, seen.depth_data),
+                ("segmentation", segmentation_out, seen.seg_data),
+            ):
+                if self._pixels[kind]:  # otherwise nobody reads it
+                    wp.copy(out, made)
+
+        draw.__annotations__ = {
+            "given": wp.array(dtype=float, ndim=2),
+            "rgb_out": wp.array(dtype=wp.uint32, ndim=2),
+            "depth_out": wp.array(dtype=float, ndim=2),
+            "segmentation_out": wp.array(dtype=wp.vec2i, ndim=2),
+        }
+        call = wp.jax_callable(draw, num_outputs=3, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
+
+        @jax.custom_batching.custom_vmap
+        def batched(given):
+            lead, rows = given.shape[:-1], given.reshape(-1, given.shape[-1])
+            sizes = {f"{kind}_out": (len(rows), max(1, count)) for kind, count in self._pixels.items()}
+            return tuple(x.reshape(lead + x.shape[1:]) for x in call(rows, output_dims=sizes))
+
+        @batched.def_vmap
+        def _(size, is_batched, given):
+            return batched(given if is_batched[0] else jnp.broadcast_to(given, (size, *given.shape))), (True,) * 3
+
+        return batched
+
+    def _get(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
+        import warp as wp
+
+        key = (str(wp.get_device()), n)
+        if key not in self._made:
+            self._made[key] = self._make(n)
+        return self._made[key]
+
+    def _make(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
+        """Makes what ``n`` worlds need on the current device.
+
+        Returns:
+            MuJoCo Warp's data, the drawn fields as one array, the pictures, the function that draws, and what must stay alive.
+        """
+        import warp as wp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        with possible("MuJoCo Warp's ray tracer"):
+            model = mujoco_warp.put_model(self._model)
+            seen = mujoco_warp.create_render_context(
+                self._model,
+                n,
+                cam_active=[MARK + name for name in self._cfg],
+                cam_res=[c.size for c in self._cfg.values()],
+                render_rgb=["rgb" in c.kinds for c in self._cfg.values()],
+                render_depth=["depth" in c.kinds for c in self._cfg.values()],
+                render_seg=["segmentation" in c.kinds for c in self._cfg.values()],
+                enabled_geom_groups=_SEEN,
+                use_precomputed_rays="cam_fovy" not in self._fields,
+                render_skybox=True,
+                enable_per_light_ambient=False,
+                enable_emission=bool(self._model.mat_emission.any()),
+            )
+        drawn = world_fields(model, self._fields, n)
+        data = mujoco_warp.make_data(self._model, n, naconmax=1, njmax=1)
+        steps: Sequence[Callable] = (mujoco_warp.kinematics, mujoco_warp.com_pos, mujoco_warp.camlight)
+
+        def run():
+            for step in steps:
+                step(model, data)
+            mujoco_warp.refit_bvh(model, data, seen)
+            mujoco_warp.render(model, data, seen)
+
+        if not wp.get_device().is_cuda:  # no graphs there
+            return data, drawn, seen, run, model
+        if drawn is not None:  # orientations that are zero would make no bounding boxes
+            nominal = [np.ravel(getattr(self._model, name)) for name in self._fields]
+            drawn.assign(np.tile(np.concatenate(nominal).astype(np.float32), (n, 1)))
+        run()  # loads the kernels, which cannot be done while a graph is captured
+        with wp.ScopedCapture() as capture:
+            run()
+        return data, drawn, seen, functools.partial(wp.capture_launch, capture.graph), (model, run)

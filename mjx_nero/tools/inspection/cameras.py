@@ -1,0 +1,82 @@
+"""What the cameras of an environment see, and how much of its objects: a sheet of pictures, and a table."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero import console
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.sim.cameras import places
+from mjx_nero.types import Picture
+
+WORLDS = 32
+_STEPS, _EVERY = 40, 40  # control steps with random actions; between two pictures
+_COLUMNS = 8
+_EDGE = 128  # of a picture on the sheet, about [pixels]
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Pictures of random states.
+
+    Attributes:
+        pictures: by camera, [states, ...].
+        shares: (camera, object) -> in what share of the states any of it is seen, and how many pixels of it, in the mean.
+    """
+
+    pictures: dict[str, Picture]
+    shares: dict[tuple[str, str], tuple[float, float]]
+
+
+def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
+    """Draws states of random episodes through the task's cameras; without any, through those that suit its robot.
+
+    Raises:
+        UserError: the robot does not say where it works, or this machine cannot draw.
+    """
+    found = cfg.scene.cameras or places.find(cfg.robot)
+    found = {name: dataclasses.replace(c, kinds=tuple({*c.kinds, "rgb", "segmentation"})) for name, c in found.items()}
+    env = ManipulationEnv(
+        dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, cameras=found)), impl=impl, num_envs=WORLDS
+    )
+    step, draw = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(lambda state: env.view(state).cameras))
+    state, shots = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(seed), WORLDS)), []
+    aim = jnp.zeros(())
+    for i in range(_STEPS + 1):
+        if i % _EVERY == 0:
+            aim = env.home_action + jax.random.uniform(
+                jax.random.PRNGKey(seed + i), (WORLDS, env.action_size), minval=-0.5, maxval=0.5
+            )
+            shots.append(jax.device_get(draw(state)))
+        state = step(state, aim)
+    pictures = jax.tree.map(lambda *x: np.concatenate(x), *shots)
+    shares = {}
+    for camera, picture in pictures.items():
+        for name in cfg.scene.objects:
+            count = (picture.segmentation == env.mj_model.geom(name).id).sum((1, 2))
+            shares[camera, name] = float((count > 0).mean()), float(count.mean())
+    return Seen(pictures, shares)
+
+
+def sheet(seen: Seen) -> np.ndarray:
+    """Puts all colour pictures into one, uint8 [height, width, 3], camera after camera."""
+    rows = []
+    for picture in seen.pictures.values():
+        times = max(1, _EDGE // max(picture.rgb.shape[1:3]))
+        large = picture.rgb.repeat(times, 1).repeat(times, 2)
+        large = np.pad(large, ((0, 0), (0, 4), (0, 4), (0, 0)), constant_values=255)
+        rows += [np.concatenate(list(large[at : at + _COLUMNS]), axis=1) for at in range(0, len(large), _COLUMNS)]
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows])
+
+
+def table(seen: Seen) -> console.Table:
+    """How much the cameras see."""
+    view = console.Table("cameras", ("camera", "pixels", "object", "seen in", "pixels of it"), left=("camera", "object"))
+    for (camera, name), (share, count) in seen.shares.items():
+        height, width = seen.pictures[camera].rgb.shape[1:3]
+        view.add(camera, f"{width} x {height}", name, f"{share:.0%} of states", f"{count:.1f}")
+    return view

@@ -1,0 +1,185 @@
+"""Cameras: what they see, by both renderers, and what they cost where nobody looks."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjx_nero
+from mjx_nero.envs import registry
+from mjx_nero.mdp import images
+from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm
+from mjx_nero.sim import cameras, scene
+from mjx_nero.sim.cameras import opengl, places
+from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
+from mjx_nero.types import Scenery, Sim, UserError
+
+# Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 8 degrees from a metre above the table.
+ABOVE = CameraCfg(pos=(0.35, 0.1, 1.0), quat=(1.0, 0.0, 0.0, 0.0), fovy=8.0, kinds=KINDS)
+
+
+def with_cameras(found, **fields):
+    cfg = registry.env_cfg("nero_lift")
+    return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, cameras=found, **fields))
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Three worlds of a Nero with a cube: qpos [3, nq], and pictures of a camera above, one in front and one at the wrist."""
+    cfg = with_cameras({"above": ABOVE, **places.find(registry.robot("nero"), (48, 36), KINDS)})
+    model, rng = scene.build(cfg.robot, cfg.scene, cfg.sim), np.random.default_rng(0)
+    qpos = np.tile(model.qpos0, (3, 1))
+    joints = [model.joint(name).qposadr[0] for name in cfg.robot.joints]
+    qpos[:, joints] = np.array(cfg.robot.home)
+    qpos[1:, joints[:7]] += rng.uniform(-0.3, 0.3, (2, 7))
+    qpos[0, joints[0]] = 2.0  # out of the way
+    at = model.joint("cube").qposadr[0]
+    qpos[:, at : at + 3] = (0.35, 0.1, 0.015)
+
+    def draw(renderer):
+        eyes = cameras.Cameras(model, cfg.scene.cameras, renderer)
+        zero = jnp.zeros((3, 0))
+        sim = Sim(jnp.asarray(qpos, jnp.float32), zero, zero, zero, zero)
+        unseen = Scenery(jnp.array([[0.35, 0.1, 0.3]] * 3), jnp.ones((3, 4)))  # the goal's marker, between camera and cube
+        return jax.jit(jax.vmap(eyes))(sim, unseen)
+
+    return model, {name: jax.device_get(draw(name)) for name in ("mujoco", "warp")}
+
+
+@pytest.mark.parametrize("renderer", ["mujoco", "warp"])
+def test_a_camera_above_a_cube_sees_its_top(worlds, renderer):
+    model, drawn = worlds
+    seen = drawn[renderer]["above"]
+    cube = seen.segmentation[0] == model.geom("cube").id
+    edge = 64 * 0.03 / (2 * 0.97 * math.tan(math.radians(4)))  # of the top, 0.97 m away [pixels]
+    assert cube.sum() == pytest.approx(edge**2, rel=0.1)
+    rows, columns = np.nonzero(cube)
+    assert rows.mean() == pytest.approx(31.5, abs=1) and columns.mean() == pytest.approx(31.5, abs=1)
+    np.testing.assert_allclose(np.median(seen.depth[0][cube]), 0.97, atol=2e-3)
+    np.testing.assert_allclose(seen.depth[0][0, 0], 1.0005, atol=3e-3)  # the table's top is drawn half a millimetre lower
+    red, green, blue = seen.rgb[0][cube].mean(0)
+    assert red > 1.3 * green and red > 1.3 * blue
+
+
+@pytest.mark.parametrize("camera", ["above", "front", "wrist"])
+def test_both_renderers_draw_the_same(worlds, camera):
+    """Colours differ by less than 4 of 255 in the mean; 4% of pixels may by more than 24, and 1% show another thing: edges. Of
+    what is the same thing, 99% of the depths agree to 5 mm.
+
+    OpenGL shades vertices, the ray tracer pixels.
+    """
+    one, other = (worlds[1][name][camera] for name in ("mujoco", "warp"))
+    colors = np.abs(one.rgb.astype(int) - other.rgb)
+    assert colors.mean() < 4
+    assert (colors.max(-1) > 24).mean() < 0.04
+    same = one.segmentation == other.segmentation
+    assert same.mean() > 0.99
+    assert np.percentile(np.abs(one.depth - other.depth)[same], 99) < 5e-3
+
+
+def test_default_cameras_see_the_cube_and_the_hand():
+    for name in ("nero_lift", "piper_lift", "so101_lift"):
+        cfg = registry.env_cfg(name, "rgb")
+        model, rng = scene.build(cfg.robot, cfg.scene, cfg.sim), np.random.default_rng(1)
+        data, seen = mujoco.MjData(model), {"front": [], "wrist": []}
+        joints = [model.joint(j).qposadr[0] for j in cfg.robot.joints]
+        event = cfg.events["reset_object_position"].params
+        hand = set(np.flatnonzero(model.geom_bodyid >= model.site_bodyid[model.site(cfg.robot.ee_site).id]))
+        with mujoco.Renderer(model, 64, 64) as renderer:
+            renderer.enable_segmentation_rendering()
+            for _ in range(6):
+                data.qpos[joints] = cfg.robot.home
+                data.joint("cube").qpos[:2] = [rng.uniform(*event[axis]) for axis in "xy"]
+                mujoco.mj_forward(model, data)
+                for camera in seen:
+                    renderer.update_scene(data, MARK + camera)
+                    geoms = renderer.render()[..., 0]
+                    seen[camera].append((geoms == model.geom("cube").id).sum())
+                    assert hand & set(geoms.flatten()), (name, camera)
+        either = np.maximum(seen["front"], seen["wrist"])
+        assert (either >= 4).mean() >= 0.8, (name, seen)
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """Two environments on MuJoCo's renderer, of episodes of three steps."""
+    env = mjx_nero.make(
+        "nero_lift", "rgb_fixed", impl="native", num_envs=2, **{"episode_length_s": 0.06, "scene.cameras.front.size": (16, 16)}
+    )
+    return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step_and_reset))
+
+
+def test_an_observation_is_the_picture_of_its_own_episode(pictured):
+    env, reset, step = pictured
+    state = reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    assert state.obs["pictures"]["front"].dtype == jnp.uint8 and state.obs["pictures"]["wrist"].shape == (2, 64, 64, 3)
+    draw = jax.jit(jax.vmap(lambda s: env.view(s).cameras["front"].rgb))
+    for _ in range(3):
+        before, state = state.obs["pictures"]["front"], step(state, jnp.zeros((2, env.action_size)))
+        np.testing.assert_array_equal(state.obs["pictures"]["front"], draw(state))
+    assert state.done.all() and (before != state.obs["pictures"]["front"]).any()
+
+
+def test_nobody_draws_what_nobody_reads(pictured, monkeypatch):
+    env, reset, _ = pictured
+    drawn = []
+    monkeypatch.setattr(opengl.OpenGL, "_draw_rows", lambda self, rows, images: drawn.append(len(rows)))
+    state = reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    assert drawn.pop() == 2 and not drawn
+    jax.jit(jax.vmap(lambda s, a: env.step(s, a).reward))(state, jnp.zeros((2, env.action_size))).block_until_ready()
+    assert not drawn
+
+
+def test_without_cameras_nothing_changes():
+    env = mjx_nero.make("nero_lift", impl="native")
+    model, seeing = env.mj_model, mjx_nero.make("nero_lift", "rgb", impl="native")
+    assert [model.camera(i).name for i in range(model.ncam)] == ["front", "side"]
+    assert not jax.eval_shape(lambda key: env.view(env.reset(key)), jax.random.PRNGKey(0)).cameras
+    assert "cameras" not in env.__dict__  # nothing was made
+    assert mujoco.mj_sizeModel(seeing.physics_model) == mujoco.mj_sizeModel(env.physics_model)
+
+
+@pytest.mark.parametrize(
+    "fields, message",
+    [
+        ({"link": "hand"}, r"scene.cameras.front.link is 'hand', and the scene's links are: base_link, .*"),
+        ({"size": (64, 4000)}, r"size must be at least 1 and at most 2048, got 4000"),
+        ({"size": (0, 64)}, r"size must be at least 1"),
+        ({"fovy": 180.0}, r"fovy must be at least 1"),
+        ({"kinds": ("infrared",)}, r"a camera's kinds are one or more of rgb, depth, segmentation"),
+        ({"quat": (0.0, 0.0, 0.0, 0.0)}, r"a camera's quat is an orientation"),
+    ],
+)
+def test_bad_cameras_are_refused(fields, message):
+    with pytest.raises(UserError, match=message):
+        cfg = with_cameras({"front": CameraCfg(**fields)})
+        scene.build(cfg.robot, cfg.scene, cfg.sim)
+
+
+@pytest.mark.parametrize(
+    "term, camera, message",
+    [
+        (images.rgb, "back", r"reads the camera 'back', and the scene's cameras \(scene.cameras\) are: front"),
+        (images.depth, "front", r"reads depth of the camera 'front': add it to scene.cameras.front.kinds"),
+    ],
+)
+def test_terms_ask_for_what_is_there(term, camera, message):
+    cfg = with_cameras({"front": CameraCfg()})
+    group = ObservationGroup({"seen": ObservationTerm(term, params={"camera": camera})}, apart=True)
+    cfg = dataclasses.replace(cfg, observations={**cfg.observations, "pictures": group})
+    with pytest.raises(UserError, match=message):
+        _ = mjx_nero.ManipulationEnv(cfg, impl="native").observation_size
+
+
+def test_a_machine_without_opengl_says_so(monkeypatch):
+    def fails(*args, **kwargs):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(mujoco, "Renderer", fails)
+    cfg = with_cameras({"front": CameraCfg()})
+    with pytest.raises(UserError, match=r"no offscreen OpenGL here"):
+        cameras.Cameras(scene.build(cfg.robot, cfg.scene, cfg.sim), cfg.scene.cameras, "mujoco")
