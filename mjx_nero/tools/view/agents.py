@@ -52,7 +52,7 @@ def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollo
 
     def act(params, memory, state, key):
         targets, memory = steering.act(params, memory, state, key)
-        return env.actions.invert(targets, _joint_pos(env, state)), memory
+        return env.actions.invert(targets, _joint_pos(env, state), state.pipeline_state.ctrl), memory
 
     return dataclasses.replace(steering, act=act)
 
@@ -62,7 +62,7 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
     def act(targets, memory, state, key):
         wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
-        return env.actions.invert(wanted, _joint_pos(env, state)), memory
+        return env.actions.invert(wanted, _joint_pos(env, state), wanted), memory
 
     return rollout.Agent(act, init=lambda state: ())
 
