@@ -98,8 +98,8 @@ class Tower:
         return contacts.sized(self.robot, self.scene, SimCfg())
 
     def success(self) -> SuccessCfg:
-        """For half a second at the end."""
-        return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
+        """For half a second at the end, without a touch of the hand."""
+        return SuccessCfg(condition=Term(towers.left_alone, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
         """Reach, grasp, lift, align, lower, release, retreat: what is paid for one is paid on for the next ones.

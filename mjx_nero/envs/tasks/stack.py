@@ -33,7 +33,7 @@ def three(robot: RobotCfg) -> EnvCfg:
 def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     cube, there = grasp.cube_for(robot), regions.of(robot)
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
-    scene = scenes.around(robot, SceneCfg(objects=objects, goal="none"))
+    scene = scenes.around(robot, SceneCfg(objects=objects, goal="none", hand=True))
     # On it, as far as it stays, and so far beside it straight down: the centre within the face below. A cube counts as held from
     # where none gets that leans on its edge.
     tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))
