@@ -210,9 +210,11 @@ class EnvCfg:
 
 
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
-    """The task as controllers act in it: by drive targets, in place of the actions that policies learn."""
-    given = any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values())
-    return cfg if given else dataclasses.replace(cfg, actions=drive_targets())
+    """The task as controllers act in it: by drive targets, in place of the actions that policies learn, with an arm that carries
+    its own weight, as real arms' controllers have it do."""
+    if any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values()):
+        return cfg
+    return dataclasses.replace(cfg, actions=drive_targets(), robot=dataclasses.replace(cfg.robot, gravity_compensation=True))
 
 
 Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, the default first

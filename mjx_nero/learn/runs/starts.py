@@ -98,8 +98,7 @@ def playground(cfg: EnvCfg) -> EnvCfg:
     """The task as the expert plays it: by drive targets, the arm's weight carried, with nothing that differs, is late or in the
     way. What it passes through there are places for joints and objects in the task itself, too."""
     plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "obstacles": None, "curriculum": CurriculumCfg()}
-    robot = dataclasses.replace(cfg.robot, gravity_compensation=True)
-    return for_controllers(dataclasses.replace(cfg.uncorrupted(), robot=robot, **plain))
+    return for_controllers(dataclasses.replace(cfg.uncorrupted(), **plain))
 
 
 def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:
