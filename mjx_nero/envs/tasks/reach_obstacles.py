@@ -78,8 +78,10 @@ def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
 
 
 def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str, Any]]:
-    """The expert, of a robot that has RMPflow's files."""
-    return {name: fields} if (robot.xml.parent / "rmpflow").is_dir() else {}
+    """The expert: by RMPflow where the robot has its files, else by inverse kinematics."""
+    if (robot.xml.parent / "rmpflow").is_dir():
+        return {name: fields}
+    return {name: {**fields, "motion": "ik", **regions.ik(robot, "ik.")}}
 
 
 def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:
