@@ -1,5 +1,8 @@
-"""Detour: carries the grasp point over obstacles by RMPflow. The target runs up, across and down, while the whole arm keeps clear
-of the boxes."""
+"""Detour: carries the grasp point over obstacles. The target runs up, across and down.
+
+With RMPflow the whole arm keeps clear of the boxes. A robot without RMPflow's files follows the same path by inverse kinematics,
+which ignores the boxes.
+"""
 
 import dataclasses
 
@@ -9,11 +12,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mjx_nero.control.follow_target import RmpCfg, RmpFollower
+from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
+from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.rmpflow import Target
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.types import View
+from mjx_nero.types import UserError, View
 
 Corners = Float[Array, "n 3"]
 
@@ -27,22 +31,26 @@ class DetourCfg:
         speed: speed of the target along the way [m/s].
         ramp: distance from a corner within which the target slows down, nearly to rest: a jerk would shake the object off.
         lead: the target waits if it is further than this from the end effector.
-        rmpflow: files and integration of RMPflow.
+        motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
+        rmpflow, ik: of the arm's motion.
     """
 
     clearance: float = 0.12
     speed: float = 0.2
     ramp: float = 0.04
     lead: float = 0.08
+    motion: str = "rmpflow"
     rmpflow: RmpCfg = RmpCfg()
+    ik: IkCfg = IkCfg(orientation_weight=0.03)
 
 
 @struct.dataclass
 class Way:
-    """Straight legs from corner to corner, and how far along them the target is [m]."""
+    """Straight legs from corner to corner, how far along them the target is [m], and the set-point of an arm that keeps one."""
 
     corners: Corners
     travelled: Float[Array, ""]
+    setpoint: Float[Array, " nj"] | None = None  # [rad]
 
     @classmethod
     def through(cls, *corners: Float[Array, "3"]) -> "Way":
@@ -90,16 +98,23 @@ class Detour:
         cfg: see ``DetourCfg``.
 
     Raises:
-        UserError: the robot has no RMPflow files, or they do not fit it.
+        UserError: ``motion`` is another; the robot has no RMPflow files, or they do not fit it.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: DetourCfg = DetourCfg()):
+        if cfg.motion not in ("rmpflow", "ik"):
+            raise UserError(f"motion must be rmpflow or ik, got {cfg.motion!r}")
         self.dt, self.cfg, self._n = dt, cfg, len(robot.arm.joints)
-        self._arm = RmpFollower(robot, dt, cfg.rmpflow)
+        self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
+        self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None
 
     def init(self, view: View) -> Way:
         """Plans the way from the end effector's position."""
-        return over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance)
+        return self._begin(over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance), view)
+
+    def _begin(self, way: Way, view: View) -> Way:
+        """The way with the arm where it is."""
+        return dataclasses.replace(way, setpoint=view.joint_pos[: self._n]) if self._ik else way
 
     def step(self, memory: Way, view: View) -> tuple[Way, Float[Array, " nu"]]:
         """Targets of the arm's drives; the gripper's stay."""
@@ -113,8 +128,13 @@ class Detour:
         # Under a constant acceleration up to ``ramp``; at a corner a tenth of the speed, or it would stay there.
         speed = self.cfg.speed * jnp.clip(jnp.sqrt(way.to_corner() / self.cfg.ramp), 0.1, 1.0)
         after = way.on(jnp.where(goes, speed * self.dt, 0.0))
-        velocity = (after.target() - position) / self.dt
-        return after, self._arm.arm(view, Target(position + offset, orientation, velocity))
+        target = Target(position + offset, orientation, (after.target() - position) / self.dt)
+        if self._rmpflow:
+            return after, self._rmpflow.arm(view, target)
+        assert self._ik is not None and way.setpoint is not None
+        turn = view.ee_quat_w if orientation is None else orientation
+        setpoint, targets = self._ik.arm(way.setpoint, dataclasses.replace(target, orientation=turn))
+        return dataclasses.replace(after, setpoint=setpoint), targets
 
     def warning(self, memory: Way) -> str:
         """Says where the target never got to the goal."""
@@ -183,13 +203,13 @@ class CarryPast(Detour):
         """Plans the way to the object, from above."""
         at = view.objects[self.cfg.object].pos_w + self._offset
         above = at + jnp.array([0.0, 0.0, self.cfg.approach])
-        way = Way.through(view.ee_pos_w, above, above, at)  # as many corners as the way over obstacles
+        way = self._begin(Way.through(view.ee_pos_w, above, above, at), view)  # as many corners as the way over obstacles
         return CarryMemory(way, jnp.zeros((), jnp.int32), jnp.asarray(self._offset))
 
     def step(self, memory: CarryMemory, view: View) -> tuple[CarryMemory, Float[Array, " nu"]]:  # type: ignore[override]
         """Targets of all drives."""
         at, holds = view.objects[self.cfg.object].pos_w, memory.there >= self._closed
-        off = over(at, view.goal_pos_w, view, self.cfg.clearance)
+        off = dataclasses.replace(over(at, view.goal_pos_w, view, self.cfg.clearance), setpoint=memory.way.setpoint)
         way = jax.tree.map(lambda new, old: jnp.where(memory.there == self._closed, new, old), off, memory.way)
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)

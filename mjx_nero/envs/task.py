@@ -226,9 +226,14 @@ class EnvCfg:
 
 
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with drive targets in place of the actions that policies learn."""
-    given = any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values())
-    return cfg if given else dataclasses.replace(cfg, actions=drive_targets())
+    """Returns the task as controllers act in it.
+
+    Drive targets replace the actions that policies learn, and the arm carries its own weight, as the controllers of real arms make
+    it do.
+    """
+    if any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values()):
+        return cfg
+    return dataclasses.replace(cfg, actions=drive_targets(), robot=dataclasses.replace(cfg.robot, gravity_compensation=True))
 
 
 Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, default first

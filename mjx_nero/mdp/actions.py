@@ -22,6 +22,7 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.types import LEVEL, Key, UserError
 
 Memory = Any
+_STAYS = 0.01  # targets of fingers that move less in a step, on the scale of a ``ContinuousGripper``, stay where they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,11 +280,11 @@ class BinaryGripper(Gripper):
         return {**self._described("binary"), "hysteresis": self.hysteresis}
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Picks whichever of open and closed is nearer."""
+        """Picks the end that the targets move towards; if they stay, the nearer one."""
         if not len(self.home):
             return super().invert(act, late)
-        to_open, to_close = (jnp.abs(act.targets["gripper"] - end).sum(-1) for end in (self.drives.open, self.drives.close))
-        return jnp.where(to_close < to_open, -1.0, 1.0)[..., None]
+        to, at = (opening(x["gripper"], self.drives.open, self.drives.close) for x in (act.targets, act.ctrl))
+        return jnp.where(jnp.where(jnp.abs(to - at) > _STAYS, to - at, to) < 0, -1.0, 1.0)[..., None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -506,17 +507,20 @@ class Chain:
         low, high = zip(*(term.bounds() for term in self.terms.values()), strict=True)
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 
-    def invert(self, targets: Float[Array, "... nu"], joint_pos: Float[Array, "... nu"]) -> Float[Array, "... na"]:
+    def invert(
+        self, targets: Float[Array, "... nu"], joint_pos: Float[Array, "... nu"], ctrl: Float[Array, "... nu"] | None = None
+    ) -> Float[Array, "... na"]:
         """Finds the action whose targets come nearest to those given, so that a controller can act in a policy's place.
 
         Args:
             targets: position targets of the drives [rad or m].
             joint_pos: current joint positions [rad or m].
+            ctrl: targets in force now [rad or m]; None: the joint positions.
         """
         delays: list[Any] = [term for term in self.terms.values() if isinstance(term, Delay)]
         late = sum(term.steps[1] for term in delays)
-        wanted, joints = self._by_group(targets), self._by_group(joint_pos)
-        act = Act(jnp.zeros((*jnp.shape(targets)[:-1], len(self.home))), joints, joints, wanted)
+        wanted, joints, now = map(self._by_group, (targets, joint_pos, joint_pos if ctrl is None else ctrl))
+        act = Act(jnp.zeros((*jnp.shape(targets)[:-1], len(self.home))), joints, now, wanted)
         return jnp.concatenate([term.invert(act, late) for term in self.terms.values()], axis=-1)
 
     def _by_group(self, values: Float[Array, "... nu"]) -> dict[str, Float[Array, "... n"]]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive
 from mjx_nero.mdp.rewards import held
-from mjx_nero.types import View
+from mjx_nero.types import UserError, View
 
 GOAL = "goal"  # the bottom of a tower that is not built on an object
 Within = tuple[Positive, Positive, Positive]
@@ -118,6 +118,17 @@ def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
         still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
         met.append(still & (jnp.linalg.norm(view.ee_pos_w - seen.pos_w) > place.clearance))
     return jnp.all(jnp.stack(met))
+
+
+def left_alone(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
+    """``built``, and the robot touches none of the objects, by the scene's sensors of the hand.
+
+    Raises:
+        UserError: the scene has none.
+    """
+    if "hand" not in view.readings:
+        raise UserError("towers.left_alone needs scene.hand, and this task is without")
+    return built(view, place=place, max_speed=max_speed) & (view.readings["hand"] == 0)
 
 
 def _sum(values: Iterable[Array]) -> Scalar:

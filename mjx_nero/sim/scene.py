@@ -104,6 +104,7 @@ class SceneCfg:
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
         self_collision: the robot's links collide with one another; ``sim.touch`` measures those forces, too.
+        hand: ``sim.touch`` measures what the robot presses objects with.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
@@ -121,6 +122,7 @@ class SceneCfg:
     objects: Mapping[str, ObjectCfg] = dataclasses.field(default_factory=lambda: {"cube": ObjectCfg()})
     obstacles: Mapping[str, ObstacleCfg] = dataclasses.field(default_factory=dict)
     self_collision: bool = False
+    hand: bool = False
     goal: str = "sphere"
     goal_edge: Positive = 0.03
     look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
@@ -192,6 +194,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     if whole:
         pairs = touch.self_pairs(robot) if scene.self_collision else ()
         touch.add(spec, robot.base_link, scene.obstacles, tuple(scene.objects), pairs)
+    if scene.hand:
+        touch.add_hand(spec, robot.base_link, tuple(scene.objects))
     if visuals:
         _add_visuals(spec, scene, goal, robot)
         cameras.add(spec, scene.cameras)

@@ -1,4 +1,5 @@
-"""Unwanted contacts: the robot with obstacles or with itself. Puts obstacles into the model and reads the contact forces.
+"""Contacts of the robot: unwanted ones, with obstacles or with itself, and those with objects. Puts obstacles into the model and
+reads the contact forces.
 
 The force is the strongest contact of each obstacle and each pair of links, from MuJoCo's contact sensors: all three backends have
 them with the same meaning. A net force on a link would hide a link that is squeezed. Distances between all shapes would cost time
@@ -22,8 +23,7 @@ from mjx_nero.types import UserError
 
 OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
 COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
-NAME = "touch"  # name of the reading
-_PREFIX = f"{NAME}:"  # prefix of the sensors' names
+NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
 # Shapes that every backend can collide with a box.
 _MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
 _SAMPLES = 1000  # postures in which links are tested
@@ -79,6 +79,19 @@ def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, Any], objects: t
         _add_sensor(spec, first, second)
 
 
+def add_hand(spec: mujoco.MjSpec, base: str, objects: tuple[str, ...]) -> None:
+    """Adds sensors for the contacts of the robot with objects, which stay as they are.
+
+    Args:
+        spec: robot and objects.
+        base: the robot's base link.
+        objects: names of objects; body and geom share a name.
+    """
+    for shape in _collision_shapes(spec, base):
+        for name in objects if shape.contype or shape.conaffinity else ():
+            _add_sensor(spec, name, shape.name, HAND)
+
+
 def _collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     """Lists the robot's collision shapes and names those without a name."""
     geoms = [geom for geom in spec.body(base).find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.conaffinity or geom.group == COLLISION]
@@ -87,10 +100,10 @@ def _collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     return geoms
 
 
-def _add_sensor(spec: mujoco.MjSpec, first: str, second: str | None) -> None:
+def _add_sensor(spec: mujoco.MjSpec, first: str, second: str | None, reading: str = NAME) -> None:
     data, strongest = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2
     spec.add_sensor(
-        name=f"{_PREFIX}{first}:{second}" if second else _PREFIX + first,
+        name=":".join(filter(None, (reading, first, second))),
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_GEOM,
         objname=first,
@@ -128,11 +141,15 @@ class Reader:
 
 def readers(model: mujoco.MjModel) -> dict[str, Reader]:
     """Makes the readers of a model's sensors, by name in ``Sim.readings``. Empty if the scene has no such sensor."""
-    ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(_PREFIX)]
-    pairs = np.zeros((model.ngeom, model.ngeom), bool)
-    for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
-        pairs[first, second if second >= 0 else slice(None)] = True
-    return {NAME: Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T)} if ours else {}
+    found = {}
+    for name in (NAME, HAND):
+        ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(f"{name}:")]
+        pairs = np.zeros((model.ngeom, model.ngeom), bool)
+        for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
+            pairs[first, second if second >= 0 else slice(None)] = True
+        if ours:
+            found[name] = Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T)
+    return found
 
 
 @functools.cache

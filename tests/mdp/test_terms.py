@@ -389,6 +389,20 @@ def test_a_gripper_with_hysteresis_changes_its_mind_beyond_it_alone():
     assert not actions.Chain({**ARM, **GRIPPER}, GROUPS).init(KEY, jnp.zeros(4))
 
 
+def test_a_gripper_is_told_where_its_targets_are_on_their_way_to():
+    """From 50 mm to 0 a millimetre a step: it closes from the first on, and opens from the first back, however far that is."""
+    chain = actions.Chain({**ARM, **GRIPPER}, GROUPS)
+
+    def told(now, to, joints=0.02):
+        at = [jnp.array([0.0, 0.0, x, -x]) for x in (to, joints, now)]
+        return float(chain.invert(*at)[-1])
+
+    assert told(now=0.05, to=0.049) == told(now=0.001, to=0.0) == told(now=0.0, to=0.0) == -1.0
+    assert told(now=0.0, to=0.001) == told(now=0.049, to=0.05) == told(now=0.05, to=0.05) == told(now=0.04, to=0.04) == 1.0
+    pressing = [jnp.array([0.0, 0.0, x, -x]) for x in (0.015, 0.02)]
+    assert chain.invert(*pressing)[-1] == -1.0  # nobody says what the targets have been: the joints are further open
+
+
 def test_a_continuous_gripper_is_as_far_open_as_it_is_told():
     """Of fingers from 0 and -1 mm to 50 and -60: a quarter is 12.5 and -15.75; -60 is beyond the range."""
     chain = {**ARM, "gripper": Term(actions.ContinuousGripper)}

@@ -191,6 +191,15 @@ def test_built(params, at, met):
     assert bool(towers.built(at, **placed(params))) is met
 
 
+def test_a_tower_that_is_touched_is_not_left_alone():
+    """However far away the grasp point is: an elbow may lean on it."""
+    for at, force, met in ((ON, 0.0, True), (ON, 0.01, False), (LYING, 0.0, False)):
+        seen = dataclasses.replace(view(at), readings={"hand": jnp.array(force)})
+        assert bool(towers.left_alone(seen, **placed(BUILT))) is met
+    with pytest.raises(UserError, match=r"towers.left_alone needs scene.hand"):
+        towers.left_alone(view(ON), **placed(BUILT))
+
+
 def test_ways_and_turns():
     np.testing.assert_allclose(towers.way(view(LYING), below="blue", object="red", rise=0.04), [0.0, 0.2, 0.04], atol=1e-7)
     np.testing.assert_allclose(towers.way(view(LYING), below="goal", object="red", rise=0.04), [-0.1, 0.1, 0.0], atol=1e-7)

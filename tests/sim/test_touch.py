@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.sim import scene
+from mjx_nero.envs.arms.nero import NERO
+from mjx_nero.sim import scene, touch
 from mjx_nero.sim.obstacles import FIELDS, Obstacles
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
@@ -143,3 +144,21 @@ def test_backends_agree(backend, model, worlds, native):
     there = [0, 1, 2, 3, 5]
     np.testing.assert_allclose(forces[-1, there], native[1][-1, there], rtol=0.01, atol=1e-3)
     assert forces[-1, 4] == pytest.approx(native[1][-1, 4], rel=0.01 if backend == "warp" else 0.2)
+
+
+def test_what_the_robot_presses_an_object_with_is_read_and_nothing_else():
+    """A cube on the table, an arm's length away; the same on the inside of a finger."""
+    model = scene.build(NERO, SceneCfg(hand=True), SimCfg(), visuals=False, fuse=True)
+    plain = scene.build(NERO, SceneCfg(), SimCfg(), visuals=False, fuse=True)
+    (name, reader), data = next(iter(touch.readers(model).items())), mujoco.MjData(model)
+    assert name == touch.HAND and len(touch.readers(model)) == 1 and not touch.readers(plain)
+    for joint, at in zip(NERO.joints, NERO.home, strict=True):
+        data.joint(joint).qpos = at
+    data.joint("cube").qpos = [0.3, 0.3, 0.0149, 1, 0, 0, 0]
+    mujoco.mj_forward(model, data)
+    assert data.ncon and reader(data.sensordata) == 0
+    pad = data.geom("pad1")
+    data.joint("cube").qpos[:3] = pad.xpos + 0.015 * (data.site("ee").xpos - pad.xpos) / 0.05
+    mujoco.mj_forward(model, data)
+    assert reader(data.sensordata) > 0.1
+    np.testing.assert_array_equal(model.geom_contype, plain.geom_contype)

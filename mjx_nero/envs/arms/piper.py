@@ -3,9 +3,10 @@
 import dataclasses
 import math
 
+from mjx_nero.envs import fitted
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import lift, reach
+from mjx_nero.envs.tasks import lift, lift_obstacles, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
@@ -46,7 +47,18 @@ REACH = reach.ReachSetup(
     episode_length_s=6.0,
 )
 
+# Wider apart than the recipe's regions, for what is to stand between.
+REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
+    start=(0.3, -0.2), goal=((0.28, 0.38), (0.14, 0.24), (0.2, 0.35)), top=0.3, scene=LIFT.scene
+)
+LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
+    cube=((0.2, 0.26), (-0.22, -0.16)), goal=((0.28, 0.36), (0.14, 0.22), (0.18, 0.28)), top=0.18, scene=LIFT.scene
+)
+
 ENVS: Envs = {
     "piper_lift": (PIPER, lift.presets(LIFT)),
     "piper_reach": (REACH_PIPER, reach.presets(REACH)),
+    "piper_reach_obstacles": (PIPER, reach_obstacles.presets(REACH_OBSTACLES)),
+    "piper_lift_obstacles": (PIPER, lift_obstacles.presets(LIFT_OBSTACLES)),
+    **{f"piper_{task}": (PIPER, presets) for task, presets in fitted.FITTING.items()},
 }

@@ -6,8 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjx_nero.envs import fitted
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
-from mjx_nero.envs.tasks import lift, reach
+from mjx_nero.envs.tasks import lift, lift_obstacles, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -81,6 +82,15 @@ REACH = reach.ReachSetup(
     scene=reach.scene(SCENE),
     position=((0.1, 0.25), (-0.1, 0.1), (0.1, 0.3)),
 )
+# Wider apart than what it picks from, for what is to stand between.
+REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
+    start=(0.16, -0.18), goal=((0.12, 0.22), (0.14, 0.2), (0.1, 0.25)), top=0.2, scene=SCENE
+)
+LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
+    cube=((0.12, 0.17), (-0.19, -0.15)), goal=((0.12, 0.2), (0.14, 0.2), (0.12, 0.2)), top=0.12, scene=SCENE
+)
+# None of three cubes: the hand does not point straight down so high.
+STACK: Presets = {"default": fitted.FITTING["stack"]["default"]}
 
 
 def with_recipe(presets: Presets) -> Presets:
@@ -96,4 +106,8 @@ def with_recipe(presets: Presets) -> Presets:
 ENVS: Envs = {
     "so100_lift": (SO_ARM100, with_recipe(lift.presets(LIFT))),
     "so100_reach": (SO_ARM100, with_recipe(reach.presets(REACH))),
+    "so100_reach_obstacles": (SO_ARM100, reach_obstacles.presets(REACH_OBSTACLES)),
+    "so100_lift_obstacles": (SO_ARM100, lift_obstacles.presets(LIFT_OBSTACLES)),
+    **{f"so100_{task}": (SO_ARM100, presets) for task, presets in fitted.FITTING.items()},
+    "so100_stack": (SO_ARM100, STACK),
 }

@@ -98,8 +98,8 @@ class Tower:
         return contacts.sized(self.robot, self.scene, SimCfg())
 
     def success(self) -> SuccessCfg:
-        """The tower is built, for half a second at the end."""
-        return SuccessCfg(condition=Term(towers.built, params=self.done), distance=Term(towers.distance, params=self.place))
+        """Requires a built tower that the hand does not touch, for half a second at the end."""
+        return SuccessCfg(condition=Term(towers.left_alone, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
         """Rewards reaching, grasping, lifting, aligning, lowering, releasing and leaving; each stage keeps the earlier rewards.

@@ -172,7 +172,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4)),
         episode_length_s=8.0,
         actions=joint_actions(scale=0.5),
-        controllers={"pick_up": {"object": TARGET, **_fits(scene), **setup.grasp}},
+        controllers={"pick_up": {"object": TARGET, **_fits(scene), **setup.grasp, **regions.ik(setup.robot, "ik.")}},
         command=CommandTerm(
             commands.uniform_position,
             params=dict(zip("xyz", setup.there.hold, strict=True)),

@@ -87,8 +87,10 @@ def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
 
 
 def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str, Any]]:
-    """Names the expert, if the robot has RMPflow's files."""
-    return {name: fields} if (robot.xml.parent / "rmpflow").is_dir() else {}
+    """Names the expert: by RMPflow if the robot has its files, otherwise by inverse kinematics."""
+    if (robot.xml.parent / "rmpflow").is_dir():
+        return {name: fields}
+    return {name: {**fields, "motion": "ik", **regions.ik(robot, "ik.")}}
 
 
 def default(robot: RobotCfg, setup: ReachObstaclesSetup) -> EnvCfg:

@@ -56,12 +56,12 @@ def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
 
 
 def through_actions(env: ManipulationEnv, agent: Agent) -> Agent:
-    """An agent of drive targets, in any environment: by the actions that give them, or come nearest."""
+    """Lets an agent of drive targets act in any environment, by the actions that give these targets or come nearest."""
 
     def act(params, memory, state, key):
         targets, memory = agent.act(params, memory, state, key)
         joint_pos = jax.vmap(lambda each: env.view(each).joint_pos)(state)
-        return env.actions.invert(targets, joint_pos), memory
+        return env.actions.invert(targets, joint_pos, state.pipeline_state.ctrl), memory
 
     return dataclasses.replace(agent, act=act)
 

@@ -103,8 +103,7 @@ def playground(cfg: EnvCfg) -> EnvCfg:
     Its states are valid states of the task itself.
     """
     plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "obstacles": None, "curriculum": CurriculumCfg()}
-    robot = dataclasses.replace(cfg.robot, gravity_compensation=True)
-    return for_controllers(dataclasses.replace(cfg.uncorrupted(), robot=robot, **plain))
+    return for_controllers(dataclasses.replace(cfg.uncorrupted(), **plain))
 
 
 def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:

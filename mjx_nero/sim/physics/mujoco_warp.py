@@ -38,7 +38,7 @@ class WarpPhysics:
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
         # dof_M0 is of MuJoCo's C library alone.
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name != "dof_M0"}
-        self._touch = touch.readers(model).get(touch.NAME)
+        self._readers = touch.readers(model)
         self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
 
@@ -51,8 +51,8 @@ class WarpPhysics:
         qpos, qvel, warmstart, overflow, force = self._batched(sim.qpos, sim.qvel, given, sim.warmstart)
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
-        if self._touch:
-            after = dataclasses.replace(after, readings={touch.NAME: force})
+        if self._readers:
+            after = dataclasses.replace(after, readings={name: force[..., i] for i, name in enumerate(self._readers)})
         return after, ((overflow & _LOST) != 0).astype(jnp.float32)
 
     def _as_jax(self) -> Callable:
@@ -81,7 +81,7 @@ class WarpPhysics:
         names = ("qpos", "qvel", "given", "warmstart", "qpos_out", "qvel_out", "warmstart_out")
         control_step.__annotations__ = dict.fromkeys(names, wp.array(dtype=float, ndim=2)) | {
             "overflow_out": wp.array(dtype=int),
-            "force_out": wp.array(dtype=float),
+            "force_out": wp.array(dtype=float, ndim=2),
         }
         call = wp.jax_callable(control_step, num_outputs=5, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
         nq, nv = self.model.nq, self.model.nv
@@ -91,7 +91,8 @@ class WarpPhysics:
             lead = inputs[0].shape[:-1]
             inputs = tuple(x.reshape(-1, x.shape[-1]) for x in inputs)
             n = inputs[0].shape[0]
-            sizes = {"qpos_out": (n, nq), "qvel_out": (n, nv), "warmstart_out": (n, nv), "overflow_out": (n,), "force_out": (n,)}
+            sizes = {"qpos_out": (n, nq), "qvel_out": (n, nv), "warmstart_out": (n, nv), "overflow_out": (n,)}
+            sizes["force_out"] = n, max(1, len(self._readers))
             return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
 
         @batched.def_vmap
@@ -151,8 +152,8 @@ class WarpPhysics:
         """Makes what ``n`` environments need on the current device.
 
         Returns:
-            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the strongest unwanted contacts (None if
-            nobody reads them), and objects that must stay alive.
+            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the strongest contacts of each reading
+            (None if there are none), and objects that must stay alive.
         """
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
@@ -212,24 +213,25 @@ class WarpPhysics:
         return ours, strongest
 
     def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
-        """Makes the array of each world's strongest unwanted contact [N], and the function that updates it after the solver.
+        """Makes the array of each world's strongest contacts [N], one a reading, and the function that updates it.
 
-        It equals MuJoCo's contact sensors, for each of which MuJoCo Warp would search all contacts once more.
+        After the solver it equals MuJoCo's contact sensors, for each of which MuJoCo Warp would search all contacts once more.
         """
         import warp as wp
         from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
 
-        if self._touch is None:
+        if not self._readers:
             return None, lambda: None
-        strongest: Any = wp.zeros(data.nworld, dtype=float)
-        found, inputs = data.contact, [model.opt.cone, wp.array(self._touch.pairs, dtype=bool)]
+        strongest: Any = wp.zeros((data.nworld, len(self._readers)), dtype=float)
+        pairs = np.stack([reader.pairs for reader in self._readers.values()])
+        found, inputs = data.contact, [model.opt.cone, wp.array(pairs, dtype=bool)]
         inputs += [found.frame, found.friction, found.dim, found.efc_address, found.adhesion, found.geom, found.worldid]
         inputs += [data.efc.force, data.njmax, data.nacon, strongest]
 
         @wp.kernel(module="unique", enable_backward=False)
         def keep(
             cone: int,
-            counts: wp.array2d(dtype=bool),  # type: ignore
+            counts: wp.array3d(dtype=bool),  # type: ignore
             frame: wp.array(dtype=wp.mat33),  # type: ignore
             friction: wp.array(dtype=found.friction.dtype),  # type: ignore
             dim: wp.array(dtype=int),  # type: ignore
@@ -240,15 +242,16 @@ class WarpPhysics:
             forces: wp.array2d(dtype=float),  # type: ignore
             njmax: int,
             nacon: wp.array(dtype=int),  # type: ignore
-            strongest: wp.array(dtype=float),  # type: ignore
+            strongest: wp.array2d(dtype=float),  # type: ignore
         ):
             i = wp.tid()
             if i >= nacon[0]:
                 return
-            if counts[geom[i][0], geom[i][1]]:
-                world = worldid[i]
-                force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, False)
-                wp.atomic_max(strongest, world, wp.length(wp.spatial_top(force)))
+            world = worldid[i]
+            for k in range(strongest.shape[1]):
+                if counts[k, geom[i][0], geom[i][1]]:
+                    force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, False)
+                    wp.atomic_max(strongest, world, k, wp.length(wp.spatial_top(force)))
 
         return strongest, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs)
 

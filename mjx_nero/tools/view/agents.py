@@ -57,7 +57,7 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
     def act(targets, memory, state, key):
         wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
-        return env.actions.invert(wanted, _joint_pos(env, state)), memory
+        return env.actions.invert(wanted, _joint_pos(env, state), wanted), memory
 
     return rollout.Agent(act, init=lambda state: ())
 
