@@ -228,8 +228,7 @@ class EnvCfg:
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
     """Returns the task as controllers act in it.
 
-    Drive targets replace the actions that policies learn, and the arm carries its own weight, as the controllers of real arms make
-    it do.
+    Drive targets replace the actions that policies learn, and the arm carries its own weight, as real arms' controllers do.
     """
     if any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values()):
         return cfg

@@ -55,7 +55,7 @@ def load(work: Callable[[], None]) -> None:
         if np.prod(dim) and not kernel.is_generic:
             found.setdefault(block_dim, {})[kernel.module] = None
 
-    wp.launch = wp.launch_tiled = note
+    wp.launch = wp.launch_tiled = note  # type: ignore[assignment]
     try:
         work()
     finally:

@@ -54,10 +54,10 @@ class NativePhysics:
         packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
         shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + len(self._readers)), jnp.float32)
         if jax.default_backend() == "cpu":
-            after = host.call(self._key, self._step, shape, packed)
+            found = host.call(self._key, self._step, shape, packed)
         else:  # an accelerator's program, which JAX does not keep between runs
-            after = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
-        qpos, qvel, warmstart, read = jnp.split(after, self._sizes[:3], axis=-1)
+            found = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
+        qpos, qvel, warmstart, read = jnp.split(found, self._sizes[:3], axis=-1)
         readings = {name: read[..., i] for i, name in enumerate(self._readers)}
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=readings)
         return dataclasses.replace(after, time=sim.time + self._period), jnp.zeros(packed.shape[:-1])
