@@ -176,7 +176,7 @@ def test_task_of_an_environment():
 def test_presets_and_controllers_actions():
     assert "lifting_object" in inspection.inspect("nero_lift", preset="isaac").task.rewards
     task = inspection.inspect("cobotta_pick_place").task
-    assert "one entry a drive: its position target itself [rad or m]" in task.action and task.action_size == 8
+    assert "one entry per drive: its position target [rad or m]" in task.action and task.action_size == 8
 
 
 def test_environments():
