@@ -132,7 +132,7 @@ class Scenery:
 
 @struct.dataclass
 class Picture:
-    """What a camera saw, of each kind that it was asked for; None: it was not."""
+    """One camera's picture, of each kind that was asked for; None if it was not."""
 
     rgb: UInt8[Array, "*n height width 3"] | None = None
     depth: Float[Array, "*n height width"] | None = None  # along the camera's axis [m]; 0: nothing is there

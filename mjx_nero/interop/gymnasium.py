@@ -228,7 +228,7 @@ def _spaces(env: ManipulationEnv, group: Any) -> tuple[Any, Any]:
 
 
 def _space(obs: Any) -> gymnasium.spaces.Space:
-    """Of an observation group's shapes; pictures are whole numbers from 0 to 255."""
+    """Builds the space of an observation group's shapes; pictures are whole numbers from 0 to 255."""
     if isinstance(obs, dict):
         return gymnasium.spaces.Dict({name: _space(each) for name, each in obs.items()})
     low, high = (0, 255) if obs.dtype == np.uint8 else (-np.inf, np.inf)

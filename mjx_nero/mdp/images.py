@@ -15,12 +15,12 @@ _KINDS = ("rgb", "depth", "segmentation")
 
 
 def rgb(view: View, *, camera: str) -> UInt8[Array, "height width 3"]:
-    """What a camera sees: red, green and blue from 0 to 255."""
+    """Colour picture of a camera: red, green and blue from 0 to 255."""
     return _seen(view, camera, "rgb")
 
 
 def depth(view: View, *, camera: str) -> Float[Array, "height width 1"]:
-    """How far away what a camera sees is, along its axis [m]; 0: nothing is there."""
+    """Distances along a camera's axis [m]; 0 where nothing is in view."""
     return _seen(view, camera, "depth")[..., None]
 
 
@@ -42,20 +42,20 @@ def _seen(view: View, camera: str, kind: str) -> Any:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lens:
-    """A sensor (``mdp.sensors``): a camera as real ones are, with an episode's exposure and colours, noise, blur, rate and delay.
+    """A realistic camera, as a sensor (``mdp.sensors``): exposure and colours of the episode, noise, blur, frame rate and delay.
 
     Attributes:
-        camera: its name.
-        exposure: factor of all colours, the same for an episode.
-        white_balance: factor of up to 1 +- this of each channel, likewise.
-        blur: share of a pixel's four neighbours in it, at most, likewise.
-        noise: deviation of each channel in every picture, from 0 to 255.
-        depth_noise: deviation of a depth, as a share of its square [1/m].
-        depth_step: depths are whole multiples of this [m]; 0: they are exact.
-        holes: chance that a depth is missing.
-        every: it takes a picture in every so many control steps.
-        delay: by how many control steps pictures are late, the least and the most.
-        hold: the chance that a step keeps the delay of the one before.
+        camera: the camera's name.
+        exposure: range of the factor of all colours, constant for an episode.
+        white_balance: each channel's factor is up to 1 +- this, constant for an episode.
+        blur: greatest share of a pixel's four neighbours in it, constant for an episode.
+        noise: standard deviation of each channel in every picture, from 0 to 255.
+        depth_noise: standard deviation of a depth, divided by its square [1/m].
+        depth_step: resolution of depths [m]; 0: exact.
+        holes: probability that a depth is missing.
+        every: control steps per picture.
+        delay: least and greatest delay of pictures [control steps].
+        hold: probability that a step keeps the previous step's delay.
     """
 
     camera: str
@@ -71,7 +71,7 @@ class Lens:
     hold: Share = 1.0
 
     def init(self, key: Key, view: View) -> tuple:
-        """The episode's draws, and what has always been seen."""
+        """Draws the episode's camera, and fills rate and delay with the first picture."""
         key, k_exposure, k_white, k_blur, k_delay = jax.random.split(key, 5)
         gain = jax.random.uniform(k_exposure, (), minval=self.exposure[0], maxval=self.exposure[1])
         gain *= 1 + self.white_balance * jax.random.uniform(k_white, (3,), minval=-1.0, maxval=1.0)
@@ -83,7 +83,7 @@ class Lens:
         return key, gain, blur, last, late
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """The view with the picture as the camera gives it."""
+        """Replaces the picture by the one that the camera gives."""
         key, gain, blur, last, late = memory
         key, k_noise = jax.random.split(key)
         seen = self._taken(view.cameras[self.camera], gain, blur, k_noise)

@@ -1,6 +1,6 @@
-"""What an episode looks like: (key, model, *, params) -> {field: (rows, values)}, as ``mdp.randomization`` for the drawn model.
+"""Looks of an episode: (key, model, *, params) -> {field: (rows, values)}, like ``mdp.randomization``, but of the drawn model.
 
-Rows are cameras, lights, geoms and materials. None of it moves anything: physics has another model.
+Rows are cameras, lights, geoms and materials. Nothing here moves anything: physics has another model.
 """
 
 import jax
@@ -25,7 +25,7 @@ def camera_pose(key: Key, model: Model, *, cameras: tuple[str, ...], offset: Non
 
 
 def camera_fovy(key: Key, model: Model, *, cameras: tuple[str, ...], scale: PositiveRange) -> Drawn:
-    """Multiplies the cameras' vertical fields of view by a uniform factor each."""
+    """Scales the cameras' vertical fields of view, by a uniform factor for each."""
     rows = model.rows("camera", cameras)
     return {
         "cam_fovy": (rows, model.fields["cam_fovy"][rows] * jax.random.uniform(key, rows.shape, minval=scale[0], maxval=scale[1]))
@@ -33,8 +33,11 @@ def camera_fovy(key: Key, model: Model, *, cameras: tuple[str, ...], scale: Posi
 
 
 def lights(key: Key, model: Model, *, turn: NonNegative, brightness: PositiveRange, tint: Share, dark: Share = 0.0) -> Drawn:
-    """Turns every light by up to ``turn`` about each axis [rad], multiplies its brightness by a uniform factor, and its colour by
-    one of up to 1 +- ``tint`` a channel; with the chance ``dark`` one is out."""
+    """Varies every light: direction, brightness and colour.
+
+    Each turns by up to ``turn`` about each axis [rad]; its brightness gets a uniform factor, each channel a factor of up to 1 +-
+    ``tint``; and it is off with probability ``dark``.
+    """
     rows = np.arange(len(model.fields["light_dir"]))
     k_turn, k_bright, k_tint, k_dark = jax.random.split(key, 4)
     turned = jax.vmap(math.quat_exp)(turn * _within(k_turn, (len(rows), 3)))
@@ -52,13 +55,16 @@ def colors(key: Key, model: Model, *, geoms: tuple[str, ...], change: Share, sha
 
 
 def materials(key: Key, model: Model, *, change: Share, shade: PositiveRange = (1.0, 1.0)) -> Drawn:
-    """Does the same to all materials: those of the robot."""
+    """Varies all materials, which are the robot's, as ``colors`` varies geoms."""
     rows = np.arange(len(model.fields["mat_rgba"]))
     return {"mat_rgba": (rows, _recolored(key, model.fields["mat_rgba"][rows], change, shade))}
 
 
 def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range, z: Range, there: Share = 1.0) -> Drawn:
-    """Puts geoms that touch nothing somewhere, turned about the vertical; those that are not ``there``, far below the table."""
+    """Puts geoms without collisions at random places, turned about the vertical; each is hidden below the table unless ``there``.
+
+    ``there`` is the probability that a geom is in place.
+    """
     rows = model.rows("geom", geoms)
     k_pos, k_turn, k_there = jax.random.split(key, 3)
     low, high = (jnp.array(ends) for ends in zip(x, y, z, strict=True))
@@ -70,7 +76,7 @@ def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range
 
 
 def sizes(key: Key, model: Model, *, geoms: tuple[str, ...], scale: PositiveRange) -> Drawn:
-    """Multiplies each edge of drawn geoms by a uniform factor of its own."""
+    """Scales each edge of drawn geoms by a uniform factor of its own."""
     rows = model.rows("geom", geoms)
     factor = jax.random.uniform(key, (len(rows), 3), minval=scale[0], maxval=scale[1])
     return {"geom_size": (rows, model.fields["geom_size"][rows] * factor)}

@@ -1,1 +1,1 @@
-"""Distillation: a student who sees learns from a teacher who knows. Its config, its networks and its learner."""
+"""Distillation: a student with cameras learns from a teacher that is told the state. Its config, networks and learner."""

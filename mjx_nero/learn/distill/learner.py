@@ -1,10 +1,10 @@
-"""Distillation on the student's own path (DAgger: Ross, Gordon and Bagnell 2011), all of it in one compiled program.
+"""Distillation on the student's own path (DAgger: Ross, Gordon and Bagnell 2011), all in one compiled program.
 
-The student acts in nearly all environments, the teacher labels every step with what it would do there, and the student learns the
-labels from what it senses and sees. Where the objects are is a second target, from the same features. Pictures are drawn within
-the step, and none outlives its iteration.
+The student acts in nearly all environments. The teacher labels every step with its own action there, and the student learns the
+labels from what it senses and sees. Object positions are a second target, from the same features. Pictures are drawn within the
+step, and none outlives its iteration.
 
-To be read from top to bottom.
+Read it from top to bottom.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ _METRICS = ("loss", "action_loss", "truth_loss", "seen_error")
 
 @struct.dataclass
 class TrainState:
-    """All of a run: saved and loaded as it is, training goes on bit for bit."""
+    """The whole state of a run. Training that resumes from a saved state continues bit for bit."""
 
     normalizer: running_statistics.RunningStatisticsState
     params: Any
@@ -50,9 +50,9 @@ class TrainState:
 
 @struct.dataclass
 class Batch:
-    """What an update learns from. Leaves are [step, ...]."""
+    """The data of an update. Leaves are [step, ...]."""
 
-    obs: dict[str, Any]  # what the student reads, and the truth
+    obs: dict[str, Any]  # the student's observations, and the truth
     label: jax.Array
 
 
@@ -60,12 +60,12 @@ class Learner:
     """A student on a batch of environments.
 
     Args:
-        env: from ``wrappers.for_training``; with the observation groups of ``envs.tasks.seeing``.
+        env: batch of environments from ``wrappers.for_training``, with the observation groups of ``envs.tasks.seeing``.
         cfg: with ``num_envs`` filled in.
-        num_devices: one.
+        num_devices: must be one.
 
     Raises:
-        UserError: sizes that do not go together, several devices, or nobody can teach.
+        UserError: sizes conflict, there are several devices, or no policy can teach.
     """
 
     def __init__(self, env: Env, cfg: DistillCfg, num_devices: int = 1):
@@ -86,7 +86,7 @@ class Learner:
         self._optimizer = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam)
 
     def init(self, key: Key, bank: Bank | None = None) -> TrainState:
-        """A fresh student, and environments spread over their episodes so that they don't all end at once."""
+        """Makes a new student and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.network, self.sizes, k_net)
         env_state = self.env.reset(jax.random.split(k_env, self.num_envs), bank)
@@ -99,28 +99,28 @@ class Learner:
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)  # none weakly typed, as ``run`` gives none back
 
     def place(self, state: TrainState) -> TrainState:
-        """The state: there is one device."""
+        """Returns the state: there is only one device."""
         return state
 
     def policy(self, state: TrainState) -> tuple[Any, Any]:
-        """Statistics and parameters."""
+        """Returns statistics and parameters."""
         return state.normalizer, state.params
 
     def with_policy(self, state: TrainState, params: tuple[Any, Any]) -> TrainState:
-        """Starts a fresh state from a student."""
+        """Returns a new state that starts from a student."""
         normalizer, params = params
         return dataclasses.replace(state, normalizer=normalizer, params=params)
 
     def slower(self, state: TrainState) -> TrainState:
-        """A tenth of the learning rate, and other draws."""
+        """Returns the state with a tenth of the learning rate, and other random draws."""
         return dataclasses.replace(state, pace=0.1 * state.pace, key=jax.random.fold_in(state.key, 1))
 
     def act(self, params: tuple[Any, Any], obs: Observation) -> jax.Array:
-        """The student's action."""
+        """Computes the student's action."""
         return apply(self.network, params, obs)[0]
 
     def describe(self) -> dict[str, Any]:
-        """The student, for the policy's file."""
+        """Describes the student for the policy's file."""
         return {"student": config.to_dict(self.cfg.student)}
 
     def footprint(self) -> tuple[float, float]:
@@ -134,7 +134,7 @@ class Learner:
         return fixed, own / cfg.num_envs + 1.1 * cfg.unroll_length * (obs + 8 * env.action_size) + acting
 
     def _seen_bytes(self) -> float:
-        """What the convolutions give for one step, in bfloat16."""
+        """Bytes of the convolutions' outputs for one step, in bfloat16."""
         total = 0.0
         for height, width, _ in self.sizes[SEEN].values():
             total += sum(2 * count * height * width / 4 ** (i + 1) for i, count in enumerate(self.cfg.student.channels))

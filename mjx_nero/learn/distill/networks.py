@@ -1,4 +1,4 @@
-"""The student's networks: made by a config, rebuilt from what a policy's file says of them."""
+"""The student's networks: made from a config, and rebuilt from the description in a policy's file."""
 
 import functools
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ class Student(linen.Module):
 
 
 def init_params(net: Student, sizes: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
-    """Fresh (statistics of what is sensed and of the truth, the network's parameters)."""
+    """Makes new (statistics of what is sensed and of the truth, network parameters)."""
     shapes = {name: specs.Array(tuple(sizes[name]), jnp.dtype("float32")) for name in (SENSED, TRUTH)}
     normalizer = running_statistics.init_state(shapes).replace(std_eps=jnp.float32(1e-4))
     pictures = {name: jnp.zeros((1, *shape)) for name, shape in sizes[SEEN].items()}
@@ -72,7 +72,7 @@ def init_params(net: Student, sizes: Mapping[str, Any], key: Key) -> tuple[Any, 
 
 
 def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.Array, jax.Array]:
-    """Action, and where the objects are in units of their deviation."""
+    """Computes the action, and the positions of objects in units of their deviation."""
     normalizer, variables = params
     of_sensed = running_statistics.NestedMeanStd(mean=normalizer.mean[SENSED], std=normalizer.std[SENSED])
     sensed = running_statistics.normalize(obs[SENSED], of_sensed, max_abs_value=_MOST)
@@ -80,7 +80,7 @@ def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.
 
 
 def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
-    """The student that a policy file describes: a template of its parameters, and how it acts."""
+    """Rebuilds the student that a policy file describes: a template of its parameters, and its act function."""
     sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=lambda node: isinstance(node, list | tuple))
     net = Student(read(StudentCfg, meta["student"], "student"), meta["action_size"], sizes[TRUTH][0])
     template = jax.eval_shape(functools.partial(init_params, net, sizes), jax.random.PRNGKey(0))

@@ -1,4 +1,4 @@
-"""Who teaches: a policy that is told what the student has to see."""
+"""Teachers: policies that are told what the student has to see."""
 
 import pathlib
 from collections.abc import Mapping
@@ -10,17 +10,17 @@ from mjx_nero.learn import checkpoint, header, policy
 from mjx_nero.sim.fingerprint import fingerprint
 from mjx_nero.sim.robot import ASSETS
 
-GROUP = "teacher"  # the observation group that it reads, as its own ``state``
+GROUP = "teacher"  # the observation group that the teacher reads as its ``state``
 
 
 def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
-    """The teacher's policy.
+    """Finds the teacher's policy.
 
     Args:
-        given: its file; empty: of the bundled policies the one that reads and does the same with the same robot.
+        given: the policy's file; empty: the bundled policy with the same robot, observations and actions.
 
     Raises:
-        UserError: there is none, or it does not fit.
+        UserError: there is no such policy, or it does not fit.
     """
     if GROUP not in env.cfg.observations:
         raise UserError(f"distillation needs the observation group {GROUP!r}, what the teacher is told: pass --preset rgb")
@@ -40,7 +40,7 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
 
 
 def _misfit(meta: Mapping[str, Any], env: ManipulationEnv) -> str:
-    """Why the policy cannot label; empty if it can."""
+    """Says why the policy cannot label; empty if it can."""
     robot, told = env.cfg.robot, list(env.cfg.observations[GROUP].terms)
     if meta.get("robot") != robot.name or meta.get("fingerprint") != fingerprint(robot):
         return f"it is of another robot ({meta.get('robot')}; here {robot.name})"

@@ -100,7 +100,7 @@ class Episodes:
 
     @property
     def pictures(self) -> list[np.ndarray]:
-        """What the policy's cameras saw in colour, uint8 [steps, k, height, width, 3], an entry a camera."""
+        """Colour pictures of the policy's cameras, uint8 [steps, k, height, width, 3], one entry per camera."""
         return [np.asarray(x) for x in jax.tree.leaves(self.record.obs) if x.ndim == 5 and x.dtype == np.uint8]
 
     def episode(self, index: int) -> Record:

@@ -1,6 +1,6 @@
-"""Cameras of a scene: what they see, as arrays, for terms and policies.
+"""Cameras of a scene: their pictures as arrays, for terms and policies.
 
-A drawer is one module with one class; ``make`` picks it. All of them draw the same visual model, and give the same ``Picture``.
+A drawer is one module with one class; ``make`` picks it. All drawers draw the same visual model, and give the same ``Picture``.
 """
 
 import copy
@@ -22,14 +22,14 @@ _UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
 
 
 class Drawer(Protocol):
-    """Draws what the cameras of a model see."""
+    """Draws the pictures of a model's cameras."""
 
     def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
         """Draws the pictures of one world, by camera; vmap it for many. Pure.
 
         Args:
             qpos: [nq].
-            fields: the drawn model's fields that differ from world to world, by MuJoCo's names.
+            fields: fields of the drawn model that differ from world to world, by MuJoCo's names.
         """
         ...
 
@@ -43,14 +43,14 @@ class Drawer(Protocol):
 
 
 class Cameras:
-    """What the cameras of a scene see of a world.
+    """Draws the pictures of a scene's cameras, one world at a time.
 
     Args:
         model: the scene with visual shapes, from ``scene.build``.
         cfg: the cameras by name.
         renderer: ``mujoco`` (OpenGL) or ``warp`` (MuJoCo Warp's ray tracer).
-        objects, obstacles: names of those whose size, place or colour differs from world to world.
-        fields: names of further fields of the model that do (``Scenery.look``).
+        objects, obstacles: names of objects and obstacles whose size, place or colour differs from world to world.
+        fields: further fields of the model that differ (``Scenery.look``).
 
     Raises:
         UserError: this machine cannot draw them.

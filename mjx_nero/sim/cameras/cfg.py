@@ -1,4 +1,4 @@
-"""What a camera is, and how it comes into MuJoCo's model."""
+"""The config of a camera, and how a camera enters MuJoCo's model."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from mjx_nero.config.bounds import Bounds
 from mjx_nero.types import UserError
 
 KINDS = ("rgb", "depth", "segmentation")
-MARK = "scene.cameras."  # before a camera's name in MuJoCo's model: that has cameras for people, too
+MARK = "scene.cameras."  # prefix of a camera's name in MuJoCo's model, which also has cameras for people
 Pixels = Annotated[int, Bounds(1, 2048)]
 
 
@@ -20,12 +20,12 @@ class CameraCfg:
     """A pinhole camera, fixed in the world or on a link.
 
     Attributes:
-        link: body that carries it; empty: it stands in the world.
+        link: body that carries it; empty: fixed in the world.
         pos: place in the frame of the link or the world [m].
         quat: orientation there, wxyz. A camera looks along its -z axis; y points up in the picture.
         fovy: vertical field of view [deg].
         size: width and height [pixels].
-        kinds: what it sees: ``rgb``, ``depth``, ``segmentation``, one or more.
+        kinds: one or more of ``rgb``, ``depth`` and ``segmentation``.
     """
 
     link: str = ""
@@ -43,7 +43,7 @@ class CameraCfg:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of its pictures."""
+        """Rows and columns of the pictures."""
         return self.size[1], self.size[0]
 
 

@@ -1,4 +1,4 @@
-"""Where a robot's cameras go if nobody says: found from the robot's shapes and from where it works."""
+"""Default places of a robot's cameras, found from the robot's shapes and its regions."""
 
 import functools
 import itertools
@@ -14,14 +14,14 @@ from mjx_nero.types import UserError
 Size = tuple[int, int]
 Cameras = dict[str, CameraCfg]
 
-_FRONT = np.array([1.0, -0.45, 0.75])  # from where it works towards the camera, ahead of the robot: it hides little from there
-_MARGIN = 0.04  # around where it works [m]
-_ASIDE = (0.05, 0.07, 0.09, 0.12, 0.15)  # how far from the hand's axis a camera may be [m]
-_BEHIND = (0.02, 0.06, 0.1, 0.14)  # ... and behind the grasp point
-_AHEAD = 0.03  # the wrist's camera looks at what is that far ahead of the grasp point [m]
-_CLEAR = 0.012  # what is nearer to a point than that is the point's own [m]
-_FREE = 0.01  # around a camera [m]
-_EQUAL = 4  # places that see so many points more or less are equal
+_FRONT = np.array([1.0, -0.45, 0.75])  # direction from the region to the camera, ahead of the robot, where the robot hides little
+_MARGIN = 0.04  # [m] margin around the regions
+_ASIDE = (0.05, 0.07, 0.09, 0.12, 0.15)  # [m] distances of a camera from the hand's axis
+_BEHIND = (0.02, 0.06, 0.1, 0.14)  # [m] distances behind the grasp point
+_AHEAD = 0.03  # [m] the wrist's camera looks this far ahead of the grasp point
+_CLEAR = 0.012  # [m] shapes nearer to a point than this belong to it
+_FREE = 0.01  # [m] free space around a camera
+_EQUAL = 4  # places whose numbers of visible points differ by no more are equal
 
 
 def find(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",)) -> Cameras:
@@ -34,7 +34,7 @@ def find(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb"
 
 
 def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 45.0) -> CameraCfg:
-    """A camera in the world, opposite the robot, as near as it can be and see all of where the robot grasps and holds.
+    """Places a camera in the world, opposite the robot, as near as it can be and still see all of the robot's regions.
 
     Raises:
         UserError: the robot does not say where that is.
@@ -83,7 +83,7 @@ def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 
 
 def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:
-    """How many points between and ahead of the fingers nothing hides from a camera at ``pos`` in the link's frame."""
+    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame sees unhidden."""
     data, count, hit = mujoco.MjData(model), 0, np.zeros(1, np.int32)
     for fingers in (robot.gripper.open, robot.gripper.close):
         for joint, position in zip(robot.joints, (*robot.arm.home, *fingers), strict=True):

@@ -35,7 +35,7 @@ _FORCES = (  # of mjtDisableBit
 
 
 def missing(m: mujoco.MjModel) -> list[str]:
-    """What a model has that these kernels do not know; with any of it MuJoCo Warp's own have to step it."""
+    """Names what a model has that these kernels do not know, so that MuJoCo Warp's own must step it."""
     linked = np.isin(m.eq_type, _LINKS)
     free = m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     driven = m.jnt_type[m.actuator_trnid[:, 0]]
@@ -61,7 +61,7 @@ def missing(m: mujoco.MjModel) -> list[str]:
 
 
 def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[], None]]:
-    """What comes before the contacts, and what after the constraints' forces.
+    """Makes the parts of a step before the contacts and after the constraint forces.
 
     Args:
         m: without anything that is ``missing``.

@@ -64,7 +64,7 @@ class NativePhysics:
 
     @functools.cached_property
     def _key(self) -> int:
-        """What this physics computes, as a number that is the same in every process."""
+        """Identifies what this physics computes, by a number that is the same in every process."""
         model = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, model)
         told = hashlib.sha256(model.tobytes() + repr((self.decimation, tuple(self._fields))).encode()).digest()

@@ -1,4 +1,4 @@
-"""What a user waits for before the first training step: every second of it, with empty caches and with filled ones."""
+"""Measures the start of a training: every second before the first step, with empty and with filled caches."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What the cameras of an environment see, and how much of its objects: a sheet of pictures, and a table."""
+"""Shows the pictures of an environment's cameras, and how much of its objects they see: a sheet of pictures, and a table."""
 
 import dataclasses
 
@@ -74,7 +74,7 @@ def sheet(seen: Seen) -> np.ndarray:
 
 
 def table(seen: Seen) -> console.Table:
-    """How much the cameras see."""
+    """Makes a table of how much the cameras see."""
     view = console.Table("cameras", ("camera", "pixels", "object", "seen in", "pixels of it"), left=("camera", "object"))
     for (camera, name), (share, count) in seen.shares.items():
         height, width = seen.pictures[camera].rgb.shape[1:3]
