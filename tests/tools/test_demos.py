@@ -46,12 +46,19 @@ def test_what_a_step_holds(made):
 
 
 def test_labels_stand_beside_what_noise_made_of_them(made):
-    """The arm's targets differ, the fingers' do not; a label is what a policy without noise would tell the drives there."""
+    """The arm's targets differ, the fingers' do not; a label is what a policy without noise would tell the drives there, at once:
+    set-points follow the velocities that it asks for by 1 - exp(-0.02 / 0.15), and at first are at the joints."""
     found = open_dataset(made)
-    off = found.column(names.EXECUTED) - found.column(names.ACTION)
-    assert np.abs(off[:, :7]).max() > 1e-3 and np.abs(off[:, 7:]).max() == 0
-    draws = off.reshape(6, 10, 9)[:, 0]
-    assert len(np.unique(draws, axis=0)) == 6  # each episode has its own
+    off = (found.column(names.EXECUTED) - found.column(names.ACTION)).reshape(6, 10, 9)
+    assert np.abs(off[..., :7]).max() > 1e-3 and np.abs(off[..., 7:]).max() == 0
+    assert len(np.unique(off[:, 5], axis=0)) == 6  # each episode has its own
+    arm, share = registry.robot("nero").arm, 1 - np.exp(-0.02 / 0.15)
+    rate = share * np.clip(found.column(names.DONE_BY).reshape(6, 10, 8)[:, 0, :7], -1, 1)
+    wanted = np.array(arm.home) + (0.02 + np.array(arm.lead)) * np.array(arm.speed) * rate
+    first = found.column(names.ACTION).reshape(6, 10, 9)[:, 0, :7]
+    free = np.abs(first - np.array(arm.home)) < 0.05  # of limits of joints
+    np.testing.assert_allclose(first[free], wanted[free], atol=1e-4)
+    assert free.sum() > 20
 
 
 def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
