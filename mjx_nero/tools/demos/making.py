@@ -16,7 +16,7 @@ from mjx_nero.data import Feature, Schema, units
 from mjx_nero.data import episode as names
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import for_controllers
+from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import policy
 from mjx_nero.learn.distill import teachers
@@ -189,4 +189,9 @@ def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
     robot = about.get("robot_folder") or about["robot"]
     cfg = registry.env_cfg(about["env"], about["preset"], robot).uncorrupted()
     cfg = config.override(cfg, about["env_fields"])
-    return ManipulationEnv(for_controllers(cfg) if drives or about["through"] == "drives" else cfg, impl="native")
+    return ManipulationEnv(by_drives(cfg, about["through"]) if drives or about["through"] == "drives" else cfg, impl="native")
+
+
+def by_drives(cfg: EnvCfg, through: str) -> EnvCfg:
+    """The task by drive targets, with the arm that a data set's agent had: who acts through drives has its weight carried."""
+    return for_controllers(cfg) if through == "drives" else dataclasses.replace(cfg, actions=drive_targets())

@@ -22,6 +22,7 @@ class MjxNeroEnv(EnvConfig):
         preset: of the environment's presets.
         robot: another than the environment's own, by name or folder.
         units: of joints, as in the data set: auto, si or lerobot.
+        through: who made the data set acted through: task (a policy) or drives (an expert), as ``demos --inspect`` says.
         cameras: whose pictures the policy sees, with commas between them, as ``demos --cameras``.
         width, height: of a picture [pixels].
         fps: filled in, as are the features: control steps a second.
@@ -31,6 +32,7 @@ class MjxNeroEnv(EnvConfig):
     preset: str = "default"
     robot: str | None = None
     units: str = "auto"
+    through: str = "task"
     cameras: str = ""
     width: int = 64
     height: int = 64
@@ -74,6 +76,7 @@ class MjxNeroEnv(EnvConfig):
             "preset": self.preset,
             "robot": self.robot,
             "units": self.units,
+            "through": self.through,
             "cameras": self.cameras,
             "size": size,
         }

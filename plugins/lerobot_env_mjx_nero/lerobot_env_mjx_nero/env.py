@@ -10,7 +10,6 @@ import numpy as np
 
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import for_controllers
 from mjx_nero.learn.play.demonstrations import environment_state
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim.render import Renderer
@@ -23,14 +22,15 @@ class Programs:
     Args:
         task, preset, robot: of ``registry.env_cfg``.
         units: of ``making.units_of``.
+        through: of the data set, as ``demos --inspect`` says it: task (a policy's) or drives (an expert's).
         cameras: names with commas between them.
         size: width and height of a picture [pixels].
     """
 
-    def __init__(self, task: str, preset: str, robot: str | None, units: str, cameras: str, size: tuple[int, int]):
+    def __init__(self, task: str, preset: str, robot: str | None, units: str, through: str, cameras: str, size: tuple[int, int]):
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
         cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are drawn here
-        self.env = env = ManipulationEnv(for_controllers(cfg), impl="native")
+        self.env = env = ManipulationEnv(making.by_drives(cfg, through), impl="native")
         names = [name for name in cameras.split(",") if name]
         self.cameras = Cameras(env, names, size) if names else None
         self.units = making.units_of(env, units)
@@ -76,11 +76,12 @@ class Env(gymnasium.Env):
         preset: str = "default",
         robot: str | None = None,
         units: str = "auto",
+        through: str = "task",
         cameras: str = "",
         size: tuple[int, int] = (64, 64),
         render_mode: str = "rgb_array",
     ):
-        self._programs = made(task, preset, robot, units, cameras, tuple(size))
+        self._programs = made(task, preset, robot, units, through, cameras, tuple(size))
         env = self._programs.env
         self.render_mode, self.task, self.task_description = render_mode, task, making.sentence(task)
         self.metadata = {**self.metadata, "render_fps": round(1 / env.dt)}
