@@ -20,6 +20,8 @@ from mjx_nero.data.episode import Dataset, Episode, Schema, check
 from mjx_nero.data.lerobot_files import pa, parquet
 from mjx_nero.errors import UserError
 
+_PLAIN = {"use_dictionary": False, "write_statistics": False}  # numbers that hardly come twice: both would take most of the time
+
 
 class LeRobotForm:
     """A data set in a folder that is claimed, or only read.
@@ -88,7 +90,7 @@ class LeRobotForm:
             {
                 **first,
                 **{lf.name_of(lf.film(name), self._pieces): film(name) for name in self._pictures},
-                lf.name_of(lf.DATA, self._pieces): lambda path: parquet.write_table(steps, path),
+                lf.name_of(lf.DATA, self._pieces): lambda path: parquet.write_table(steps, path, **_PLAIN),
                 lf.name_of(lf.EPISODES, self._pieces): lambda path: parquet.write_table(self._about(episodes, of_pictures), path),
                 lf.INFO: lambda path: path.write_text(json.dumps(lf.info(self.schema, *totals), indent=2)),
             },

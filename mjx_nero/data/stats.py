@@ -19,13 +19,14 @@ def of(values: np.ndarray) -> Stats:
         name -> [numbers], float64; of ``count`` [1], int64.
     """
     ordered = np.sort(values.T.astype(np.float32), axis=1)  # along contiguous memory
-    wide = ordered.astype(np.float64)
-    out = {"min": wide[:, 0], "max": wide[:, -1], "mean": wide.mean(axis=1), "std": wide.std(axis=1)}
+    mean, std = ordered.mean(axis=1, dtype=np.float64), ordered.std(axis=1, dtype=np.float64)
+    out = {"min": ordered[:, 0].astype(np.float64), "max": ordered[:, -1].astype(np.float64), "mean": mean, "std": std}
     for name, share in QUANTILES.items():
         at = share * (len(values) - 1)
         low = int(at)
         high = min(low + 1, len(values) - 1)
-        out[name] = wide[:, low] + (at - low) * (wide[:, high] - wide[:, low])
+        ends = ordered[:, [low, high]].astype(np.float64)
+        out[name] = ends[:, 0] + (at - low) * (ends[:, 1] - ends[:, 0])
     return {**out, "count": np.array([len(values)])}
 
 

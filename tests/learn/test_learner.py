@@ -126,7 +126,9 @@ def test_another_learner_trains_is_resumed_played_and_measured(search, call, tmp
 def test_names_of_learners(search, call):
     with pytest.raises(UserError, match="there is a learner 'search' already: choose another name"):
         learner.KINDS.add("search", learner.find("search"))
-    with pytest.raises(UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, distill, search"):
+    with pytest.raises(
+        UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, clone, distill, search"
+    ):
         learner.find("pop")
     code, _, err = call("train", "--learner", "search", "--ppo.num_epochs", 3)
     assert code == 2 and "--ppo.* is for --learner ppo, and this is search" in err

@@ -4,6 +4,7 @@ import json
 import pathlib
 import re
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 
@@ -46,12 +47,19 @@ def test_what_a_step_holds(made):
 
 
 def test_labels_stand_beside_what_noise_made_of_them(made):
-    """The arm's targets differ, the fingers' do not; a label is what a policy without noise would tell the drives there."""
+    """The arm's targets differ, the fingers' do not; a label is what a policy without noise would tell the drives there, at once:
+    set-points follow the velocities that it asks for by 1 - exp(-0.02 / 0.15), and at first are at the joints."""
     found = open_dataset(made)
-    off = found.column(names.EXECUTED) - found.column(names.ACTION)
-    assert np.abs(off[:, :7]).max() > 1e-3 and np.abs(off[:, 7:]).max() == 0
-    draws = off.reshape(6, 10, 9)[:, 0]
-    assert len(np.unique(draws, axis=0)) == 6  # each episode has its own
+    off = (found.column(names.EXECUTED) - found.column(names.ACTION)).reshape(6, 10, 9)
+    assert np.abs(off[..., :7]).max() > 1e-3 and np.abs(off[..., 7:]).max() == 0
+    assert len(np.unique(off[:, 5], axis=0)) == 6  # each episode has its own
+    arm, share = registry.robot("nero").arm, 1 - np.exp(-0.02 / 0.15)
+    rate = share * np.clip(found.column(names.DONE_BY).reshape(6, 10, 8)[:, 0, :7], -1, 1)
+    wanted = np.array(arm.home) + (0.02 + np.array(arm.lead)) * np.array(arm.speed) * rate
+    first = found.column(names.ACTION).reshape(6, 10, 9)[:, 0, :7]
+    free = np.abs(first - np.array(arm.home)) < 0.05  # of limits of joints
+    np.testing.assert_allclose(first[free], wanted[free], atol=1e-4)
+    assert free.sum() > 10
 
 
 def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
@@ -116,3 +124,22 @@ def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
     code, _, err = call("mjx_nero", "demos", *argv)
     assert code == 2 and message in err and err.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(call, tmp_path):
+    """The bundled policy acts, told where the cube is; both cameras see it as the preset has it looks."""
+    argv = [*SHORT, "--preset", "rgb", "--episodes", 3, "--cameras", "front,wrist", "--out", "d"]
+    code, _, err = call("mjx_nero", "demos", *argv)
+    assert code == 0, err
+    found = open_dataset(tmp_path / "d")
+    for camera in ("front", "wrist"):
+        frames = found.column(names.PICTURES + camera).reshape(3, 10, 64, 64, 3)
+        assert frames.std() > 10
+        first = frames[:, 0].reshape(3, -1, 3).mean(axis=1)
+        assert np.abs(first[0] - first[1]).max() > 2 and np.abs(first[1] - first[2]).max() > 2  # of 255
+    code, out, _ = call("mjx_nero", "demos", "--inspect", "d", "--sheet", "sheet.png")
+    assert code == 0 and "pictures: sheet.png" in out
+    assert imageio.imread(tmp_path / "sheet.png").shape[1] % (6 * 64) == 0  # three moments by two cameras
+    code, _, err = call("mjx_nero", "demos", *argv[:-1], "e", "--cameras", "ceiling")
+    assert code == 2 and "ceiling: no camera of this environment: choose from front, wrist, side" in err

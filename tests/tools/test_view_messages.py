@@ -167,6 +167,7 @@ def test_a_key_moves_the_hand_and_only_commands_that_there_are_are_heard(lift):
     agent = lift.panel.agent
     with talk(lift) as client:
         threading.Thread(target=drain, args=(client,), daemon=True).start()
+        look(lift, client)
         say(client, "CommandTriggerMessage", uuid=commands["hand up"])
         wait(lambda: agent.value == "your hand")
         say(client, "GuiUpdateMessage", uuid=controls(lift)["Give back"][0], updates={"value": True})

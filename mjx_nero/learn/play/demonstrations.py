@@ -25,7 +25,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
-from mjx_nero.types import Key, Scenery, View
+from mjx_nero.types import DelayMemory, Key, Scenery, View
 
 SMOOTH_S = 0.2  # [s] time constant of the noise: the drives would swallow what changes in every step
 _NOISE = 0xDA27  # folded into an episode's key
@@ -118,7 +118,7 @@ class Player:
         """Features of a step of one environment: its state before, label, what was done, and its outcome."""
         env = self.env
         view = env.view(state)
-        label, told = env.targets(state, clean), after.pipeline_state.ctrl
+        label, told = env.targets(_prompt(state, clean), clean), after.pipeline_state.ctrl
         seen = state.obs["state"]
         parts = jax.tree.leaves(seen)  # of a group that stays apart, its terms by name
         label, told = (self._deltas(view, x) if self._hand else self.units.shown(x) for x in (label, told))
@@ -152,6 +152,18 @@ def environment_state(env: ManipulationEnv, view: View) -> Float[Array, " n"]:
     poses += [(seen.pos_w, seen.quat_w) for name, seen in view.objects.items() if name in env.cfg.scene.objects]
     poses += [(view.goal_pos_w, view.goal_quat_w)]
     return jnp.concatenate([x for pose in poses for x in pose])
+
+
+def _prompt(state: State, action: Float[Array, " na"]) -> State:
+    """The state with ``action`` already in all delays of actions: a label is what the agent asks for now, and comes at once."""
+    carry = state.info["carry"]
+    memory = {
+        name: dataclasses.replace(held, past=jnp.broadcast_to(action, held.past.shape))
+        if name.startswith("actions.") and isinstance(held, DelayMemory)
+        else held
+        for name, held in carry.memory.items()
+    }
+    return state.replace(info={**state.info, "carry": carry.replace(memory=memory)})
 
 
 def start(env: ManipulationEnv, number: int, seed: int) -> State:

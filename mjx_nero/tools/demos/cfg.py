@@ -31,7 +31,7 @@ class DemosCfg:
         holds: all of a step, or arm: only what a real arm knows, too, so that both go together.
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
         cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
-        picture: width and height of a picture in pixels, even numbers.
+        picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
         form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).
         task: sentence that says what the robot does (default: the environment's).
         side_by_side: episodes played at a time; each time is written as one piece.
@@ -52,7 +52,7 @@ class DemosCfg:
     holds: Annotated[str, OneOf("all", "arm")] = flag("all")
     units: Annotated[str, OneOf("auto", "si", "lerobot")] = flag("auto")
     cameras: str = flag("")
-    picture: str = flag("128x128")
+    picture: str = flag("")
     form: Annotated[str, OneOf(*FORMS)] = flag("lerobot")
     task: str = flag("")
     side_by_side: Annotated[int, Bounds(1, 65536)] = flag(256)

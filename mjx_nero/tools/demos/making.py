@@ -1,6 +1,7 @@
 """Makes the player of a data set and its schema."""
 
 import argparse
+import dataclasses
 import hashlib
 import math
 import pathlib
@@ -15,9 +16,10 @@ from mjx_nero.data import Feature, Schema, units
 from mjx_nero.data import episode as names
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import for_controllers
+from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import policy
+from mjx_nero.learn.distill import teachers
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.learn.play.demonstrations import Player
 from mjx_nero.learn.play.pictures import Cameras
@@ -53,8 +55,15 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     size = min(cfg.side_by_side, cfg.episodes)
     name = next(iter(env_cfg.controllers), evaluation.EXPERT) if cfg.agent == evaluation.EXPERT else cfg.agent
     drives = not acts and cfg.through == "drives"
+    told = not cfg.policy and teachers.GROUP in env_cfg.observations  # who acts is told what others have to see
+    if not acts or told:  # what no term reads is not drawn
+        kept = {name: env_cfg.observations[name] for name in ("state", teachers.GROUP) if name in env_cfg.observations}
+        env_cfg = dataclasses.replace(env_cfg, observations=kept)
     env = ManipulationEnv(for_controllers(env_cfg) if drives else env_cfg, impl="native", num_envs=size)
-    if acts:
+    if acts and told:
+        teacher = teachers.find(env)
+        agent = rollout.policy_agent(lambda params, obs, key: teacher.act({"state": obs[teachers.GROUP]}))
+    elif acts:
         trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, preset=cfg.preset)
         agent = rollout.policy_agent(lambda params, obs, key: trained.act(obs))
     else:
@@ -82,13 +91,12 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "impl": env.impl,
         "version": mjx_nero.__version__,
     }
-    kept = {name: each for name, each in features(env, shown, cfg.actions).items() if cfg.holds == "all" or name in ARM}
+    held = {name: each for name, each in features(env, shown, cfg.actions).items() if cfg.holds == "all" or name in ARM}
     cameras = cameras_of(env, cfg)
     if cameras:
-        width, height = cameras.size
-        kept |= {names.PICTURES + name: names.picture(height, width) for name in cameras.names}
-    schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), kept, about)
-    return schema, Player(env, agent, shown, size, tuple(kept), cfg.actions == "hand", cfg.noise, cameras)
+        held |= {names.PICTURES + name: names.picture(*size[::-1]) for name, size in cameras.sizes.items()}
+    schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), held, about)
+    return schema, Player(env, agent, shown, size, tuple(held), cfg.actions == "hand", cfg.noise, cameras)
 
 
 def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
@@ -99,7 +107,7 @@ def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
     """
     found = list(dict.fromkeys(name.strip() for name in cfg.cameras.split(",") if name.strip()))
     try:
-        size = cli.size(cfg.picture)
+        size = cli.size(cfg.picture) if cfg.picture else None
     except argparse.ArgumentTypeError as error:
         raise UserError(f"--picture {error}") from None
     return Cameras(env, found, size) if found else None
@@ -181,4 +189,9 @@ def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
     robot = about.get("robot_folder") or about["robot"]
     cfg = registry.env_cfg(about["env"], about["preset"], robot).uncorrupted()
     cfg = config.override(cfg, about["env_fields"])
-    return ManipulationEnv(for_controllers(cfg) if drives or about["through"] == "drives" else cfg, impl="native")
+    return ManipulationEnv(by_drives(cfg, about["through"]) if drives or about["through"] == "drives" else cfg, impl="native")
+
+
+def by_drives(cfg: EnvCfg, through: str) -> EnvCfg:
+    """The task by drive targets, with the arm that a data set's agent had: who acts through drives has its weight carried."""
+    return for_controllers(cfg) if through == "drives" else dataclasses.replace(cfg, actions=drive_targets())

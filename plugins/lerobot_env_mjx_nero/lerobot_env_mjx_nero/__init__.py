@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import gymnasium
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from mjx_nero.envs import registry
 
@@ -22,6 +22,9 @@ class MjxNeroEnv(EnvConfig):
         preset: of the environment's presets.
         robot: another than the environment's own, by name or folder.
         units: of joints, as in the data set: auto, si or lerobot.
+        through: who made the data set acted through: task (a policy) or drives (an expert), as ``demos --inspect`` says.
+        cameras: whose pictures the policy sees, with commas between them, as ``demos --cameras``.
+        width, height: of a picture [pixels].
         fps: filled in, as are the features: control steps a second.
     """
 
@@ -29,6 +32,10 @@ class MjxNeroEnv(EnvConfig):
     preset: str = "default"
     robot: str | None = None
     units: str = "auto"
+    through: str = "task"
+    cameras: str = ""
+    width: int = 64
+    height: int = 64
     fps: int = 0
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
@@ -44,6 +51,11 @@ class MjxNeroEnv(EnvConfig):
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(joints,)),
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(7 * poses,)),
         }
+        for name in filter(None, self.cameras.split(",")):
+            self.features[f"pixels/{name}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(self.height, self.width, 3))
+            self.features_map[f"pixels/{name}"] = f"{OBS_IMAGES}.{name}"
+        if self.cameras:  # who sees is not told
+            del self.features["environment_state"]
 
     @property
     def package_name(self) -> str:
@@ -58,7 +70,16 @@ class MjxNeroEnv(EnvConfig):
     @property
     def gym_kwargs(self) -> dict:
         """Arguments of ``env.Env``."""
-        return {"task": self.task, "preset": self.preset, "robot": self.robot, "units": self.units}
+        size = (self.width, self.height)
+        return {
+            "task": self.task,
+            "preset": self.preset,
+            "robot": self.robot,
+            "units": self.units,
+            "through": self.through,
+            "cameras": self.cameras,
+            "size": size,
+        }
 
 
 if GYM_ID not in gymnasium.registry:

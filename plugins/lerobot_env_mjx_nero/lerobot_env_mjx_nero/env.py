@@ -1,5 +1,6 @@
 """One environment as LeRobot's commands take it: joints' targets in, states out, in the units of a data set of ``demos``."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -9,8 +10,8 @@ import numpy as np
 
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import for_controllers
 from mjx_nero.learn.play.demonstrations import environment_state
+from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim.render import Renderer
 from mjx_nero.tools.demos import making
 
@@ -21,11 +22,17 @@ class Programs:
     Args:
         task, preset, robot: of ``registry.env_cfg``.
         units: of ``making.units_of``.
+        through: of the data set, as ``demos --inspect`` says it: task (a policy's) or drives (an expert's).
+        cameras: names with commas between them.
+        size: width and height of a picture [pixels].
     """
 
-    def __init__(self, task: str, preset: str, robot: str | None, units: str):
+    def __init__(self, task: str, preset: str, robot: str | None, units: str, through: str, cameras: str, size: tuple[int, int]):
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
-        self.env = env = ManipulationEnv(for_controllers(cfg), impl="native")
+        cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are drawn here
+        self.env = env = ManipulationEnv(making.by_drives(cfg, through), impl="native")
+        names = [name for name in cameras.split(",") if name]
+        self.cameras = Cameras(env, names, size) if names else None
         self.units = making.units_of(env, units)
 
         def seen(state):
@@ -42,6 +49,18 @@ class Programs:
 
         self.reset, self.step, self.scenery = jax.jit(reset), jax.jit(step), jax.jit(env.scenery)
 
+    def named(self, state: Any, seen: Any) -> dict[str, Any]:
+        """An observation as LeRobot has it; ``pixels``: by camera, uint8 [height, width, 3]."""
+        out: dict[str, Any] = dict(zip(("agent_pos", "environment_state"), map(np.asarray, seen), strict=True))
+        if self.cameras:
+            del out["environment_state"]
+            shown = (
+                np.asarray(state.pipeline_state.qpos)[None],
+                jax.tree.map(lambda x: x[None], jax.device_get(self.scenery(state))),
+            )
+            out["pixels"] = {name: next(self.cameras.frames(name, *shown)) for name in self.cameras.names}
+        return out
+
 
 made = functools.lru_cache(Programs)
 
@@ -52,9 +71,17 @@ class Env(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
     def __init__(
-        self, task: str, preset: str = "default", robot: str | None = None, units: str = "auto", render_mode: str = "rgb_array"
+        self,
+        task: str,
+        preset: str = "default",
+        robot: str | None = None,
+        units: str = "auto",
+        through: str = "task",
+        cameras: str = "",
+        size: tuple[int, int] = (64, 64),
+        render_mode: str = "rgb_array",
     ):
-        self._programs = made(task, preset, robot, units)
+        self._programs = made(task, preset, robot, units, through, cameras, tuple(size))
         env = self._programs.env
         self.render_mode, self.task, self.task_description = render_mode, task, making.sentence(task)
         self.metadata = {**self.metadata, "render_fps": round(1 / env.dt)}
@@ -63,24 +90,33 @@ class Env(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(np.minimum(low, high), np.maximum(low, high), dtype=np.float32)
         size = 7 * (2 + len(env.cfg.scene.objects))
         boxes = {"agent_pos": len(env.cfg.robot.joints), "environment_state": size}
-        self.observation_space = gymnasium.spaces.Dict(
-            {name: gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32) for name, n in boxes.items()}
-        )
+        spaces: dict[str, Any] = {name: gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32) for name, n in boxes.items()}
+        if drawn := self._programs.cameras:
+            del spaces["environment_state"]
+            pictures = {n: gymnasium.spaces.Box(0, 255, (h, w, 3), np.uint8) for n, (w, h) in drawn.sizes.items()}
+            spaces["pixels"] = gymnasium.spaces.Dict(pictures)
+        self.observation_space = gymnasium.spaces.Dict(spaces)
         self._renderer: Renderer | None = None
         self._state: Any = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict]:
         """A fresh episode; a seed draws all of it."""
         super().reset(seed=seed)
         self._state, seen = self._programs.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
-        return _named(seen), {"is_success": False}
+        return self._programs.named(self._state, seen), {"is_success": False}
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict]:
         """One control step. The info has ``is_success``, which an episode can only have at its end."""
         self._state, seen, out = self._programs.step(self._state, np.asarray(action, np.float32))
         reward, done, truncated, success = (float(x) for x in out)
         ended = done > 0
-        return _named(seen), reward, ended and not truncated, truncated > 0, {"is_success": ended and success > 0}
+        return (
+            self._programs.named(self._state, seen),
+            reward,
+            ended and not truncated,
+            truncated > 0,
+            {"is_success": ended and success > 0},
+        )
 
     def render(self) -> np.ndarray:
         """A frame, uint8 [height, width, 3]."""
@@ -93,7 +129,3 @@ class Env(gymnasium.Env):
         if self._renderer:
             self._renderer.__exit__()
             self._renderer = None
-
-
-def _named(seen: Any) -> dict[str, np.ndarray]:
-    return dict(zip(("agent_pos", "environment_state"), map(np.asarray, seen), strict=True))
