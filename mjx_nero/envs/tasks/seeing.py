@@ -1,7 +1,7 @@
-"""A task seen through cameras: pictures take the place of what is told of objects.
+"""Tasks seen through cameras: pictures replace the observations of objects.
 
-Presets ``rgb``, ``depth``, ``rgbd``, and each with ``_fixed`` behind it. A teacher who is told where the objects are shows a
-student who is not (``learn.distill``).
+The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``. A teacher that is told the objects'
+positions trains a student that is not (``learn.distill``).
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ from mjx_nero.types import UserError
 
 SIZE = (64, 64)  # pixels
 DISTRACTORS = 6
-STEPS, STEPS_ON_CPU = 20_000_000, 200_000  # env steps of a training
+STEPS, STEPS_ON_CPU = 20_000_000, 200_000  # env steps of a training run
 _READS = {"rgb": (images.rgb, ("rgb",)), "depth": (images.depth, ("depth",)), "rgbd": (images.rgbd, ("rgb", "depth"))}
-FIXED = "_fixed"  # behind a preset's name: every episode looks the same
+FIXED = "_fixed"  # suffix of a preset whose episodes all look the same
 PRESETS = (*_READS, *(name + FIXED for name in _READS))
 
 
 def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
-    """The task by pictures of a camera in front and one at the wrist.
+    """Returns the task with a camera in front and one at the wrist.
 
-    Its observation groups: ``state`` has the robot and the goal alone, ``pictures`` what the cameras see, ``teacher`` what was
-    ``state`` before, and ``truth`` where the objects are.
+    The observation group ``state`` has only the robot and the goal, ``pictures`` the cameras' pictures, ``teacher`` what
+    ``state`` was before, and ``truth`` the positions of objects.
 
     Args:
         sees: one of ``PRESETS``.

@@ -10,17 +10,17 @@ from mjx_nero.learn.ppo.cfg import NetworkCfg, Rate
 
 @dataclasses.dataclass(frozen=True)
 class CloneCfg:
-    """Hyperparameters. ``num_envs`` and ``num_timesteps`` 0: chosen for the machine.
+    """Hyperparameters. 0 for ``num_envs`` or ``num_timesteps`` lets the machine decide.
 
     Attributes:
         data: folder of the demonstrations (``demos --out``).
-        num_envs: environments, which only evaluations step.
-        num_timesteps: steps of demonstrations to learn from, each as often as it comes, in all.
-        minibatch_size: steps of an update.
-        updates: of an iteration.
-        learning_rate: at first; it falls to nothing along half a cosine.
-        max_grad_norm: longer gradients are shortened to this.
-        weight_decay: how much of a weight is taken away, times the learning rate, in an update.
+        num_envs: number of environments; only evaluations step them.
+        num_timesteps: total steps of demonstrations to learn from, repeats included.
+        minibatch_size: steps per update.
+        updates: updates per iteration.
+        learning_rate: initial learning rate; it falls to zero along half a cosine.
+        max_grad_norm: greatest norm of the gradient.
+        weight_decay: share of a weight that an update removes, times the learning rate.
     """
 
     data: str = ""

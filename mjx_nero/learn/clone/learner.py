@@ -1,7 +1,7 @@
-"""Cloning (Pomerleau 1989): the policy's network learns to give the demonstrated action for what the demonstrator saw.
+"""Cloning (Pomerleau 1989): the policy's network learns the demonstrated action for what the demonstrator saw.
 
-The environments are stepped by evaluations alone. The network is PPO's, so that whatever plays or exports a policy takes this
-one, and PPO can go on from it.
+Only evaluations step the environments. The network is PPO's, so whatever plays or exports a policy takes it, and PPO can continue
+from it.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from mjx_nero.types import Bank, Key
 
 @struct.dataclass
 class CloneState:
-    """All of a run."""
+    """The whole state of a run."""
 
     normalizer: Any
     params: Any
@@ -41,12 +41,12 @@ class CloneState:
 
 
 class Learner:
-    """See ``learner.Learner``.
+    """A ``learner.Learner`` that learns from demonstrations.
 
     Args:
-        env: from ``wrappers.for_training``.
+        env: batch of environments, from ``wrappers.for_training``.
         cfg: with ``num_envs`` and ``num_timesteps`` filled in.
-        num_devices: one.
+        num_devices: must be one.
 
     Raises:
         UserError: no demonstrations, or those of something else; more devices than one.
@@ -71,7 +71,7 @@ class Learner:
         )
 
     def init(self, key: Key, bank: Bank | None = None) -> CloneState:
-        """Fresh networks; observations are normalised by the demonstrations' mean and deviation."""
+        """Makes new networks; the demonstrations' mean and deviation normalise observations."""
         k_net, k_seed = jax.random.split(key)
         normalizer, params = init_params(self._networks, self._sizes, k_net)
         normalizer = normalizer.replace(
@@ -83,7 +83,7 @@ class Learner:
         return CloneState(normalizer, params, opt_state, jnp.zeros((), jnp.int32), seed, jnp.ones(()))
 
     def place(self, state: CloneState) -> CloneState:
-        """There is one device."""
+        """Returns the state: there is only one device."""
         return state
 
     def run(self, state: CloneState, iterations: int) -> tuple[CloneState, dict[str, Array]]:
@@ -108,7 +108,7 @@ class Learner:
         return dataclasses.replace(state, params=params, opt_state=opt_state, iteration=state.iteration + 1), losses.mean()
 
     def _draw(self, seed: Any, iteration: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The steps that an iteration learns from, out of the host's memory [updates, steps, numbers]."""
+        """Draws the steps that an iteration learns from, in the host's memory [updates, steps, numbers]."""
         drawn = np.random.default_rng((int(seed), int(iteration)))
         rows = drawn.integers(len(self._seen), size=(self.cfg.updates, self.cfg.minibatch_size))
         return self._seen[rows], self._done[rows]
@@ -119,27 +119,27 @@ class Learner:
         return jnp.mean((make_act(self._networks, params)({ACTOR: seen}) - done) ** 2)
 
     def policy(self, state: CloneState) -> tuple:
-        """Normalizer and network parameters."""
+        """Returns normalizer and network parameters."""
         return state.normalizer, state.params
 
     def with_policy(self, state: CloneState, params: tuple) -> CloneState:
-        """A fresh state that starts from a policy."""
+        """Returns a new state that starts from a policy."""
         return dataclasses.replace(state, normalizer=params[0], params=params[1])
 
     def slower(self, state: CloneState) -> CloneState:
-        """A tenth of the learning rate, and other draws."""
+        """Returns the state with a tenth of the learning rate, and other random draws."""
         return dataclasses.replace(state, slow=0.1 * state.slow, seed=state.seed + 1)
 
     def act(self, params: tuple, obs: Observation) -> jax.Array:
-        """The mode of the action's distribution."""
+        """Returns the mode of the action distribution."""
         return make_act(self._networks, params)(obs)
 
     def describe(self) -> dict[str, Any]:
-        """The networks, for the policy's file."""
+        """Describes the networks for the policy's file."""
         return {"network": config.to_dict(self.cfg.network)}
 
     def footprint(self) -> tuple[float, float]:
-        """The steps of an iteration, twice: as they are drawn, and on the device."""
+        """Counts the steps of an iteration twice: as drawn, and on the device."""
         width = self._seen.shape[1] + self._done.shape[1]
         return 8.0 * self.steps_per_iteration * width, 0.0
 

@@ -1,7 +1,8 @@
-"""Demonstrations: episodes that an agent plays side by side, as a data set holds them.
+"""Demonstrations: episodes that an agent plays side by side, in the form of a data set.
 
-An episode is drawn by its number and the seed alone, so that any of them can be played again. Noise on the agent's actions brings
-it where it would not go by itself; beside what was done stands what it would have done, its label (Laskey et al. 2017, DART).
+An episode depends only on its number and the seed, so each can be played again. Noise on the agent's actions takes it where it
+would not go by itself. The executed action is kept beside its label, the action that the agent would have taken (Laskey et al.
+2017, DART).
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
 from mjx_nero.types import DelayMemory, Key, Scenery, View
 
-SMOOTH_S = 0.2  # [s] time constant of the noise: the drives would swallow what changes in every step
+SMOOTH_S = 0.2  # [s] time constant of the noise; drives would not follow noise that changes at every step
 _NOISE = 0xDA27  # folded into an episode's key
 
 
@@ -35,13 +36,13 @@ class Player:
     """Plays episodes by their numbers, ``size`` at a time, in one compiled program.
 
     Args:
-        env: where.
-        agent: who.
-        units: of states and actions in the data set.
-        kept: features that episodes hold.
-        deltas: actions are steps of the hand, in place of the joints' targets.
-        noise: standard deviation of what is added to the arm's actions, in the agent's own units.
-        cameras: whose pictures episodes have.
+        env: the environment.
+        agent: the agent that plays.
+        units: units of states and actions in the data set.
+        kept: features that episodes keep.
+        deltas: actions are steps of the hand, instead of the joints' targets.
+        noise: standard deviation of the noise on the arm's actions, in the agent's units.
+        cameras: cameras whose pictures episodes keep.
     """
 
     def __init__(
@@ -63,12 +64,12 @@ class Player:
         self._run = jax.jit(self._play)
 
     def close(self) -> None:
-        """Frees what draws."""
+        """Frees the renderers."""
         if self._cameras:
             self._cameras.close()
 
     def __call__(self, first: int, seed: int) -> list[Episode]:
-        """The episodes of the numbers from ``first`` on."""
+        """Plays the next episodes, from number ``first`` on."""
         numbers = np.arange(first, first + self.size)
         kept, length, success = jax.device_get(self._run(jnp.asarray(numbers), jax.random.PRNGKey(seed)))
         arrays, qpos, scenery = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
@@ -85,7 +86,7 @@ class Player:
         return [episode(i) for i in range(self.size)]
 
     def _play(self, numbers: Array, key: Key) -> tuple[tuple[dict[str, Array], Array | None, Scenery | None], Array, Array]:
-        """Features, and what pictures are drawn from, leaves [steps, n, ...]; lengths and successes [n]."""
+        """Returns features and what pictures need, leaves [steps, n, ...]; lengths and successes [n]."""
         env, keys = self.env, _keys(numbers, key)
         apart = jax.vmap(jax.random.fold_in, (0, None))(keys, _NOISE)
 
@@ -107,7 +108,7 @@ class Player:
         return kept, alive.sum(axis=0).astype(jnp.int32), won.sum(axis=0) > 0
 
     def _next_noise(self, off: Float[Array, "n na"], keys: Key, at: Array) -> Float[Array, "n na"]:
-        """A first-order filter's answer to white noise, of the same deviation at every step."""
+        """Filters white noise by a first-order filter that keeps its standard deviation at every step."""
         if not self.noise:
             return off
         stays = np.exp(-self.env.dt / SMOOTH_S)
@@ -115,7 +116,7 @@ class Player:
         return jnp.where(at > 0, stays, 0.0) * off + self.noise * jnp.where(at > 0, np.sqrt(1 - stays**2), 1.0) * drawn
 
     def _record(self, state: State, clean: Float[Array, " na"], after: State) -> dict[str, Float[Array, " n"]]:
-        """Features of a step of one environment: its state before, label, what was done, and its outcome."""
+        """Collects the features of one environment's step: its state before, label, executed action, and outcome."""
         env = self.env
         view = env.view(state)
         label, told = env.targets(_prompt(state, clean), clean), after.pipeline_state.ctrl
@@ -138,7 +139,7 @@ class Player:
         return {name: found[name] for name in self.kept if name in found}
 
     def _deltas(self, view: View, targets: Float[Array, " nu"]) -> Float[Array, " n"]:
-        """Way of the hand from where it is to where the targets put it (metres, rotation vector, world), and the gripper's
+        """Motion of the hand from where it is to where the targets put it (m, rotation vector, world), and the gripper's
         targets."""
         assert self._hand
         (pos,), (quat,) = self._hand.poses(targets)
@@ -147,7 +148,7 @@ class Player:
 
 
 def environment_state(env: ManipulationEnv, view: View) -> Float[Array, " n"]:
-    """The hand, each object and the goal, as a pose (metres, wxyz) in the world."""
+    """Poses of the hand, each object and the goal in the world (m, wxyz)."""
     poses = [(view.ee_pos_w, view.ee_quat_w)]
     poses += [(seen.pos_w, seen.quat_w) for name, seen in view.objects.items() if name in env.cfg.scene.objects]
     poses += [(view.goal_pos_w, view.goal_quat_w)]
@@ -167,7 +168,7 @@ def _prompt(state: State, action: Float[Array, " na"]) -> State:
 
 
 def start(env: ManipulationEnv, number: int, seed: int) -> State:
-    """The state that an episode begins in."""
+    """Returns the state in which an episode starts."""
     return env.reset(_keys(jnp.asarray([number]), jax.random.PRNGKey(seed))[0])
 
 

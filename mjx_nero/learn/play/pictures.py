@@ -1,4 +1,4 @@
-"""Pictures of episodes that have been played: drawn afterwards, from what the physics came to, by MuJoCo's own renderer."""
+"""Pictures of played episodes, drawn afterwards from the physics' positions by MuJoCo's own renderer."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
 SIZE = 128, 128  # [pixels] of a camera for people
-SHADOWS = 0  # no shadow map, which takes three quarters of the time where a processor draws
+SHADOWS = 0  # no shadow map, which takes three quarters of the time on a CPU
 _UNSEEN = 5  # a group of geoms that is not drawn
 
 

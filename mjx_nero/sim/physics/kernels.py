@@ -1,4 +1,4 @@
-"""Kernels of Warp: made from a source of this folder, and compiled side by side."""
+"""Warp kernels, made from sources in this folder and compiled side by side."""
 
 from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
