@@ -22,6 +22,7 @@ from mjx_nero.data import Episode
 from mjx_nero.data import episode as names
 from mjx_nero.data.units import Units
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import device_memory
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
@@ -42,6 +43,9 @@ class Player:
         deltas: actions are steps of the hand, in place of the joints' targets.
         noise: standard deviation of what is added to the arm's actions, in the agent's own units.
         cameras: whose pictures episodes have.
+
+    Raises:
+        UserError: so many episodes of such a length do not fit into the memory.
     """
 
     def __init__(
@@ -61,6 +65,11 @@ class Player:
         robot = env.cfg.robot
         self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
         self._run = jax.jit(self._play)
+        one = jax.eval_shape(
+            self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
+        )
+        # Steps come from the device, are put in order of episodes, and are written, each time in a copy.
+        device_memory.check_batch(env, size, "--side-by-side", 3.0 * size * env.episode_length * device_memory.size(one))
 
     def close(self) -> None:
         """Frees what draws."""
