@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+from lerobots import lerobot_python
 
 from mjx_nero import files
 from mjx_nero.data import Episode, Feature, Schema, open_dataset, writer
@@ -18,7 +19,6 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools.demos import inspection
 
 FORMS = ("lerobot", "arrays")
-LEROBOT = os.environ.get("MJX_NERO_LEROBOT_PYTHON", "")  # a Python that has lerobot, where it is not this one
 
 
 def schema(**about) -> Schema:
@@ -240,13 +240,6 @@ def test_pictures_come_back(form, tmp_path):
         colours = wanted.reshape(-1, 3) / 255
         for what, values in (("mean", colours.mean(0)), ("std", colours.std(0)), ("max", colours.max(0))):
             np.testing.assert_allclose(np.ravel(stats["observation.images.front"][what]), values, atol=1e-6)
-
-
-def lerobot_python() -> str:
-    """A Python that has lerobot, which wants its own versions of much."""
-    found = LEROBOT or sys.executable
-    have = subprocess.run([found, "-c", "import lerobot.datasets"], capture_output=True)
-    return found if have.returncode == 0 else ""
 
 
 @pytest.mark.slow

@@ -116,6 +116,10 @@ def test_units_of_lerobots_robots_by_hand():
         (["--out", "d", "--policy", "p.safetensors"], "--policy needs --agent policy"),
         (["--out", "d", "--agent", "policy", "--through", "task"], "--through is of experts"),
         (["--out", "d", "--agent", "juggler"], "controller 'juggler' cannot do nero_lift"),
+        (
+            ["--out", "d", "--agent", "policy", "--side-by-side", 65536, "--episodes", 65536, "--env.episode_length_s", 3000],
+            "--side-by-side 65,536 with",
+        ),
         (["--inspect", "d"], "d holds no demonstrations of mjx_nero: give a folder that 'demos --out' wrote"),
         (["--video", "v.mp4", "--inspect", "d"], "--video is of the episode that is replayed"),
     ],

@@ -23,6 +23,7 @@ from mjx_nero.data import Episode
 from mjx_nero.data import episode as names
 from mjx_nero.data.units import Units
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import device_memory
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
@@ -43,6 +44,9 @@ class Player:
         deltas: actions are steps of the hand, instead of the joints' targets.
         noise: standard deviation of the noise on the arm's actions, in the agent's units.
         cameras: cameras whose pictures episodes keep.
+
+    Raises:
+        UserError: so many episodes of such a length do not fit into memory.
     """
 
     def __init__(
@@ -62,6 +66,11 @@ class Player:
         robot = env.cfg.robot
         self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
         self._run = jax.jit(self._play)
+        one = jax.eval_shape(
+            self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
+        )
+        # Steps come from the device, are put in order of episodes, and are written, each time in a copy.
+        device_memory.check_batch(env, size, "--side-by-side", 3.0 * size * env.episode_length * device_memory.size(one))
 
     def close(self) -> None:
         """Frees the renderers."""
