@@ -1,4 +1,4 @@
-"""Where objects are by AprilTags that a camera sees (pupil-apriltags; OpenCV opens the camera).
+"""Places of objects by AprilTags that a camera sees (pupil-apriltags; OpenCV opens the camera).
 
 ``--object camera.json`` with a file that has a ``camera``:
 

@@ -26,7 +26,7 @@ _SHORTEST, _FEWEST = 1.0, 20  # [s], readings
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What an arm did, and what the simulation says that it should have done.
+    """An arm's run, and the run that the simulation predicts for its targets.
 
     Attributes:
         times: of readings, from 0 on [s].

@@ -152,7 +152,7 @@ class Plant:
 
     @property
     def time(self) -> float:
-        """Since its beginning, now [s]."""
+        """Time since its beginning [s]."""
         return self._clock.now() - self._begun
 
     def target(self, targets: np.ndarray, later: float = 0.0) -> None:

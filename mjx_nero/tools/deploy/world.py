@@ -1,4 +1,4 @@
-"""Where a policy's objects are, and the scene of a simulated or emulated arm."""
+"""Places of a policy's objects, and the scene of a simulated or emulated arm."""
 
 import argparse
 import contextlib
@@ -13,7 +13,7 @@ from mjx_nero.tools.deploy import arms
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What a simulated arm stands in.
+    """Surroundings of a simulated arm.
 
     Attributes:
         robot, scene, sim: configs.

@@ -23,7 +23,7 @@ from mjx_nero.tools.deploy.world import World
 
 
 def metadata_of(robot: RobotCfg) -> dict[str, Any]:
-    """What an exported policy would say of a robot."""
+    """Describes a robot as an exported policy would."""
     return {**description.robot(robot), "robot": robot.name, "control_dt": 1 / RATE, "command": {}, "objects": {}}
 
 
