@@ -28,7 +28,8 @@ COMMANDS = {
     ),
     "import-urdf": ("mjx_nero.tools.import_urdf", "main", "a model folder from a URDF"),
     "tune-gains": ("mjx_nero.tools.tuning", "main", "stiffness and damping from step responses"),
-    "record": ("mjx_nero.tools.identification", "record_main", "a log of a simulated arm's drives"),
+    "record": ("mjx_nero.tools.identification", "record_main", "a log of an arm's drives, real or simulated"),
+    "replay": ("mjx_nero.tools.replay", "main", "a logged run of an arm, beside the simulation's prediction"),
     "identify": ("mjx_nero.tools.identification", "identify_main", "a real arm's gains, friction, delay and offsets, from a log"),
 }
 

@@ -14,8 +14,9 @@ import mjx_nero
 from mjx_nero.sim import render
 
 ROOT = pathlib.Path(__file__).parents[1]
-NOTEBOOKS = tuple(ROOT / "notebooks" / f"{name}.ipynb" for name in ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm"))
-NERO_LIFT, COBOTTA_MOTION, OWN_ARM = NOTEBOOKS
+NAMES = ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm", "04_onto_the_arm")
+NOTEBOOKS = tuple(ROOT / "notebooks" / f"{name}.ipynb" for name in NAMES)
+NERO_LIFT, COBOTTA_MOTION, OWN_ARM, ONTO_ARM = NOTEBOOKS
 STEPS = 12_288  # 8 iterations of PPO with the first notebook's 64 environments
 ARM_STEPS = 245_760  # 80 with the third's 128: most reaches succeed
 
@@ -25,6 +26,7 @@ def _run(path: pathlib.Path, folder: pathlib.Path, steps: int = STEPS) -> list:
     notebook = nbformat.read(path, as_version=4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MJX_NERO_NOTEBOOK_STEPS", str(steps))
+        patch.setenv("MJX_NERO_NOTEBOOK_EPISODES", "3")
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.jax_compilation_cache_dir))
         patch.setenv("JAX_PLATFORMS", "cpu")
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))))
@@ -67,7 +69,12 @@ def _can_draw() -> bool:
         return False
 
 
-PICTURES = {NERO_LIFT: (3, 2), COBOTTA_MOTION: (5, 3), OWN_ARM: (3, 2)}  # plotted always, drawn where the machine can draw
+PICTURES = {
+    NERO_LIFT: (3, 2),
+    COBOTTA_MOTION: (5, 3),
+    OWN_ARM: (3, 2),
+    ONTO_ARM: (2, 0),
+}  # plotted always, drawn where the machine can draw
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -199,3 +206,17 @@ def test_arm_of_the_notebook_learns_to_reach(arm_outputs):
     assert _figure(r"the policy: success rate ([\d.]+)", text) > 0.3
     idle = _figure(r"no action: .* at the end ([\d.]+) cm", text)
     assert _figure(r"the policy: .* at the end ([\d.]+) cm", text) < idle / 3
+
+
+@pytest.fixture(scope="module")
+def onto_outputs(tmp_path_factory) -> list:
+    return _run(ONTO_ARM, tmp_path_factory.mktemp("onto_arm"))
+
+
+@pytest.mark.slow
+def test_onto_the_arm_finds_the_delay_and_succeeds(onto_outputs):
+    _check(onto_outputs, ONTO_ARM)  # measured and predicted, success
+    text = _text(onto_outputs)
+    assert _figure(r"delay found: (\d+) ms", text) == pytest.approx(40, abs=2)
+    assert _figure(r"identified: off by ([\d.]+) mrad", text) < 1
+    assert _figure(r"softer and late drives: (\d+)%", text) < 50 < _figure(r"that was found: (\d+)%", text)

@@ -28,7 +28,7 @@ Ask = Callable[[str], "bool | None"]
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """What was told to a joint and read of all of them; times since its beginning [s].
+    """A joint's move: what was told to it and read of all joints.
 
     Attributes:
         sent, told: when targets were sent, and which [rad or m].
@@ -43,7 +43,7 @@ class Move:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """What a move showed of a joint.
+    """A joint as a move showed it.
 
     Attributes:
         name: of the joint.
@@ -64,7 +64,7 @@ class Joint:
     there: bool = True
 
     def wrong(self, grips: bool) -> list[str]:
-        """What speaks against letting a policy have it."""
+        """Lists what speaks against letting a policy have it."""
         out = [] if self.there else ["the fence does not let it move here"]
         if self.follows != self.name:
             out.append(f"the reading of {self.follows} moved instead: the order of the joints is wrong")
@@ -107,7 +107,7 @@ def move(arm: Guarded, joint: int, step: float, limits: Limits, clock: Clock, st
 
 
 def judged(made: Move, joint: int, names: tuple[str, ...], step: float) -> Joint:
-    """What a move says."""
+    """Judges a joint by its move."""
     far = np.abs(made.told - made.told[0]).max() > 0.8 * abs(step)
     settled = (made.times > made.sent[0]) & (np.abs(np.interp(made.times, made.sent, made.told) - made.told[0]) < 1e-6)
     start = made.read[made.times < made.sent[5]].mean(axis=0)
@@ -124,7 +124,7 @@ def judged(made: Move, joint: int, names: tuple[str, ...], step: float) -> Joint
 
 
 def delay_of(made: Move, joint: int) -> float:
-    """How late the reading follows the command: where the two differ least, but for scale and offset [s]."""
+    """Returns how late the reading follows the command: where the two differ least, but for scale and offset [s]."""
     seen, best = made.read[:, joint], (math.inf, 0.0)
     for delay in np.arange(0.0, _LATEST, 0.001):
         last = np.clip(np.searchsorted(made.sent, made.times - delay, side="right") - 1, 0, None)
@@ -135,7 +135,7 @@ def delay_of(made: Move, joint: int) -> float:
 
 
 def described(body: Body, position: np.ndarray, joint: int, step: float) -> str:
-    """What a person sees when a joint moves by ``step``: where the end effector goes."""
+    """Says what a person sees when a joint moves by ``step``: where the end effector goes."""
     before, turn = body.ee(position)
     there = position.copy()
     there[joint] += step
@@ -177,7 +177,7 @@ def walk(
 
 
 def yaml_of(robot: str, found: list[Joint], arm: Sequence[str]) -> str:
-    """What ``deploy --identified`` and ``--env.identified`` read: offsets and the delay, each with the range that joints showed.
+    """Writes what ``deploy --identified`` and ``--env.identified`` read: offsets, and the delay with its range over the joints.
 
     Args:
         arm: names of the arm's joints.

@@ -1,4 +1,4 @@
-"""What is known of an arm's drives, from a file of ``identify`` or ``deploy --check``: its delay and its encoders' offsets."""
+"""Delay and encoders' offsets of an arm, from a file of ``identify`` or ``deploy --check``."""
 
 import dataclasses
 import math

@@ -55,7 +55,8 @@ def identify(plant: Plant, log: Log) -> Fit:
         UserError: the log does not say enough, or the simulation diverges.
     """
     cut = log.times[0] + (1 - HELD_OUT) * (log.times[-1] - log.times[0])
-    x = dataclasses.replace(plant.nominal, offset=np.mean(log.positions - _held(log), axis=0), delay=0.02).vector()
+    begun = dataclasses.replace(plant.nominal, offset=np.mean(log.positions - _held(log), axis=0))
+    x = dataclasses.replace(begun, delay=_first_delay(plant, log, begun)).vector()
     for end, enough in ((min(log.times[0] + _BEGINNING, cut), 0.03), (cut, 1e-5)):
         part = (log.times >= log.times[0] + _SETTLED) & (log.times <= end)
         found = _solve(plant, log, part, x, enough)
@@ -72,6 +73,15 @@ def identify(plant: Plant, log: Log) -> Fit:
     readings, nominal = _read(plant, log, [x, plant.nominal.vector()])
     rms, before = (np.sqrt(np.mean((path - log.positions)[held] ** 2, axis=0)) for path in (readings, nominal))
     return Fit(drives, Drives.of(low), Drives.of(high), readings, nominal, held, rms, before)
+
+
+def _first_delay(plant: Plant, log: Log, drives: Drives) -> float:
+    """Returns the delay [s] with which the model's drives fit the log's beginning best, to 10 ms. A search that begins far from
+    it ends where damping and armature explain what is late."""
+    part = (log.times >= log.times[0] + _SETTLED) & (log.times <= log.times[0] + _BEGINNING)
+    tried = np.arange(0.0, 0.2, 0.01)
+    paths = _read(plant, log, [dataclasses.replace(drives, delay=delay).vector() for delay in tried], part)
+    return float(tried[int(np.argmin(((paths - log.positions[part]) ** 2).sum(axis=(1, 2))))])
 
 
 def _held(log: Log) -> np.ndarray:

@@ -21,7 +21,7 @@ from mjx_nero.errors import UserError
 
 MAX_BYTES, MAX_ROWS = 64_000_000, 500_000
 _LARGEST = 1e4  # of a number: an arm's angles, metres and seconds are below
-_SHORTEST, _FEWEST = 10.0, 500  # [s], readings
+SHORTEST, FEWEST = 10.0, 500  # [s], readings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +59,12 @@ def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[s
         part.write_text("\n".join(lines) + "\n")
 
 
-def read(path: pathlib.Path, joints: Sequence[str]) -> Log:
+def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, fewest: int = FEWEST) -> Log:
     """Reads a log of a robot's arm; a stranger may have made it.
 
     Args:
         joints: of the arm, in their order here; the file may have them in another.
+        shortest, fewest: how long it has to be [s], and how many readings it has to have.
 
     Raises:
         UserError: there is none, it is too large, or it is no log of these joints; the message names the line.
@@ -97,8 +98,8 @@ def read(path: pathlib.Path, joints: Sequence[str]) -> Log:
     if not told[0]:
         raise UserError(f"{path}: its first row has to have the targets that are in force at its beginning")
     log = Log(table[told, 0], table[told, 1 : n + 1], table[seen, 0], table[seen, n + 1 :])
-    if len(log.times) < _FEWEST or log.times[-1] - log.times[0] < _SHORTEST:
-        raise UserError(f"{path} has {len(log.times)} readings: {_FEWEST} or more over {_SHORTEST:g} s or more are needed")
+    if len(log.times) < fewest or log.times[-1] - log.times[0] < shortest:
+        raise UserError(f"{path} has {len(log.times)} readings: {fewest} or more over {shortest:g} s or more are needed")
     if table[-1, 0] - table[0, 0] > 3600:
         raise UserError(f"{path} is longer than an hour: a minute is enough")
     return log

@@ -1,4 +1,4 @@
-"""Arms for the tests of the runtime: what a policy says of a robot, a clock that stands still, an arm without physics."""
+"""Arms for the tests of the runtime: what a policy says of a robot, an arm without physics."""
 
 import json
 import threading
@@ -6,32 +6,17 @@ import threading
 import numpy as np
 
 from mjx_nero.deploy.arm import ArmError, Feedback
+from mjx_nero.deploy.emulators.timeless import Clock
 from mjx_nero.envs import registry
 from mjx_nero.interop import description
+
+__all__ = ["Bench", "Clock", "Ideal", "metadata"]
 
 
 def metadata(name, dt=0.02):
     """The part of a policy's metadata that is about its robot."""
     told = {**description.robot(registry.robot(name)), "robot": name, "control_dt": dt, "command": {}, "objects": {}}
     return json.loads(json.dumps(told))
-
-
-class Clock:
-    """Time passes where somebody waits; after every ``period`` of it all in ``ticks`` happens."""
-
-    def __init__(self, period=0.005):
-        self.time, self.ticks, self._period, self._due = 100.0, [], period, 100.0
-
-    def now(self):
-        return self.time
-
-    def sleep_until(self, time):
-        while self.ticks and self._due <= time:
-            self.time = max(self.time, self._due)
-            for tick in self.ticks:
-                tick()
-            self._due += self._period
-        self.time = max(self.time, time)
 
 
 class Bench:

@@ -165,7 +165,7 @@ class Client:
         self._serial = 0
 
     def __call__(self, function: int, *arguments: Any) -> Any:
-        """What a function gives.
+        """Calls a function and returns what it gives.
 
         Raises:
             ArmError: the controller refuses, or does not answer.

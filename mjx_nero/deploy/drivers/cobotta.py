@@ -110,7 +110,7 @@ class Cobotta:
             self.turn()
 
     def turn(self) -> None:
-        """What the thread does, again and again; what fails is told by ``read`` and ``command``."""
+        """Runs a cycle, as the thread does again and again; ``read`` and ``command`` tell what fails."""
         try:
             if not self._error:
                 self.cycle()
@@ -126,7 +126,7 @@ class Cobotta:
         self._remember(self._angles(answer[0] if answer and isinstance(answer[0], list) else answer))
 
     def _path(self, now: float) -> np.ndarray:
-        """Where the joints are to be: on the straight way to the last target, there after a control step."""
+        """Returns where the joints are to be: on the straight way to the last target, there after a control step."""
         share = min(max((now - self._since) / self._dt, 0.0), 1.0)
         return self._from + share * (self._to - self._from)
 

@@ -26,7 +26,7 @@ from mjx_nero.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Motor:
-    """What ``MOTOR.pos`` means for a joint: ``position = scale * pos + offset`` [rad or m]."""
+    """A joint's motor: ``position = scale * (MOTOR.pos) + offset`` [rad or m]."""
 
     motor: str
     scale: float
@@ -34,7 +34,7 @@ class Motor:
 
 
 def motors_of(metadata: Mapping[str, Any], path: pathlib.Path | None) -> list[Motor]:
-    """Of the joints: by a file, or by LeRobot's habits.
+    """Returns the joints' motors, by a file or by LeRobot's habits.
 
     Raises:
         UserError: there is no such file, or it says something else.

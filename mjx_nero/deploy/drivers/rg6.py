@@ -62,7 +62,7 @@ class Rg6:
             raise UserError(f"no RG6 answers at {self._address}: {error}") from None
 
     def engage(self) -> None:
-        """From now on it is asked and told."""
+        """Starts to ask and to tell it."""
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -71,7 +71,7 @@ class Rg6:
             self.turn()
 
     def turn(self) -> None:
-        """What the thread does every now and then; what fails is told by ``read``."""
+        """Asks and tells it once, as the thread does; ``read`` tells what fails."""
         try:
             if not self._error:
                 self._step()

@@ -44,14 +44,14 @@ def read_calibration(path: pathlib.Path, joints: tuple[str, ...]) -> dict[str, S
         found = json.loads(text)
         if missing := [name for name in joints if name not in found]:
             raise UserError(f"{path} has no joint {', '.join(missing)}: it is of {', '.join(map(str, found))[:200]}")
-        out = {name: Servo(*(_count(found[name][field]) for field in _FIELDS)) for name in joints}
+        out = {name: Servo(*(_count(found[name][field]) for field in FIELDS)) for name in joints}
         driven = {name: _count(found[name].get("drive_mode", 0)) for name in joints}
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from None
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"{path} is no calibration file of LeRobot: each joint has {', '.join(_FIELDS)}") from None
+        raise UserError(f"{path} is no calibration file of LeRobot: each joint has {', '.join(FIELDS)}") from None
     for name, servo in out.items():
         if not 0 <= servo.range_min < servo.range_max <= 4095 or not 0 < servo.id < 254 or abs(servo.homing_offset) > 2047:
             raise UserError(f"{path}: {name} has no range within 0 to 4095, or no id within 1 to 253: calibrate it again")
@@ -62,7 +62,7 @@ def read_calibration(path: pathlib.Path, joints: tuple[str, ...]) -> dict[str, S
     return out
 
 
-_FIELDS = ("id", "homing_offset", "range_min", "range_max")
+FIELDS = ("id", "homing_offset", "range_min", "range_max")
 
 
 def _count(value: Any) -> int:

@@ -30,7 +30,7 @@ _FASTEST = 3.0  # times the model's speed, from one target to the next
 
 @dataclasses.dataclass
 class BusFaults:
-    """What can go wrong, to be set while it runs.
+    """Faults of the buses, to be set while they run.
 
     Attributes:
         cut: nobody answers.
@@ -48,7 +48,7 @@ class BusFaults:
 
 
 class Controller:
-    """What the controller makes of requests.
+    """The controller: answers requests, and moves the plant.
 
     Args:
         speed: of the arm's joints, at most [rad/s].

@@ -91,7 +91,7 @@ class Plant:
         stiffness = np.where(soft, 10 * self._gain, self._gain)
         damping = np.where(soft, 2 * np.sqrt(stiffness * inertia), -self._bias[:, 2])
         self._gain, self._bias[:, 1], self._bias[:, 2] = stiffness, -stiffness, -damping
-        fastest = float(np.sqrt(stiffness / inertia)[soft].max(initial=0.0))
+        fastest = float(np.sqrt(stiffness / inertia).max())
         while fastest * self.model.opt.timestep > 1:
             self.model.opt.timestep /= 2  # a servo's swing takes some steps of physics
 
@@ -152,7 +152,7 @@ class Plant:
 
     @property
     def time(self) -> float:
-        """Since its beginning, now [s]."""
+        """Time since its beginning [s]."""
         return self._clock.now() - self._begun
 
     def target(self, targets: np.ndarray, later: float = 0.0) -> None:

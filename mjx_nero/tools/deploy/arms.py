@@ -1,4 +1,4 @@
-"""From flags to an arm: which one, where it is, its limits, and, where it is emulated or simulated, its scene."""
+"""Flags of an arm: which one, where it is, its limits; and, where it is emulated or simulated, its scene."""
 
 import argparse
 import contextlib
@@ -102,7 +102,7 @@ def safety_of(args: argparse.Namespace) -> Any:
 
 
 def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping[str, Any], log: pathlib.Path | None, note: str):
-    """What the arm's process has to know, and the delay of its targets [s].
+    """Returns what the arm's process has to know, and the delay of its targets [s].
 
     Raises:
         UserError: a flag says something impossible.

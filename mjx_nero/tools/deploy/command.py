@@ -51,7 +51,7 @@ def _parser() -> cli.Parser:
     add("--arm", choices=drivers.KINDS, required=True, help="which arm")
     arms.add_arm(parser)
     add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")
-    text = "where the object is: X,Y,Z, a JSON file, udp://HOST:PORT to listen at, tcp://HOST:PORT to listen to, or a camera"
+    text = "where the object is: X,Y,Z, a JSON file of its place or of a camera, udp://HOST:PORT to listen at, or tcp://HOST:PORT"
     add("--object", metavar="PLACE", help=f"{text} (default: where the simulator has it)")
     add(
         "--goal",

@@ -1,9 +1,10 @@
-"""Where a policy's objects are, and the scene of a simulated or emulated arm."""
+"""Places of a policy's objects, and the scene of a simulated or emulated arm."""
 
 import argparse
 import contextlib
 import dataclasses
 import functools
+import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ from mjx_nero.tools.deploy import arms
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What a simulated arm stands in.
+    """Surroundings of a simulated arm.
 
     Attributes:
         robot, scene, sim: configs.
@@ -38,7 +39,10 @@ def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> It
         source = places.FromSocket("udp", "127.0.0.1", 0)
         told = source.port
     else:
-        source = places.of(args.object)
+        from mjx_nero.deploy import tags
+
+        camera = None if "://" in args.object else tags.read(pathlib.Path(args.object))
+        source = tags.FromTags(camera) if camera else places.of(args.object)
     with contextlib.closing(source):
         point = args.object if constant else None
         with arms.options_of(args, metadata, functools.partial(_world, args, metadata, point), told) as options:

@@ -1,15 +1,20 @@
 """The commands ``record`` and ``identify``."""
 
+import argparse
 import dataclasses
 from collections.abc import Sequence
 
 from mjx_nero import config, console, files
+from mjx_nero.deploy import drivers
+from mjx_nero.deploy.arm import ArmError
 from mjx_nero.envs import registry
+from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.fit import identify
 from mjx_nero.identify.plant import Plant
 from mjx_nero.identify.simulate import RecordCfg, record
 from mjx_nero.tools import cli
+from mjx_nero.tools.deploy import FAULT, arms
 from mjx_nero.tools.identification.report import save, save_plot, table
 
 _DT = 0.005
@@ -19,9 +24,13 @@ def record_main(argv: Sequence[str]) -> None:
     """The command line of ``record``."""
     parser = cli.Parser(
         prog=cli.called_as("record"),
-        description="Moves a simulated arm by sine sweeps within its limits, and writes what its drives were told and did.",
+        description="Moves an arm by sine sweeps within its limits, and writes what its drives were told and did. Without --arm "
+        "the arm is simulated, at once; with it, the movement goes through the safety layer of deploy, in real time.",
     )
     _add_robot(parser)
+    parser.add_argument("--arm", choices=drivers.KINDS, help="real, emulated or simulated arm (default: none)")
+    arms.add_arm(parser)
+    arms.add_limits(parser)
     parser.add_argument(
         "--out", type=cli.path(".csv"), required=True, help="the log: a table with commas (docs/guides/identification.md)"
     )
@@ -33,12 +42,35 @@ def record_main(argv: Sequence[str]) -> None:
         )
     args, _ = parser.parse(argv)
     files.check_writable(args.out)
+    if args.arm:
+        _record_arm(parser, args)
+        return
     cfg = RecordCfg(**{field.name: getattr(args, field.name) for field in dataclasses.fields(RecordCfg)})
     plant = Plant(registry.robot(args.robot), args.dt)
     log, truth = record(plant, cfg)
     notes = [f"simulated {plant.robot.name}; its parameters:", *(f"{name}: {value}" for name, value in _plain(truth).items())]
     logs.write(args.out, log, plant.robot.arm.joints, notes)
     console.wrote(console.screen(), "log", args.out)
+
+
+def _record_arm(parser: cli.Parser, args: argparse.Namespace) -> None:
+    """Records an arm.
+
+    Raises:
+        UserError: it cannot be had.
+        SystemExit: it holds because something failed.
+    """
+    arms.check(parser, args)
+    try:
+        with arms.missing():
+            from mjx_nero.tools.identification.arm import record_arm
+
+            failed = record_arm(args, registry.robot(args.robot))
+    except ArmError as error:
+        raise UserError(f"the arm is lost: {error}") from None
+    console.wrote(console.screen(), "log", args.out)
+    if failed:
+        raise SystemExit(FAULT)
 
 
 def identify_main(argv: Sequence[str]) -> None:

@@ -48,7 +48,7 @@ class Scene:
         self._stand: list[np.ndarray] = []
         self._place(session.frame)
         self._bodies = []
-        for body, name, mesh, rgba in _meshes(model):
+        for body, name, mesh, rgba in meshes(model):
             handle = server.scene.add_batched_meshes_simple(
                 name,
                 mesh.vertices.astype(np.float32),
@@ -127,7 +127,7 @@ def _above(model: mujoco.MjModel, body: int) -> list[int]:
     return [body, *(_above(model, int(model.body_parentid[body])) if body else [])]
 
 
-def _meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:
+def meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:
     """(body, name, mesh in the body's frame, colour): the visible geoms of a body, those of one colour in one mesh."""
     for body in range(model.nbody):
         found: dict[tuple[float, ...], list[trimesh.Trimesh]] = {}

@@ -1,0 +1,117 @@
+"""Emulated arms in this process and in a time of their own: what takes an arm a minute takes as long as it takes to compute.
+
+Registers, frames and drivers are those of the emulators in processes of their own; bytes take no time, and nothing waits.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Arm
+from mjx_nero.deploy.drivers import agilex, feetech, so_arm
+from mjx_nero.deploy.emulators import agilex as can
+from mjx_nero.deploy.emulators import feetech as serial
+from mjx_nero.deploy.emulators.plant import Plant
+from mjx_nero.deploy.places import Known, Place
+
+
+class Clock:
+    """Time that passes where somebody waits; after every ``period`` of it [s] all in ``ticks`` is called. See ``arm.Clock``."""
+
+    def __init__(self, period: float = can.PERIOD):
+        self.time, self.ticks, self._period, self._due = 100.0, list[Callable[[], Any]](), period, 100.0
+
+    def now(self) -> float:
+        """See ``arm.Clock``."""
+        return self.time
+
+    def sleep_until(self, time: float) -> None:
+        """See ``arm.Clock``."""
+        while self.ticks and self._due <= time:
+            self.time = max(self.time, self._due)
+            for tick in self.ticks:
+                tick()
+            self._due += self._period
+        self.time = max(self.time, time)
+
+
+class Wire:
+    """A serial line: what was asked is answered at once."""
+
+    def __init__(self, servos: serial.Servos):
+        self._servos, self._waiting = servos, b""
+
+    def reset_input_buffer(self) -> None:
+        """Forgets what has come."""
+        self._waiting = b""
+
+    def write(self, data: bytes) -> None:
+        """Asks."""
+        self._waiting += self._servos.answer(data)
+
+    def read(self, count: int) -> bytes:
+        """Gives so many bytes of the answer, or fewer."""
+        out, self._waiting = self._waiting[:count], self._waiting[count:]
+        return out
+
+    def close(self) -> None:
+        """Ends nothing."""
+
+
+class Sees(Known):
+    """Places that the simulator has."""
+
+    def __init__(self, plant: Plant):
+        super().__init__()
+        self._plant = plant
+
+    def find(self, name: str, now: float) -> Place:
+        """See ``Places``."""
+        return Place(self._plant.place(name), self._plant.data.qpos[self._plant.objects[name] :][3:7].copy())
+
+
+def _servos(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
+    entries = serial.calibration(told, "so101")
+    known = {name: so_arm.Servo(**{f: entry[f] for f in so_arm.FIELDS}) for name, entry in entries.items()}
+    arm = so_arm.SoArm("so101", told, known, "", clock)
+    arm._bus = feetech.Bus(Wire(serial.servos_of(told, "so101", entries, plant)))
+    return arm, lambda: None
+
+
+def _frames(kind: str) -> Callable[[Mapping[str, Any], Plant, Clock], tuple[Arm, Callable[[], None]]]:
+    def made(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
+        port = can.CanPort(can.Arm(plant, agilex.MODELS[kind]), f"virtual:{id(plant)}")
+        plant.gears = 1e4  # it lies on something
+        clock.ticks = [port.take, port.say]
+        arm = agilex.of(kind, told, clock, port.name)
+        arm.connect()
+        return arm, port.close
+
+    return made
+
+
+LINES = {"so101": _servos, "piper": _frames("piper"), "nero": _frames("nero")}
+LATE = {"so101": 0.0, "piper": 0.02, "nero": 0.02}  # [s] until such an arm has got to a target
+
+
+def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
+    """An arm that holds where it is, and what unplugs it.
+
+    Args:
+        told: metadata of a policy, or of a robot.
+    """
+    arm, close = LINES[kind](told, plant, clock)
+    arm.engage()
+
+    def unplug() -> None:
+        clock.ticks = []
+        arm.close()
+        close()
+
+    return arm, unplug
+
+
+def home_of(told: Mapping[str, Any]) -> np.ndarray:
+    """Home of all joints [rad or m]."""
+    return np.array(told["joints"]["home"], float)

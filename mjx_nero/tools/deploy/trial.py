@@ -1,0 +1,85 @@
+"""Episodes of an exported lift over an emulated arm, in a time of their own: how many succeed, and logs of its drives."""
+
+import pathlib
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_nero.deploy import setup
+from mjx_nero.deploy.emulators import timeless
+from mjx_nero.deploy.emulators.plant import Faults, Plant
+from mjx_nero.deploy.guard import Guard
+from mjx_nero.deploy.log import Log
+from mjx_nero.deploy.loop import Brain, run
+from mjx_nero.deploy.observe import Observer
+from mjx_nero.deploy.safety import Fault
+from mjx_nero.envs.task import EnvCfg
+from mjx_nero.identify.excitation import sweeps
+from mjx_nero.sim import scene
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tools.identification.arm import metadata_of, play
+
+_NEAR = 0.02  # of the goal: success [m]
+
+
+def lifts(
+    policy: pathlib.Path,
+    cfg: EnvCfg,
+    kind: str,
+    episodes: int,
+    faults: Faults,
+    delay: float | None = None,
+    seed: int = 0,
+) -> tuple[float, list[Fault]]:
+    """Plays a lift whose cube and goal are drawn as in training.
+
+    Args:
+        cfg: of the environment.
+        kind: of the arm: ``so101``, ``piper`` or ``nero``.
+        faults: of its drives.
+        delay: of targets, that the runtime is told of [s]; None: what they are late by.
+
+    Returns:
+        share of the episodes that end with the cube within 2 cm of the goal, and the faults that ended others.
+    """
+    brain, clock, rng = Brain(policy), timeless.Clock(), np.random.default_rng(seed)
+    told, ended, good = brain.metadata, [], 0
+    home, region = timeless.home_of(told), np.array([told["command"][axis] for axis in "xyz"])
+    event = next(term for term in cfg.events.values() if "x" in term.params)
+    cubes, base = np.array([event.params[axis] for axis in "xy"]), told["base"]["position"]
+    model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
+    delay = faults.late + timeless.LATE[kind] if delay is None else delay
+    for _ in range(episodes):
+        plant = Plant(model, told["joints"]["names"], home, clock, base)
+        cube, goal = rng.uniform(*cubes.T), rng.uniform(*region.T)
+        plant.reset(home, {"cube": np.array([*cube, told["objects"]["cube"][2] / 2 - base[2]])})
+        arm, unplug = timeless.engaged(kind, told, plant, clock)
+        plant.faults = faults
+        guard: Any = Guard(arm, setup.safety_of(told), clock)
+        guard.start()
+        observer = Observer(told, setup.body_of(told), goal.tolist(), timeless.Sees(plant))
+        report = run(guard, brain, observer, clock, cfg.episode_length_s, lambda: None, delay=delay)
+        ended += [report.fault] if report.fault.kind != "stop" else []
+        good += float(np.linalg.norm(plant.place("cube") - goal)) < _NEAR
+        unplug()
+    return good / episodes, ended
+
+
+def recorded(path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, seconds: float) -> dict[str, int]:
+    """Writes the log of an emulated arm under identification's movement; returns how often each limit acted."""
+    told, clock, swings = metadata_of(robot), timeless.Clock(), sweeps(robot, seconds)
+    targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
+    model: mujoco.MjModel = scene.build(robot, SceneCfg(objects={}), SimCfg(), visuals=False)
+    plant = Plant(model, told["joints"]["names"], targets[0], clock, told["base"]["position"])
+    arm, unplug = timeless.engaged(kind, told, plant, clock)
+    plant.faults = faults
+    guard: Any = Guard(arm, setup.safety_of(told), clock)
+    guard.start(anywhere=True)
+    guard.log = Log(path, arm.joints, targets[0], clock.now(), 0, (f"emulated {robot.name}",))
+    fault, limited = play(guard, targets, clock, lambda: None)
+    assert fault is None, fault
+    guard.log.close()
+    unplug()
+    return limited

@@ -1,0 +1,72 @@
+"""``record`` on an arm: identification's movement through the safety layer, and its log."""
+
+import argparse
+import contextlib
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.deploy.arm import Clock
+from mjx_nero.deploy.guard import Guarded, WallClock, urgent
+from mjx_nero.deploy.loop import Stop, go_home
+from mjx_nero.deploy.remote import Remote
+from mjx_nero.deploy.safety import Fault, Limits
+from mjx_nero.deploy.stop import operator
+from mjx_nero.identify.excitation import RATE, sweeps
+from mjx_nero.sim import description
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tools.deploy import arms
+from mjx_nero.tools.deploy.world import World
+
+
+def metadata_of(robot: RobotCfg) -> dict[str, Any]:
+    """Describes a robot as an exported policy would."""
+    return {**description.robot(robot), "robot": robot.name, "control_dt": 1 / RATE, "command": {}, "objects": {}}
+
+
+def play(arm: Guarded, targets: np.ndarray, clock: Clock, stop: Stop) -> tuple[Fault | None, dict[str, int]]:
+    """Sends targets at ``RATE`` [m, n]; why it stopped short, and how often each limit acted."""
+    begun, limited = clock.now(), dict[str, int]()
+    for k, target in enumerate(targets):
+        clock.sleep_until(begun + k / RATE)
+        if ending := stop():
+            arm.hold(ending)
+        arm.read()
+        command = arm.command(target)
+        if arm.fault:
+            return arm.fault, limited
+        for name in command.limited:
+            limited[name] = limited.get(name, 0) + 1
+        clock.sleep_until(begun + (k + 0.5) / RATE)
+        arm.read()  # twice as many readings as targets
+    return None, limited
+
+
+def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
+    """Moves an arm, goes home first, and writes what it was told and did; returns whether it ended in a fault."""
+    metadata, clock = metadata_of(robot), WallClock()
+    arms.known(args.arm, metadata)
+    swings = sweeps(robot, args.seconds, args.amplitude)
+    targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
+    limits = dataclasses.replace(Limits.of(metadata, arms.safety_of(args)), home=targets[0])
+    world = functools.partial(World, robot, SceneCfg(objects={}), SimCfg(), {})
+    with contextlib.ExitStack() as stack:
+        options = stack.enter_context(arms.options_of(args, metadata, world))
+        arms.warn(args)
+        note = f"{robot.name} by {args.arm}{' (emulated)' if args.emulate else ''}, identification's movement"
+        remote = Remote(arms.spec(args, metadata, options, args.out, note)[0])
+        stack.callback(remote.close)
+        remote.ready()
+        stop = stack.enter_context(operator())
+        remote.start(anywhere=True)
+        fault = go_home(remote, limits, clock, stop)
+        if not fault:
+            urgent()
+            print(f"the arm is where the movement begins: it takes {args.seconds:g} s")
+            fault, limited = play(remote, targets, clock, stop)
+            print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in limited.items()) or "never"))
+    print(f"the arm holds: {fault.text if fault else 'the movement is over'}")
+    return fault is not None and fault.kind != "stop"
