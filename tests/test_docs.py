@@ -34,6 +34,7 @@ RUN = {
     "gymnasium.md": "tests/interop/test_gymnasium.py",
     "deploy_onnx.md": "tests/interop/test_onnx.py",
     "adding_an_arm.md": "tests/test_docs.py",
+    "cameras.md": "tests/sim/test_cameras.py",
 }
 
 NO_BEGINNING = set(

@@ -13,7 +13,8 @@ import numpy as np
 
 from mjx_nero.config.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import description, need
+from mjx_nero.interop import description, need, student
+from mjx_nero.interop.graph import Graph
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.runs.folder import versions
 from mjx_nero.types import UserError
@@ -25,6 +26,8 @@ IR_VERSION = 8  # the one of that opset
 def model(policy: Policy, env: ManipulationEnv) -> Any:
     """The policy as an ``onnx.ModelProto``: ``observations`` [n, state] -> ``actions`` [n, action_size], deterministic.
 
+    One that sees takes what its cameras see, too: ``picture_<camera>`` [n, height, width, channels].
+
     Args:
         env: what it acts in; the metadata describe its robot and terms.
 
@@ -35,15 +38,14 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
     if isinstance(policy.meta["observation_size"]["state"], dict):
         raise UserError("only a policy that reads one vector can be exported: this one's observations stay apart")
     helper, floats = onnx.helper, onnx.TensorProto.FLOAT
-    nodes, weights = _graph(policy, onnx)
+    drawn, seen = Graph(onnx), student.pictures(policy.meta)
+    (student.build if seen else _build)(policy, drawn)
     (size,) = policy.meta["observation_size"]["state"]
-    graph = helper.make_graph(
-        nodes,
-        f"{policy.meta['env']} policy",
-        [helper.make_tensor_value_info("observations", floats, ["n", size])],
-        [helper.make_tensor_value_info("actions", floats, ["n", policy.meta["action_size"]])],
-        weights,
-    )
+    inputs = [helper.make_tensor_value_info("observations", floats, ["n", size])]
+    for name, (shape, whole) in seen.items():
+        inputs.append(helper.make_tensor_value_info(name, onnx.TensorProto.UINT8 if whole else floats, ["n", *shape]))
+    outputs = [helper.make_tensor_value_info("actions", floats, ["n", policy.meta["action_size"]])]
+    graph = helper.make_graph(drawn.nodes, f"{policy.meta['env']} policy", inputs, outputs, drawn.weights)
     made = helper.make_model(
         graph, producer_name="mjx_nero", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
     )
@@ -52,34 +54,23 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
     return made
 
 
-def _graph(policy: Policy, onnx: Any) -> tuple[list[Any], list[Any]]:
-    """Nodes and weights: normalisation, then the layers."""
-    nodes: list[Any] = []
-    weights: list[Any] = []
-
-    def constant(name: str, value: np.ndarray) -> str:
-        weights.append(onnx.numpy_helper.from_array(np.asarray(value, np.float32), name))
-        return name
-
-    def apply(kind: str, *inputs: str) -> str:
-        nodes.append(onnx.helper.make_node(kind, list(inputs), [f"{kind.lower()}_{len(nodes)}"]))
-        return nodes[-1].output[0]
-
+def _build(policy: Policy, graph: Graph) -> None:
+    """Adds normalisation, then the layers."""
     network, normalizer = policy.meta["network"], policy.params[0]
-    x = apply("Sub", "observations", constant("mean", normalizer.mean["state"]))
-    x = apply("Div", x, constant("std", normalizer.std["state"]))
+    x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
+    x = graph.apply("Div", x, graph.constant("std", normalizer.std["state"]))
     if bound := network.get("max_observation"):
-        x = apply("Clip", x, constant("least", -bound), constant("most", bound))
+        x = graph.apply("Clip", x, graph.constant("least", -bound), graph.constant("most", bound))
     *hidden, last = _layers(policy.params[1].policy["params"])
     for i, (kernel, bias) in enumerate(hidden):
-        x = apply("Gemm", x, constant(f"kernel_{i}", kernel), constant(f"bias_{i}", bias))
+        x = graph.apply("Gemm", x, graph.constant(f"kernel_{i}", kernel), graph.constant(f"bias_{i}", bias))
         # Swish is x * sigmoid(x), which ONNX has no single operator for before opset 24.
-        x = apply("Mul", x, apply("Sigmoid", x)) if network["activation"] == "swish" else apply(_OPS[network["activation"]], x)
+        swish = network["activation"] == "swish"
+        x = graph.apply("Mul", x, graph.apply("Sigmoid", x)) if swish else graph.apply(_OPS[network["activation"]], x)
     n = policy.meta["action_size"]  # what the last layer gives beyond it is the deviation of tanh_normal
-    x = apply("Gemm", x, constant("kernel_out", last[0][:, :n]), constant("bias_out", last[1][:n]))
-    x = apply("Tanh" if network["distribution"] == "tanh_normal" else "Identity", x)
-    nodes[-1].output[0] = "actions"
-    return nodes, weights
+    x = graph.apply("Gemm", x, graph.constant("kernel_out", last[0][:, :n]), graph.constant("bias_out", last[1][:n]))
+    graph.apply("Tanh" if network["distribution"] == "tanh_normal" else "Identity", x)
+    graph.name_output("actions")
 
 
 _OPS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
@@ -134,7 +125,12 @@ def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(dict(params), default=str))
 
 
-def check(made: Any, policy: Policy, observations: int = 10_000, seed: int = 0) -> tuple[float, float]:
+def tries(meta: Mapping[str, Any]) -> int:
+    """Returns the number of observations of a check: fewer where they are pictures."""
+    return student.TRIES if student.pictures(meta) else 10_000
+
+
+def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tuple[float, float]:
     """Runs the model with ONNX Runtime on one core, on observations drawn as the normaliser has seen them.
 
     Returns:
@@ -143,17 +139,20 @@ def check(made: Any, policy: Policy, observations: int = 10_000, seed: int = 0) 
     Raises:
         UserError: the extra ``onnx`` is not installed.
     """
-    runtime = need("onnxruntime", "onnx")
+    runtime, observations = need("onnxruntime", "onnx"), observations or tries(policy.meta)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = runtime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])
     normalizer, rng = policy.params[0], np.random.default_rng(seed)
     mean, std = np.asarray(normalizer.mean["state"]), np.asarray(normalizer.std["state"])
     obs = (mean + std * rng.standard_normal((observations, len(mean)))).astype(np.float32)
-    ours = np.asarray(policy.act({"state": jnp.asarray(obs)}))
+    seen = student.random_pictures(policy.meta, observations, rng)
+    act = student.exact(policy) if seen else policy.act
+    given: dict[str, Any] = {"state": jnp.asarray(obs), "pictures": {k.removeprefix("picture_"): v for k, v in seen.items()}}
+    ours = np.asarray(act(given))
     theirs, times = np.empty_like(ours), []
     for i in range(observations):
         started = time.thread_time()
-        (theirs[i],) = session.run(None, {"observations": obs[i : i + 1]})[0]
+        (theirs[i],) = session.run(None, {name: each[i : i + 1] for name, each in {"observations": obs, **seen}.items()})[0]
         times.append(time.thread_time() - started)
     return float(np.abs(ours - theirs).max()), float(np.percentile(times, 99))

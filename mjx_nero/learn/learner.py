@@ -93,6 +93,7 @@ class Kind:
             least ``num_envs`` and ``num_timesteps``, where 0 means chosen for the machine.
         policy: description in a policy's file -> (template of the policy's parameters, act function).
         envs: number of environments that suits a CPU, and one that suits a GPU.
+        pace: what a GPU does, for people who train without one.
         fit: (config, devices at the run's start) -> the config with what their number decides, which the run keeps.
         held: prefix of the parameters' names in a policy's file -> their prefix in the learner's state, as in
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
@@ -104,6 +105,7 @@ class Kind:
     presets: Mapping[str, Any]
     policy: Callable[[Mapping[str, Any]], tuple[Params, Act]]
     envs: tuple[int, int] = (256, 8192)
+    pace: str = "an NVIDIA H200 makes 60 M steps of 8,192 environments in half a minute"
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
     held: Mapping[str, str] = dataclasses.field(default_factory=dict)
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}

@@ -143,13 +143,11 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
             f"was trained on observations of size {sizes[0]}, here it is {sizes[1]}: pass the --preset (it had "
             f"{there['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
         )
-    if "pictures" in there["observation_size"] and there["observation_size"]["pictures"] != here["observation_size"].get(
-        "pictures"
-    ):
+    shapes = [each["observation_size"].get("pictures") for each in (there, here)]
+    if shapes[0] and shapes[0] != shapes[1]:
         return (
-            f"was trained on pictures of the shapes {there['observation_size']['pictures']}, here they are "
-            f"{here['observation_size'].get('pictures', 'none')}: pass the --preset (it had {there['preset']}) and the "
-            "--env.scene.cameras fields that it was trained with"
+            f"was trained on pictures of the shapes {shapes[0]}, here they are {shapes[1] or 'none'}: pass the --preset "
+            f"(it had {there['preset']}) and the --env.scene.cameras fields that it was trained with"
         )
     if not header.acts_alike(there, here):
         kinds = ", ".join(there.get("actions", ["JointPosition"]))

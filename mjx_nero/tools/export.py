@@ -12,6 +12,7 @@ from mjx_nero.tools import cli
 from mjx_nero.types import UserError
 
 TOLERANCE = 1e-5  # of actions: joint targets then agree to microradians
+SEEING = 1e-4  # of those of policies that see, whose convolutions add up thousands of numbers
 
 
 def main(argv: Sequence[str]) -> None:
@@ -38,14 +39,14 @@ def main(argv: Sequence[str]) -> None:
     trained = policy.load_for(env, meta["env"], path)
     made = onnx.model(trained, env)
     difference, p99 = onnx.check(made, trained)
-    if difference > TOLERANCE:
+    if difference > (SEEING if len(made.graph.input) > 1 else TOLERANCE):
         raise UserError(f"ONNX Runtime and JAX differ by {difference:.1e} on {path}: nothing was written")
     with files.whole(args.out) as part:
         onnx_package.save(made, str(part))
     print(
         f"{args.out}: {meta['env']}, {made.graph.input[0].type.tensor_type.shape.dim[1].dim_value} observations -> "
         f"{meta['action_size']} actions every {1000 * env.dt:.0f} ms\n"
-        f"ONNX Runtime and JAX differ by at most {difference:.1e} over 10,000 observations; "
+        f"ONNX Runtime and JAX differ by at most {difference:.1e} over {onnx.tries(meta):,} observations; "
         f"{1000 * p99:.3f} ms of one core for one (99th percentile)"
     )
 

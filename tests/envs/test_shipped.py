@@ -41,3 +41,12 @@ def test_it_succeeds(name):
     few = 64 if name.endswith(("_reach", "_lift")) else 24
     found = evaluation.play(evaluation.EvalCfg(name, agent="policy", episodes=few, backend="mujoco")).result
     assert found["success_rate"] >= (0.93 if name.endswith("_reach") else 0.8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nero_lift", "piper_lift"])
+def test_it_succeeds_by_sight(name):
+    """Every episode looks different. MuJoCo Warp's ray tracer draws, as in training: OpenGL in software would take minutes."""
+    fields = {"scene.renderer": "warp"}
+    cfg = evaluation.EvalCfg(name, preset="rgb", agent="policy", episodes=16, backend="mujoco", env_fields=fields)
+    assert evaluation.play(cfg).result["success_rate"] >= 0.7

@@ -12,14 +12,16 @@ from kinematic import Kinematic
 
 from mjx_nero import ManipulationEnv, UserError
 from mjx_nero.envs import registry, wrappers
-from mjx_nero.learn import learner
+from mjx_nero.learn import learner, policy
 from mjx_nero.learn.distill import teachers
 from mjx_nero.learn.distill.cfg import DistillCfg, StudentCfg
 from mjx_nero.types import Picture
 
 EDGE = 16
 SMALL = {"scene.cameras.front.size": (EDGE, EDGE), "scene.cameras.wrist.size": (EDGE, EDGE), "episode_length_s": 0.2}
-CFG = DistillCfg(num_envs=8, minibatch_size=64, student=StudentCfg(channels=(8, 8), features=32, layers=(32,)))
+CFG = DistillCfg(
+    num_envs=8, minibatch_size=64, student=StudentCfg(channels=(8, 8), features=32, layers=(32,), precision="float32")
+)
 
 
 def drawn(sim, scenery):
@@ -43,19 +45,18 @@ def make(cfg=CFG, preset="rgb_fixed", num_devices=1, **fields):
     return learner.find("distill").make(wrappers.for_training(env), cfg, num_devices)
 
 
-def test_the_student_learns_to_see_and_goes_on_to_the_bit(quick):
-    made = make()
+def test_the_student_learns_to_see_and_repeats_to_the_bit(quick):
+    made = make(dataclasses.replace(CFG, truth_cost=1.0, num_epochs=4))
     run = jax.jit(made.run, static_argnums=1)
     state = jax.jit(made.init)(jax.random.PRNGKey(0))
-    first, metrics = run(state, 1)
-    errors = [float(metrics["seen_error"])]
+    (first, metrics), (again, _) = run(state, 1), run(state, 1)
     assert np.isfinite(list(metrics.values())).all() and int(first.iteration) == 1
-    both, second = run(state, 2), run(first, 1)[0]
-    for one, other in zip(jax.tree.leaves(both[0]), jax.tree.leaves(second), strict=True):
+    for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
-    later, metrics = run(second, 60)
-    errors.append(float(run(later, 1)[1]["seen_error"]))
-    assert errors[1] < 0.025 < 0.05 < errors[0]  # [m]; the cube's places spread over 10 x 30 cm
+    begun, state = float(metrics["seen_error"]), first
+    for _ in range(25):
+        state, metrics = run(state, 1)
+    assert float(metrics["seen_error"]) < 0.04 < 0.05 < begun  # [m]; the cube's places spread over 10 x 30 cm
 
 
 def test_the_teacher_acts_where_it_should(quick):
@@ -75,8 +76,8 @@ def test_the_bundled_policy_of_the_task_teaches():
     assert teachers.find(ManipulationEnv(cfg, "native")).meta["env"] == "nero_lift"
     other = ManipulationEnv(registry.env_cfg("so101_lift", "rgb_fixed"), "native")
     assert teachers.find(other).meta["env"] == "so101_lift"
-    nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, name="other"))
-    with pytest.raises(UserError, match=r"no bundled policy can teach other this task: train one .* --distill.teacher RUN"):
+    nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, gravity_compensation=True))
+    with pytest.raises(UserError, match=r"no bundled policy can teach nero this task: train one .* --distill.teacher RUN"):
         teachers.find(ManipulationEnv(nobody, "native"))
     with pytest.raises(UserError, match=r"cannot teach here: it is of another robot \(piper; here nero\)"):
         teachers.find(ManipulationEnv(cfg, "native"), "assets/policies/piper_lift.safetensors")
@@ -87,18 +88,14 @@ def test_what_does_not_go_together_is_refused(quick):
         make(num_devices=2)
     with pytest.raises(UserError, match=r"num_envs \(9\) must be a multiple of 4"):
         make(dataclasses.replace(CFG, num_envs=9, unroll_length=1, minibatch_size=2))
-    with pytest.raises(UserError, match="needs the observation groups pictures, truth: pass --preset rgb"):
-        make(preset="default") if "scene.cameras.front.size" not in SMALL else _blind()
-
-
-def _blind():
     env = ManipulationEnv(registry.env_cfg("nero_lift"), "native", 8)
-    learner.find("distill").make(wrappers.for_training(env), CFG, 1)
+    with pytest.raises(UserError, match="needs the observation groups pictures, truth: pass --preset rgb"):
+        learner.find("distill").make(wrappers.for_training(env), CFG, 1)
 
 
 def test_a_student_trains_is_resumed_and_played(quick, call, tmp_path):
     flags = ["--preset", "rgb_fixed", "--num-envs", 8, "--no-video", "--out", "run", "--distill.minibatch_size", 64]
-    flags += [word for name, value in SMALL.items() for word in (f"--env.{name}", value)]
+    flags += ["--env.episode_length_s", 0.2, "--distill.student.channels", "(8, 8)"]
     code, out, err = call("train", *flags, "--num-timesteps", 256)
     assert code == 0 and "256 env steps" in out, err
     assert json.loads((tmp_path / "run" / "config.json").read_text())["learner"] == "distill"
@@ -107,7 +104,15 @@ def test_a_student_trains_is_resumed_and_played(quick, call, tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["distill/seen_error"] > 0
     play = ["eval", "--policy", "run/policy.safetensors", "--episodes", 2, "--backend", "mujoco", "--env.episode_length_s", 0.2]
-    code, _, err = call(*play, "--preset", "rgb_fixed")
-    assert code == 2 and "was trained on pictures of the shapes {'front': [16, 16, 3]" in err
-    code, out, err = call(*play, "--preset", "rgb_fixed", *flags[8:12])
+    code, out, err = call(*play, "--preset", "rgb_fixed")
     assert code == 0 and "success rate" in out, err
+
+
+def test_a_policy_knows_what_size_its_pictures_have():
+    metas = []
+    for size in ((16, 16), (32, 16)):
+        env = ManipulationEnv(registry.env_cfg("nero_lift", "rgb_fixed", **{"scene.cameras.front.size": size}), "native")
+        metas.append(policy.describe(env, "nero_lift", "rgb_fixed", "distill", {}))
+    assert not policy.misfit(metas[0], metas[0])
+    said = policy.misfit(*metas)
+    assert said.startswith("was trained on pictures of the shapes {'front': [16, 16, 3], ") and "--env.scene.cameras" in said

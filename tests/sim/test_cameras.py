@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import pathlib
+import re
 
 import jax
 import jax.numpy as jnp
@@ -183,3 +185,11 @@ def test_a_machine_without_opengl_says_so(monkeypatch):
     cfg = with_cameras({"front": CameraCfg()})
     with pytest.raises(UserError, match=r"no offscreen OpenGL here"):
         cameras.Cameras(scene.build(cfg.robot, cfg.scene, cfg.sim), cfg.scene.cameras, "mujoco")
+
+
+def test_the_guide_says_what_is_so():
+    page = (pathlib.Path(__file__).resolve().parents[2] / "docs" / "guides" / "cameras.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    names = {}
+    exec(code, names)
+    assert names["env"].observation_size["pictures"] == {"side": (32, 32, 3)}

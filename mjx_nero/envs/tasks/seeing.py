@@ -7,6 +7,7 @@ positions trains a student that is not (``learn.distill``).
 import dataclasses
 
 from mjx_nero.config.bounds import Range
+from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg
 from mjx_nero.mdp import images, looks, observations
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, Term
@@ -62,7 +63,11 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
     """A task with cameras whose every episode looks different. Each range is a field of its own
     (``--env.look.lights.params.brightness "(0.3, 2)"``, ``--env.sensors.front.params.noise 8``)."""
     scene = dataclasses.replace(cfg.scene, distractors=DISTRACTORS, backdrop=True)
-    names, objects, there = scenes.distractors(scene), tuple(scene.objects), cfg.robot.pick or cfg.robot.workspace
+    names, objects, there = (
+        scenes.distractors(scene),
+        tuple(scene.objects),
+        regions.box(cfg.robot, "pick", "where on the table it can grasp"),
+    )
     any_color = {"change": 1.0, "shade": (0.3, 1.2)}
     poses = {
         f"{name}_pose": Term(

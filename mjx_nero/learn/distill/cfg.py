@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated
 
-from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
+from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive, Share
 from mjx_nero.config.values import hints, read, short
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
@@ -19,12 +19,14 @@ class StudentCfg:
         channels: channels of the convolutions, each of which halves the picture's edges. The first has kernels of 5 x 5 pixels,
             the others of 3 x 3.
         features: number of features per picture.
+        precision: number format of the convolutions: bfloat16 or float32.
         layers: widths of the hidden layers before the action.
     """
 
     channels: tuple[int, ...] = (32, 64, 64, 64)
-    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 256
+    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 64
     layers: tuple[int, ...] = (256, 128)
+    precision: Annotated[str, OneOf("bfloat16", "float32")] = "bfloat16"
 
     def __post_init__(self):
         for name in ("channels", "layers"):

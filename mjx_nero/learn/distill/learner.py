@@ -220,4 +220,6 @@ class Learner:
 
 _HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, held=_HELD)
+_PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
+
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD)

@@ -18,27 +18,27 @@ from mjx_nero.learn.learner import Act, Observation
 from mjx_nero.types import Key
 
 SENSED, SEEN, TRUTH = "state", "pictures", "truth"  # observation groups: what it reads, and what else it predicts
-_MOST = 10.0  # bound on normalised observations
+MOST = 10.0  # bound on normalised observations
 
 
 class Eye(linen.Module):
     """Convolutions that make features [..., n] of a picture [..., height, width, channels]; whole numbers are colours to 255.
 
-    They compute in bfloat16, their parameters are float32.
+    They compute in ``StudentCfg.precision``, their parameters are float32.
     """
 
-    channels: tuple[int, ...]
-    features: int
+    cfg: StudentCfg
 
     @linen.compact
     def __call__(self, x: jax.Array) -> jax.Array:
+        cfg, kind = self.cfg, jnp.dtype(self.cfg.precision)
         scale = 1 / 255 if x.dtype == jnp.uint8 else 1.0
-        x = x.astype(jnp.bfloat16) * scale - 0.5
-        for i, count in enumerate(self.channels):
+        x = (x.astype(jnp.float32) * scale - 0.5).astype(kind)
+        for i, count in enumerate(cfg.channels):
             edge = 3 if i else 5
-            x = linen.relu(linen.Conv(count, (edge, edge), strides=2, dtype=jnp.bfloat16)(x))
+            x = linen.relu(linen.Conv(count, (edge, edge), strides=2, dtype=kind)(x))
         x = x.reshape(*x.shape[:-3], -1)
-        return linen.relu(linen.Dense(self.features, dtype=jnp.bfloat16)(x)).astype(jnp.float32)
+        return linen.relu(linen.Dense(cfg.features, dtype=kind)(x)).astype(jnp.float32)
 
 
 class Student(linen.Module):
@@ -55,7 +55,7 @@ class Student(linen.Module):
     @linen.compact
     def __call__(self, sensed: jax.Array, pictures: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         cfg = self.cfg
-        features = [Eye(tuple(cfg.channels), cfg.features, name=f"eye_{name}")(pictures[name]) for name in sorted(pictures)]
+        features = [Eye(cfg, name=f"eye_{name}")(pictures[name]) for name in sorted(pictures)]
         x = jnp.concatenate([*features, sensed], axis=-1)
         truth = linen.Dense(self.truth_size, name="truth")(linen.elu(linen.Dense(cfg.layers[-1], name="where")(x)))
         for size in cfg.layers:
@@ -75,8 +75,9 @@ def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.
     """Computes the action, and the positions of objects in units of their deviation."""
     normalizer, variables = params
     of_sensed = running_statistics.NestedMeanStd(mean=normalizer.mean[SENSED], std=normalizer.std[SENSED])
-    sensed = running_statistics.normalize(obs[SENSED], of_sensed, max_abs_value=_MOST)
-    return net.apply(variables, sensed, obs[SEEN])
+    sensed = running_statistics.normalize(obs[SENSED], of_sensed, max_abs_value=MOST)
+    action, truth = net.apply(variables, sensed, obs[SEEN])  # type: ignore[misc]
+    return action, truth
 
 
 def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:

@@ -115,8 +115,6 @@ def fit_machine(run: RunCfg) -> tuple[RunCfg, str]:
     if asked:
         return run, ""
     run = dataclasses.replace(run, max_minutes=run.max_minutes or 10.0)
-    note = (
-        f"no GPU: {run.num_envs} environments for {enough / 1e6:g} M steps, at most {run.max_minutes:g} minutes; "
-        "an NVIDIA H200 makes 60 M steps of 8,192 environments in half a minute"
-    )
+    steps = f"{run.num_envs} environments for {enough / 1e6:g} M steps"
+    note = f"no GPU: {steps}, at most {run.max_minutes:g} minutes; {kind.pace}"
     return run, note

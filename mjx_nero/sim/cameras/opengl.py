@@ -72,8 +72,7 @@ class OpenGL:
 
     def _draw_all(self, packed: Array) -> list[np.ndarray]:
         """(qpos, fields) of all worlds -> the images. JAX calls this function back, so calling JAX in here would deadlock."""
-        packed = np.asarray(packed)
-        rows = packed.reshape(-1, packed.shape[-1])
+        rows = np.asarray(packed).reshape(-1, packed.shape[-1])
         images = [np.empty((len(rows), *s.shape), s.dtype) for s in self._shapes]
         self._thread.submit(self._draw_rows, rows, images).result()
         return [image.reshape(*packed.shape[:-1], *image.shape[1:]) for image in images]

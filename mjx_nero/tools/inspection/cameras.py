@@ -1,16 +1,15 @@
 """Shows the pictures of an environment's cameras, and how much of its objects they see: a sheet of pictures, and a table."""
 
 import dataclasses
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_nero import console
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.sim.cameras import places
-from mjx_nero.types import Picture
 
 WORLDS = 32
 _STEPS, _EVERY = 40, 40  # control steps with random actions; between two pictures
@@ -23,11 +22,11 @@ class Seen:
     """Pictures of random states.
 
     Attributes:
-        pictures: by camera, [states, ...].
+        pictures: ``types.Picture`` by camera, [states, ...], in numpy.
         shares: (camera, object) -> in what share of the states any of it is seen, and how many pixels of it, in the mean.
     """
 
-    pictures: dict[str, Picture]
+    pictures: dict[str, Any]
     shares: dict[tuple[str, str], tuple[float, float]]
 
 
@@ -44,7 +43,7 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
     )
     step, draw = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(lambda state: env.view(state).cameras))
     state, shots = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(seed), WORLDS)), []
-    aim = jnp.zeros(())
+    aim: Any = None
     for i in range(_STEPS + 1):
         if i % _EVERY == 0:
             aim = env.home_action + jax.random.uniform(
@@ -52,7 +51,7 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
             )
             shots.append(jax.device_get(draw(state)))
         state = step(state, aim)
-    pictures = jax.tree.map(lambda *x: np.concatenate(x), *shots)
+    pictures: dict[str, Any] = jax.tree.map(lambda *x: np.concatenate(x), *shots)
     shares = {}
     for camera, picture in pictures.items():
         for name in cfg.scene.objects:
