@@ -46,8 +46,8 @@ class Learner(Protocol):
     steps_per_iteration: int
 
     def init(self, key: "Key", bank: "Bank | None" = None, shown: "Shown | None" = None) -> Any:
-        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts; ``shown`` is for
-        a learner that imitates."""
+        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts; ``shown`` is
+        for a learner that imitates."""
         ...
 
     def place(self, state: Any) -> Any:

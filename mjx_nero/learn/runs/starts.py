@@ -1,11 +1,11 @@
 """Expert starts: what a task's expert leaves a learner. A bank of visited states, in which ``wrappers.ExpertStarts`` begins
 training episodes, and the actions that the expert took, to imitate.
 
-The task's first controller plays one episode in each of several environments, side by side in one program, through the task's own
-actions (``Chain.invert``). The program compiles and runs on the CPU while the device's programs compile, so every machine gets the
-same states. States are taken along the whole of successful episodes. If the expert rarely succeeds, or obstacles are in the way,
-they end shortly after the grasp. A state is at rest: joints, objects, and the pressure of the fingers. Some noise in the actions
-makes the expert show how to recover (DART, Laskey et al. 2017).
+The task's first controller plays one episode in each of several environments, side by side in one program, through the
+task's own actions (``Chain.invert``). The program compiles and runs on the CPU while the device's programs compile, so every
+machine gets the same states. States are taken along the whole of successful episodes. If the expert rarely succeeds, or
+obstacles are in the way, they end shortly after the grasp. A state is at rest: joints, objects, and the pressure of the fingers.
+Some noise in the actions makes the expert show how to recover (DART, Laskey et al. 2017).
 """
 
 import dataclasses
