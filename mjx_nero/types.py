@@ -79,7 +79,7 @@ class Bank:
 
 @struct.dataclass
 class Shown:
-    """What an expert has shown, in rows [n, ...]."""
+    """Steps that an expert has shown, in rows [n, ...]."""
 
     obs: dict[str, Any]
     action: Float[Array, "n na"]  # what the expert wanted there

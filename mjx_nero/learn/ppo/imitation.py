@@ -1,4 +1,4 @@
-"""What an expert has shown, as PPO learns from it: a policy that begins by imitating it, and keeps near it until it succeeds.
+"""Imitation: PPO with what an expert has shown. The policy begins as a clone of it, and keeps near it until it succeeds.
 
 As DAPG (Rajeswaran et al. 2018), but that the weight of what is shown falls with the policy's own success, not with time, and
 that actions are compared, not their probabilities, as deviations have bounds of their own.
@@ -28,21 +28,21 @@ _SLOW = 0.1  # share of an iteration's success rate in the running one
 
 @struct.dataclass
 class School:
-    """What is shown, and how much that counts."""
+    """Steps that are shown, and how much they count."""
 
     shown: Shown
     weight: Float[Array, ""]  # from 1 to 0
     success: Float[Array, ""]  # running rate of training's episodes
 
     def after(self, successes: Float[Array, ""], episodes: Float[Array, ""]) -> "School":
-        """After another iteration. It counts less the more succeed, nothing once half of them do, and never more again."""
+        """Returns the school after an iteration. It counts less the more succeed, nothing once half do, and never more again."""
         slow = jnp.where(episodes > 0, _SLOW, 0.0)
         rate = self.success + slow * (successes / jnp.maximum(episodes, 1.0) - self.success)
         return School(self.shown, jnp.minimum(self.weight, jnp.maximum(0.0, 1.0 - 2.0 * rate)), rate)
 
 
 def school(env: ManipulationEnv, shown: Shown | None) -> School:
-    """Before anything is learnt; where nothing is shown it counts nothing."""
+    """Makes the school of a new run. It counts nothing if nothing is shown."""
     zero = jnp.zeros(())
     if shown is not None:
         return School(Shown({ACTOR: shown.obs[ACTOR]}, shown.action), zero + 1.0, zero)
@@ -51,7 +51,7 @@ def school(env: ManipulationEnv, shown: Shown | None) -> School:
 
 
 def seen(normalizer: Any, shown: Shown) -> Any:
-    """Statistics of the observations of what is shown."""
+    """Returns statistics of the observations that are shown."""
     normalizer = running_statistics.update(normalizer, {name: shown.obs[name] for name in normalizer.mean})
     longer = normalizer.count.replace(lo=normalizer.count.lo * jnp.uint32(LONG))
     return normalizer.replace(count=longer, summed_variance=jax.tree.map(lambda x: x * LONG, normalizer.summed_variance))
@@ -60,7 +60,7 @@ def seen(normalizer: Any, shown: Shown) -> Any:
 def cloned(
     nets: networks.PPONetworks, normalizer: Any, params: losses.PPONetworkParams, shown: Shown, key: Key
 ) -> losses.PPONetworkParams:
-    """A policy that acts as the expert does, with little noise; the critic as it is."""
+    """Returns a policy that acts as the expert does, with little noise; the critic stays as it is."""
     adam = optax.adam(RATE)
 
     def step(carry: tuple, key: Key) -> tuple:
@@ -79,7 +79,7 @@ def cloned(
 def gradient(
     nets: networks.PPONetworks, normalizer: Any, params: losses.PPONetworkParams, school: School, key: Key
 ) -> losses.PPONetworkParams:
-    """Of the policy's squared distance from some of what is shown, as far as that counts."""
+    """Computes the gradient of the policy's squared distance from some of the steps shown, as far as they count."""
     some = _some(school.shown, BESIDE, key)
     return jax.grad(lambda p: school.weight * _distance(nets, normalizer, p.policy, some))(params)
 
