@@ -78,6 +78,14 @@ class Bank:
 
 
 @struct.dataclass
+class Shown:
+    """Steps that an expert has shown, in rows [n, ...]."""
+
+    obs: dict[str, Any]
+    action: Float[Array, "n na"]  # what the expert wanted there
+
+
+@struct.dataclass
 class Progress:
     """The state of ``envs.wrappers.ExpertStarts``. In a batch every field is [n, ...], spread over devices and saved like the
     environments."""

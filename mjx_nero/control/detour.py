@@ -107,6 +107,7 @@ class Detour:
         self.dt, self.cfg, self._n = dt, cfg, len(robot.arm.joints)
         self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
         self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None
+        self._down = np.array(robot.down, np.float32)
 
     def init(self, view: View) -> Way:
         """Plans the way from the end effector's position."""
@@ -132,8 +133,8 @@ class Detour:
         if self._rmpflow:
             return after, self._rmpflow.arm(view, target)
         assert self._ik is not None and way.setpoint is not None
-        turn = view.ee_quat_w if orientation is None else orientation
-        setpoint, targets = self._ik.arm(way.setpoint, dataclasses.replace(target, orientation=turn))
+        # As far down as it goes: after its present orientation a hand would drift.
+        setpoint, targets = self._ik.arm(way.setpoint, dataclasses.replace(target, orientation=jnp.asarray(self._down)))
         return dataclasses.replace(after, setpoint=setpoint), targets
 
     def warning(self, memory: Way) -> str:
@@ -192,7 +193,7 @@ class CarryPast(Detour):
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: CarryPastCfg = CarryPastCfg()):
         super().__init__(robot, dt, cfg)
-        self._gripper, self._down = ParallelGripper(robot), np.array(robot.down, np.float32)
+        self._gripper = ParallelGripper(robot)
         self._settled = max(1, round(cfg.settling / dt))
         self._closed = self._settled + max(1, round(cfg.closing / dt))
         way = np.abs(np.subtract(robot.gripper.close, robot.gripper.open)) / np.array(robot.gripper.speed)

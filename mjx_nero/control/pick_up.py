@@ -26,7 +26,6 @@ _UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
-_TILTS = 0.003  # [m/rad] what orientation weighs at most on the way to the goal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +42,7 @@ class PickUpCfg:
         above: the hand comes down from so high over the object, and lifts it so high before it carries it away.
         speed: of the grasp point [m/s].
         closing: how long the fingers take [s].
-        ik: of the arm's motion. Orientation weighs little, and next to nothing on the way to the goal: where that cannot be
-            reached with the hand pointing down, it tilts.
+        ik: of the arm's motion. Orientation weighs little: where a goal cannot be reached with the hand pointing down, it tilts.
     """
 
     object: str = "cube"
@@ -99,8 +97,6 @@ class PickUp:
             raise UserError(f"heading and turns are an axis (0, 1, 2) and a number an object, got {cfg.heading} and {cfg.turns}")
         self.dt, self.cfg = dt, cfg
         self.gripper, self._ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
-        tilted = dataclasses.replace(cfg.ik, orientation_weight=min(_TILTS, cfg.ik.orientation_weight))
-        self._carry = InverseKinematics(robot, cfg=tilted)
         self._n = len(robot.arm.joints)
         self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
         self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
@@ -139,8 +135,7 @@ class PickUp:
         way = wanted - memory.pos
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
-        hand = self._hand(memory.yaw)
-        found = jnp.where(phase == CARRY, self._carry.local(pos, hand, memory.q).q, self._ik.local(pos, hand, memory.q).q)
+        found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
         q, qd = self._follow(memory, jnp.where(phase == ABOVE, memory.above, found))
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
@@ -172,7 +167,7 @@ class PickUp:
             [memory.phase == ABOVE, memory.phase == DOWN, memory.phase == CLOSE, memory.phase == UP],
             [
                 still & (error < 0.01) | (time > 2.5),
-                arrived & still & (error < 0.004) | (time > 1.2),
+                arrived & still & (error < 0.004) | (time > 0.8),
                 time > self.cfg.closing + 0.15,
                 arrived | (time > 1.0),
             ],

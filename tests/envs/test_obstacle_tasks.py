@@ -120,11 +120,24 @@ def test_the_first_joint_turns_the_arm_aside(robot, x, y):
 
 
 @pytest.mark.parametrize("robot", ["piper", "so_arm100"])
-def test_robots_without_rmpflow_have_no_expert(robot):
+def test_experts_of_robots_without_rmpflow_go_by_inverse_kinematics(robot):
     assert not (ASSETS / robot / "rmpflow").exists()
-    for name in ("reach_obstacles", "lift_obstacles"):
-        assert not env_cfg(name, robot=robot).controllers
-    assert "detour" in env_cfg("reach_obstacles", robot="nero").controllers
+    for name, expert in (("reach_obstacles", "detour"), ("lift_obstacles", "carry")):
+        assert env_cfg(name, robot=robot).controllers[expert]["motion"] == "ik"
+        assert "motion" not in env_cfg(name, robot="nero").controllers[expert]
+
+
+@pytest.mark.parametrize("arm", ["piper", "so100", "so101"])
+def test_there_is_room_for_obstacles_between_start_and_goal(arm):
+    """In every episode; and nothing touches at the start."""
+    for task in ("reach_obstacles", "lift_obstacles"):
+        env = make(f"{arm}_{task}", impl="native", num_envs=64)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
+        boxes = jax.vmap(env.view)(state).obstacles.values()
+        assert (np.stack([box.pos_w[:, 2] for box in boxes]) > 0).any(axis=0).all()
+        still = jax.jit(jax.vmap(env.finish, (0, None, 0, None)))
+        held = env.physics.step(state.pipeline_state, state.pipeline_state.ctrl)[0]
+        assert (still(state, env.home_action, held, jnp.zeros(())).pipeline_state.readings["touch"] == 0).all()
 
 
 def test_a_touch_costs_a_beginner_a_tenth():

@@ -13,9 +13,10 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg
 from mjx_nero.learn import checkpoint
+from mjx_nero.learn.learner import ROWS
 from mjx_nero.learn.runs import starts
 from mjx_nero.mdp import curriculum, events
-from mjx_nero.types import PHASE, Bank, Start
+from mjx_nero.types import PHASE, Bank, Shown, Start
 
 N, PHASES = 16, wrappers.PHASES
 KEYS = jax.random.split(jax.random.PRNGKey(5), N)
@@ -95,6 +96,16 @@ def test_rows_are_of_their_phases():
     assert set(found["episode"]) == {0, 2} and set(found["step"]) == set(range(2, 10))
 
 
+def test_steps_that_are_shown_are_of_episodes_worth_it():
+    """Three steps of four episodes, of which the second and the last are worth it: each step of those as often as any other."""
+    step, episode = np.indices((3, 4))
+    way = starts.Way(None, np.zeros(4, int), np.array([0, 2, 0, 3]), 1.0, 1.0)
+    found = starts.steps(way, Shown({"state": 10 * step + episode}, step), seed=0)
+    which, often = np.unique(found.obs["state"], return_counts=True)
+    assert which.tolist() == [1, 3, 11, 13, 21, 23] and (found.obs["state"] // 10 == found.action).all()
+    np.testing.assert_allclose(often / ROWS, 1 / 6, atol=0.02)
+
+
 # --- with physics
 
 
@@ -121,7 +132,9 @@ def told():
 
 @pytest.fixture(scope="module")
 def bank(batch, told):
-    return starts.maker(asked(batch), told.append)(3)
+    found = starts.maker(asked(batch), told.append)(3)
+    assert set(found) == {"bank"}  # its learner imitates nobody
+    return found["bank"]
 
 
 @pytest.fixture(scope="module")
@@ -231,12 +244,12 @@ def test_a_task_without_an_expert_says_so():
     told = []
     cfg = env_cfg("nero_push", **{"curriculum.expert_starts": 0.5})
     env = wrappers.for_training(ManipulationEnv(cfg, impl="native"))
-    assert starts.maker(asked(env), told.append)(0) is None
-    assert told == ["no episodes start from an expert's states: the task has no script that grasps"]
+    assert starts.maker(asked(env), told.append)(0) == {}
+    assert told == ["no expert shows how: the task has no script that grasps"]
 
 
 def test_all_that_differs_is_left_out_where_the_expert_plays():
     cfg = starts.playground(env_cfg("nero_lift", "sim2real"))
     assert not cfg.randomization and not cfg.sensors and cfg.robot.gravity_compensation
     assert not any(group.corruption for group in cfg.observations.values())
-    assert starts.playground(env_cfg("nero_lift_obstacles")).obstacles is None
+    assert cfg.actions == env_cfg("nero_lift", "sim2real").actions  # it plays by what a policy acts by

@@ -164,5 +164,7 @@ class Tower:
             "motion": "ik",
             "turn": self.angle < math.pi,
             **regions.ik(self.robot, "ik."),
+            # Where the hand does not point straight down as high as it goes, it leans, but goes there.
+            **({"ik.orientation_weight": regions.UPRIGHT} if leave > high else {}),
         }
         return {"pick_place": fields}

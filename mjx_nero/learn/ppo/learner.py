@@ -43,11 +43,12 @@ from mjx_nero import config
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
 from mjx_nero.learn.ppo.cfg import differing, fit
 from mjx_nero.learn.ppo.networks import from_meta, init_params, make_act, make_networks, shapes
-from mjx_nero.types import Bank, Key
+from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
 Tree = TypeVar("Tree")
@@ -67,11 +68,12 @@ class TrainState:
     key: Key
     iteration: Int[Array, ""]
     returns: running_statistics.RunningStatisticsState  # statistics of all returns so far: the critic's unit
+    school: imitation.School | None = None  # what an expert has shown; None: nothing is imitated
 
 
 _HERE: Any = PartitionSpec()
 _SPREAD: Any = PartitionSpec(_AXIS)
-_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE)
+_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE, _HERE)
 
 
 @struct.dataclass
@@ -119,6 +121,7 @@ class Learner:
             raise UserError(f"ppo.min_std ({cfg.min_std:g}) is above ppo.max_std ({cfg.max_std:g})")
         self.env, self.cfg, self.num_envs = env, cfg, cfg.num_envs
         self.num_devices, self.divisor = num_devices, parts
+        self.imitates = cfg.imitation > 0
         self._axis = _AXIS if num_devices > 1 else None  # None: a program without any communication
         self._mesh = Mesh(np.array(devices), (_AXIS,))
         self.sizes = env.observation_size
@@ -129,17 +132,21 @@ class Learner:
         self._optimizer = optax.flatten(optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam))
         self._make_policy = networks.make_inference_fn(self.networks)
 
-    def init(self, key: Key, bank: Bank | None = None) -> TrainState:
+    def init(self, key: Key, bank: Bank | None = None, shown: Shown | None = None) -> TrainState:
         """Makes new networks and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.networks, self.sizes, k_net)
+        school = imitation.school(self.env.unwrapped, shown) if self.imitates else None
+        if school and shown is not None:
+            normalizer = imitation.seen(normalizer, shown)
+            params = imitation.cloned(self.networks, normalizer, params, shown, k_net)
         env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs), bank)
         carry = env_state.info["carry"]
         phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
         env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
         opt_state = self._optimizer.init(params)
         returns = running_statistics.init_state(specs.Array((), jnp.dtype("float32")), std_eps=jnp.float32(1e-6))
-        state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns)
+        state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns, school)
         # ``run`` returns weakly typed leaves as strong ones, so whatever takes the state would be compiled twice.
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
 
@@ -156,7 +163,8 @@ class Learner:
                 return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, np.asarray(x).__getitem__), part)
             return jax.device_put(part, sharding)
 
-        return TrainState(*(put(getattr(state, f.name), getattr(_SPECS, f.name)) for f in dataclasses.fields(TrainState)))
+        parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(TrainState)}
+        return TrainState(**{name: part and put(part, getattr(_SPECS, name)) for name, part in parts.items()})
 
     def policy(self, state: TrainState) -> tuple:
         """Returns normalizer and network parameters from the first device, for programs that run only there."""
@@ -232,8 +240,9 @@ class Learner:
         if self.cfg.normalize_returns:  # otherwise they stay what they start as, mean 0 and deviation 1
             raw = running_statistics.denormalize(batch.returns, returns)
             returns = running_statistics.update(returns, raw, pmap_axis_name=self._axis)
-        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns)
         sums = jax.lax.psum(sums, self._axis) if self._axis else sums
+        school = state.school and state.school.after(sums["sum/success"], sums["sum/episodes"])
+        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns, school)
         return state, {**sums, **metrics}
 
     def _networks_precision(self):
@@ -325,7 +334,11 @@ class Learner:
             params, opt_state = carry
             envs, key = envs_and_key
             part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat, for faster products on a CPU
-            grads, metrics = self._mean(jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key))
+            grads, metrics = jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key)
+            if state.school:
+                pull = imitation.gradient(self.networks, state.normalizer, params, state.school, key)
+                grads = jax.tree.map(lambda own, to: own + cfg.imitation * to, grads, pull)
+            grads, metrics = self._mean((grads, metrics))
             if cfg.desired_kl:
                 opt_state, _ = optimizer.adaptive_kl_learning_rate(
                     opt_state, metrics["kl"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate

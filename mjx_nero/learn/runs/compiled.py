@@ -86,9 +86,7 @@ def fresh(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], 
     init = jax.jit(learner.init)
 
     def start(seed: int) -> Any:
-        found = bank(seed)
-        given = () if found is None else (found,)  # not every learner takes a bank
-        return init(jax.random.PRNGKey(seed), *given)
+        return init(jax.random.PRNGKey(seed), **bank(seed))  # not every learner takes what it makes
 
     return start
 

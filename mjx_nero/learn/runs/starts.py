@@ -1,9 +1,11 @@
-"""Expert starts: the bank of visited states in which ``wrappers.ExpertStarts`` begins training episodes.
+"""Expert starts: what a task's expert leaves a learner. A bank of visited states, in which ``wrappers.ExpertStarts`` begins
+training episodes, and the actions that the expert took, to imitate.
 
-The task's first controller plays one episode in each of several environments, side by side in one program. The program compiles
-and runs on the CPU while the device's programs compile, so every machine gets the same states. States are taken along the whole
-of successful episodes. If the expert rarely succeeds, or obstacles are in the way, they end shortly after the grasp. A state is
-at rest: joints, objects, and the pressure of the fingers.
+The task's first controller plays one episode in each of several environments, side by side in one program, through the
+task's own actions (``Chain.invert``). The program compiles and runs on the CPU while the device's programs compile, so every
+machine gets the same states. States are taken along the whole of successful episodes. If the expert rarely succeeds, or
+obstacles are in the way, they end shortly after the grasp. A state is at rest: joints, objects, and the pressure of the fingers.
+Some noise in the actions makes the expert show how to recover (DART, Laskey et al. 2017).
 """
 
 import dataclasses
@@ -21,19 +23,20 @@ from jaxtyping import Array
 from mjx_nero import config, control
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import CurriculumCfg, EnvCfg, for_controllers
+from mjx_nero.envs.task import CurriculumCfg, EnvCfg
 from mjx_nero.errors import UserError
-from mjx_nero.learn.learner import Learner
-from mjx_nero.learn.play import rollout
-from mjx_nero.types import Bank, Start
+from mjx_nero.learn.learner import ROWS, Learner
+from mjx_nero.types import Bank, Shown, Start
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
+# Greatest standard deviation of the noise on the expert's actions, if they are velocities or not: noisy positions shake the arm.
+NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
 _GRASPED, _HOLD = "metrics.grasped", "success.hold"
 
-Make = Callable[[int], Bank | None]  # seed -> bank
+Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` beside its key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,32 +61,39 @@ class Way:
         return bool((self.ends > 0).mean() >= ENOUGH)
 
 
-def none(seed: int) -> None:
-    """Makes no bank: all episodes start as usual."""
+def none(seed: int) -> dict[str, Any]:
+    """Makes nothing: all episodes start as usual, and no expert is imitated."""
+    return {}
 
 
 def maker(learner: Learner, say: Callable[[str], None]) -> Make:
-    """Returns a function that makes the bank of a learner's environments from a seed.
+    """Returns a function that makes from a seed what an expert leaves a learner.
 
-    It returns None, and says why in a line, if there can be none.
+    It returns nothing, and says why in a line, if there can be none.
     """
-    env = learner.env
+    env, imitates = learner.env, getattr(learner, "imitates", False)
+    begins = isinstance(env, wrappers.ExpertStarts)
     player = functools.cache(lambda: _player(env.unwrapped, learner.num_envs))
 
-    def make(seed: int) -> Bank | None:
-        if not isinstance(env, wrappers.ExpertStarts):
-            return None
+    def make(seed: int) -> dict[str, Any]:
+        if not begins and not imitates:
+            return {}
         try:
             with jax.default_device(_processor()):
                 play = player()
                 begun = time.perf_counter()
-                found = play(seed)
+                found, shown = play(seed)
         except UserError as error:
-            say(f"no episodes start from an expert's states: {error}")
-            return None
+            say(f"no expert shows how: {error}")
+            return {}
         did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} episodes"
-        say(f"{did}: {'some' if found.enough else 'no'} episodes start from its states ({time.perf_counter() - begun:.1f} s)")
-        return rows(found, learner.num_envs, wrappers.PHASES, seed) if found.enough else None
+        uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if begins else []
+        uses += ["it is imitated" if found.enough else "it is not imitated"] if imitates else []
+        say(f"{did}: {', '.join(uses)} ({time.perf_counter() - begun:.1f} s)")
+        if not found.enough:
+            return {}
+        bank = {"bank": rows(found, learner.num_envs, wrappers.PHASES, seed)} if begins else {}
+        return {**bank, **({"shown": steps(found, shown, seed)} if imitates else {})}
 
     return make
 
@@ -97,16 +107,24 @@ def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
     return jax.tree.map(lambda x: np.asarray(x)[step, episode], way.states)
 
 
+def steps(way: Way, shown: Shown, seed: int) -> Shown:
+    """Draws ``ROWS`` of the steps [steps, episodes, ...] of the useful episodes, each with the same probability."""
+    rng, count = np.random.default_rng(seed), len(shown.action)
+    at = rng.integers(count, size=ROWS), rng.choice(np.flatnonzero(way.ends), ROWS)
+    return jax.tree.map(lambda x: np.asarray(x)[at], shown)
+
+
 def playground(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task for the expert: drive targets, the arm's weight carried, no randomization, delays or obstacles.
+    """Returns the task for the expert: the arm's weight carried, no randomization, delays or pushes.
 
     Its states are valid states of the task itself.
     """
-    plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "obstacles": None, "curriculum": CurriculumCfg()}
-    return for_controllers(dataclasses.replace(cfg.uncorrupted(), **plain))
+    plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "curriculum": CurriculumCfg()}
+    robot = dataclasses.replace(cfg.robot, gravity_compensation=True)
+    return dataclasses.replace(cfg.uncorrupted(), robot=robot, **plain)
 
 
-def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:
+def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown]]:
     """Compiles a program that plays the expert's episodes of a seed.
 
     Raises:
@@ -118,15 +136,15 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], Way]:
     count = min(most, EPISODES)
     env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
     quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
-    expert = rollout.controller_agent(env, control.make(name, cfg.robot, env.dt, {**cfg.controllers[name], **quick}))
+    expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick})
     some = jax.random.split(jax.random.PRNGKey(0), count)
     run = jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile()
 
-    def play(seed: int) -> Way:
+    def play(seed: int) -> tuple[Way, Shown]:
         found: Any = jax.device_get(run(jax.random.split(jax.random.PRNGKey(seed), count)))
-        states, grasped, won, hold = found
+        states, shown, grasped, won, hold = found
         coming, past = (round(time / env.dt) for time in (COMING, LIFTED))
-        return way(states, grasped, won, hold, coming, past, whole=cfg.obstacles is None)
+        return way(states, grasped, won, hold, coming, past, whole=cfg.obstacles is None), shown
 
     return play
 
@@ -139,23 +157,26 @@ def _processor() -> jax.Device | None:
         return None
 
 
-def _play(env: ManipulationEnv, expert: rollout.Agent, keys: Array) -> tuple[Bank, Array, Array, Array]:
-    """Plays one episode per key; returns the arguments of ``way``."""
+def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
+    """Plays one episode per key; returns the arguments of ``way``, and the steps as second."""
+    noise = NOISE["JointVelocity" in env.action_kinds] * jnp.arange(len(keys))[:, None] / len(keys)
 
-    def step(carry: tuple, _: None) -> tuple:
+    def step(carry: tuple, key: Array) -> tuple:
         state, memory, alive = carry
-        action, memory = expert.act(None, memory, state, keys)
-        state = jax.vmap(env.step)(state, action)
-        seen = jax.vmap(lambda s: _at_rest(env, s))(state), state.metrics["distance"]
-        grasped = state.info["carry"].memory[_GRASPED] & (alive > 0)
-        return (state, memory, alive * (1 - state.done)), (*seen, grasped, alive)
+        view = jax.vmap(env.view)(state)
+        memory, targets = jax.vmap(expert.step)(memory, view)
+        wanted = jax.vmap(env.actions.invert)(targets, view.joint_pos, view.ctrl)
+        after = jax.vmap(env.step)(state, wanted + noise * jax.random.normal(key, wanted.shape))
+        seen = jax.vmap(lambda s: _at_rest(env, s))(after), after.metrics["distance"]
+        grasped = after.info["carry"].memory[_GRASPED] & (alive > 0)
+        return (after, memory, alive * (1 - after.done)), (*seen, grasped, alive, Shown(state.obs, wanted))
 
     first = jax.vmap(env.reset)(keys)
-    begin = first, expert.init(first), jnp.ones(len(keys))
-    played: Any = jax.lax.scan(step, begin, None, env.episode_length)
-    (state, *_), (starts, distance, grasped, alive) = played
+    begin = first, jax.vmap(lambda state: expert.init(env.view(state)))(first), jnp.ones(len(keys))
+    played: Any = jax.lax.scan(step, begin, jax.random.split(keys[0], env.episode_length))
+    (state, *_), (starts, distance, grasped, alive, shown) = played
     won = (state.metrics["success"] > 0) & (alive[-1] > 0)
-    return Bank(starts, distance < distance[0] / 2), grasped, won, state.info["carry"].memory[_HOLD]
+    return Bank(starts, distance < distance[0] / 2), shown, grasped, won, state.info["carry"].memory[_HOLD]
 
 
 def _at_rest(env: ManipulationEnv, state: State) -> Start:

@@ -1,0 +1,94 @@
+"""Imitation: PPO with what an expert has shown. The policy begins as a clone of it, and keeps near it until it succeeds.
+
+As DAPG (Rajeswaran et al. 2018), but that the weight of what is shown falls with the policy's own success, not with time, and
+that actions are compared, not their probabilities, as deviations have bounds of their own.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import losses, networks
+from flax import struct
+from jaxtyping import Array, Float
+
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn.learner import ROWS
+from mjx_nero.learn.ppo.networks import ACTOR
+from mjx_nero.types import Key, Shown
+
+STEPS, BATCH, RATE = 2000, 1024, 1e-3  # of cloning
+LONG = 200  # times that the observations' statistics count what is shown: what arms see in their first second is no measure
+STILL = 0.2  # deviation of a cloned policy's actions: with 0.5 it grasps nothing, and unlearns within 4 M env steps what it knew
+BESIDE = 512  # rows beside every minibatch
+_SLOW = 0.1  # share of an iteration's success rate in the running one
+
+
+@struct.dataclass
+class School:
+    """Steps that are shown, and how much they count."""
+
+    shown: Shown
+    weight: Float[Array, ""]  # from 1 to 0
+    success: Float[Array, ""]  # running rate of training's episodes
+
+    def after(self, successes: Float[Array, ""], episodes: Float[Array, ""]) -> "School":
+        """Returns the school after an iteration. It counts less the more succeed, nothing once half do, and never more again."""
+        slow = jnp.where(episodes > 0, _SLOW, 0.0)
+        rate = self.success + slow * (successes / jnp.maximum(episodes, 1.0) - self.success)
+        return School(self.shown, jnp.minimum(self.weight, jnp.maximum(0.0, 1.0 - 2.0 * rate)), rate)
+
+
+def school(env: ManipulationEnv, shown: Shown | None) -> School:
+    """Makes the school of a new run. It counts nothing if nothing is shown."""
+    zero = jnp.zeros(())
+    if shown is not None:
+        return School(Shown({ACTOR: shown.obs[ACTOR]}, shown.action), zero + 1.0, zero)
+    rows = jax.tree.map(lambda x: jnp.zeros((ROWS, *x.shape), x.dtype), env.state_shape.obs[ACTOR])
+    return School(Shown({ACTOR: rows}, jnp.zeros((ROWS, env.action_size))), zero, zero)
+
+
+def seen(normalizer: Any, shown: Shown) -> Any:
+    """Returns statistics of the observations that are shown."""
+    normalizer = running_statistics.update(normalizer, {name: shown.obs[name] for name in normalizer.mean})
+    longer = normalizer.count.replace(lo=normalizer.count.lo * jnp.uint32(LONG))
+    return normalizer.replace(count=longer, summed_variance=jax.tree.map(lambda x: x * LONG, normalizer.summed_variance))
+
+
+def cloned(
+    nets: networks.PPONetworks, normalizer: Any, params: losses.PPONetworkParams, shown: Shown, key: Key
+) -> losses.PPONetworkParams:
+    """Returns a policy that acts as the expert does, with little noise; the critic stays as it is."""
+    adam = optax.adam(RATE)
+
+    def step(carry: tuple, key: Key) -> tuple:
+        policy, memory = carry
+        grads = jax.grad(lambda p: _distance(nets, normalizer, p, _some(shown, BATCH, key)))(policy)
+        updates, memory = adam.update(grads, memory)
+        return (optax.apply_updates(policy, updates), memory), None
+
+    (policy, _), _ = jax.lax.scan(step, (params.policy, adam.init(params.policy)), jax.random.split(key, STEPS))
+    layers = dict(policy["params"])
+    if "std_logparam" in layers:
+        layers["std_logparam"] = jax.tree.map(lambda x: jnp.full_like(x, jnp.log(STILL)), layers["std_logparam"])
+    return params.replace(policy={**policy, "params": layers})
+
+
+def gradient(
+    nets: networks.PPONetworks, normalizer: Any, params: losses.PPONetworkParams, school: School, key: Key
+) -> losses.PPONetworkParams:
+    """Computes the gradient of the policy's squared distance from some of the steps shown, as far as they count."""
+    some = _some(school.shown, BESIDE, key)
+    return jax.grad(lambda p: school.weight * _distance(nets, normalizer, p.policy, some))(params)
+
+
+def _distance(nets: networks.PPONetworks, normalizer: Any, policy: Any, shown: Shown) -> Float[Array, ""]:
+    mean = nets.parametric_action_distribution.create_dist(nets.policy_network.apply(normalizer, policy, shown.obs)).loc
+    return jnp.mean(jnp.sum(jnp.square(mean - shown.action), axis=-1))
+
+
+def _some(shown: Shown, n: int, key: Key) -> Shown:
+    at = jax.random.randint(key, (n,), 0, len(shown.action))
+    return jax.tree.map(lambda x: jnp.asarray(x)[at], shown)

@@ -1,0 +1,83 @@
+"""Imitation of an expert: how much it counts, what a clone does, and what it leaves alone."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training.acme import running_statistics
+
+from mjx_nero.learn.learner import ROWS
+from mjx_nero.learn.ppo import imitation
+from mjx_nero.learn.ppo.cfg import NetworkCfg
+from mjx_nero.learn.ppo.networks import init_params, make_act, make_networks
+from mjx_nero.types import Shown
+
+SIZES = {"state": (3,), "privileged_state": (4,)}
+KEY = jax.random.PRNGKey(0)
+NETS = make_networks(SIZES, 2, NetworkCfg(actor=(32,), critic=(8,), init_std=0.5))
+
+
+@pytest.fixture(scope="module")
+def shown() -> Shown:
+    """An expert whose actions are the first observation, doubled, and minus the second; observations about 5, a tenth wide."""
+    obs = 5.0 + 0.1 * jax.random.normal(KEY, (ROWS, 4))
+    action = jnp.stack([2.0 * (obs[:, 0] - 5.0), 5.0 - obs[:, 1]], axis=1)
+    return Shown({"state": obs[:, :3], "privileged_state": obs}, action)
+
+
+@pytest.fixture(scope="module")
+def cloned(shown):
+    normalizer, params = init_params(NETS, SIZES, KEY)
+    normalizer = imitation.seen(normalizer, shown)
+    return normalizer, params, jax.jit(lambda: imitation.cloned(NETS, normalizer, params, shown, KEY))()
+
+
+def test_what_is_shown_counts_less_the_more_succeed():
+    """A tenth of every iteration's rate: 0.1 of all after one in which all do, half as much of what is left at 0.25."""
+    school = imitation.School(Shown({}, jnp.zeros((1, 2))), jnp.ones(()), jnp.zeros(()))
+    same = school.after(jnp.zeros(()), jnp.zeros(()))
+    assert float(same.weight) == 1 and float(same.success) == 0  # no episode has ended
+    one = school.after(jnp.array(30.0), jnp.array(30.0))
+    assert float(one.success) == pytest.approx(0.1) and float(one.weight) == pytest.approx(0.8)
+    worse = one.after(jnp.zeros(()), jnp.array(5.0))
+    assert float(worse.success) == pytest.approx(0.09) and float(worse.weight) == pytest.approx(0.8)  # never more again
+    half = dataclasses.replace(school, success=jnp.array(0.5)).after(jnp.array(1.0), jnp.array(2.0))
+    assert float(half.weight) == 0 == float(half.after(jnp.zeros(()), jnp.array(9.0)).weight)
+
+
+def test_statistics_are_of_what_is_shown_for_long(shown, cloned):
+    normalizer = cloned[0]
+    np.testing.assert_allclose(normalizer.mean["state"], 5.0, atol=0.01)
+    np.testing.assert_allclose(normalizer.std["privileged_state"], 0.1, rtol=0.05)
+    assert int(normalizer.count) == imitation.LONG * ROWS
+    other = running_statistics.update(normalizer, jax.tree.map(jnp.zeros_like, shown.obs))
+    np.testing.assert_allclose(other.mean["state"], 5.0 * imitation.LONG / (imitation.LONG + 1), atol=0.02)
+
+
+def test_a_clone_acts_as_the_expert_with_little_noise(shown, cloned):
+    normalizer, before, after = cloned
+    act = make_act(NETS, (normalizer, after))(shown.obs)
+    assert float(jnp.mean(jnp.square(act - shown.action))) < 0.02 * float(jnp.mean(jnp.square(shown.action)))
+    deviations = NETS.parametric_action_distribution.create_dist(
+        NETS.policy_network.apply(normalizer, after.policy, shown.obs)
+    ).scale
+    np.testing.assert_allclose(deviations, imitation.STILL, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(before.value), jax.tree.leaves(after.value), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_pull_is_as_strong_as_its_weight_and_no_critics(shown, cloned):
+    normalizer, before, after = cloned
+
+    def pull(params, weight):
+        school = imitation.School(Shown({"state": shown.obs["state"]}, shown.action), jnp.array(weight), jnp.zeros(()))
+        return imitation.gradient(NETS, normalizer, params, school, KEY)
+
+    def norm(tree):
+        return float(jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(tree))))
+
+    whole, half, none = (pull(before, weight) for weight in (1.0, 0.5, 0.0))
+    assert norm(half.policy) == pytest.approx(norm(whole.policy) / 2) and norm(none) == 0 == norm(whole.value)
+    assert norm(pull(after, 1.0).policy) < norm(whole.policy) / 5  # hardly any from where it already acts so
