@@ -25,7 +25,7 @@ from mjx_nero.learn.clone.cfg import PRESETS, CloneCfg
 from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.ppo.cfg import differing
 from mjx_nero.learn.ppo.networks import ACTOR, from_meta, init_params, make_act, make_networks
-from mjx_nero.types import Bank, Key
+from mjx_nero.types import Bank, Key, Shown
 
 
 @struct.dataclass
@@ -70,7 +70,7 @@ class Learner:
             optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), optax.adamw(rate, weight_decay=cfg.weight_decay))
         )
 
-    def init(self, key: Key, bank: Bank | None = None) -> CloneState:
+    def init(self, key: Key, bank: Bank | None = None, shown: Shown | None = None) -> CloneState:
         """Makes new networks; the demonstrations' mean and deviation normalise observations."""
         k_net, k_seed = jax.random.split(key)
         normalizer, params = init_params(self._networks, self._sizes, k_net)

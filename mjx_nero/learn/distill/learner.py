@@ -29,7 +29,7 @@ from mjx_nero.learn.distill import teachers
 from mjx_nero.learn.distill.cfg import ENVS, PRESETS, DistillCfg
 from mjx_nero.learn.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
 from mjx_nero.learn.learner import Kind, Observation
-from mjx_nero.types import Bank, Key
+from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
 _METRICS = ("loss", "action_loss", "truth_loss", "seen_error")
@@ -85,7 +85,7 @@ class Learner:
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
         self._optimizer = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam)
 
-    def init(self, key: Key, bank: Bank | None = None) -> TrainState:
+    def init(self, key: Key, bank: Bank | None = None, shown: Shown | None = None) -> TrainState:
         """Makes a new student and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.network, self.sizes, k_net)

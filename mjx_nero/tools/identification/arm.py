@@ -15,7 +15,7 @@ from mjx_nero.deploy.remote import Remote
 from mjx_nero.deploy.safety import Fault, Limits
 from mjx_nero.deploy.stop import operator
 from mjx_nero.identify.excitation import RATE, sweeps
-from mjx_nero.sim import description
+from mjx_nero.interop import description
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools.deploy import arms
