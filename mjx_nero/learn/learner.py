@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import jax
     from brax.envs.base import Env
 
-    from mjx_nero.types import Bank, Key, Shown
+    from mjx_nero.types import Bank, Key
 
 ROWS = 16_384  # of ``types.Shown``
 Params = Any  # a policy's parameters: a pytree of arrays
@@ -35,7 +35,7 @@ class Learner(Protocol):
         num_envs: number of environments on all devices together.
         num_devices: number of devices that they are spread over.
         divisor: ``num_envs`` must be a multiple of it.
-        imitates: whether ``init`` takes what an expert shows; may be missing: no.
+        imitates: True if ``init`` also takes ``shown``, ``ROWS`` steps of an expert (``types.Shown``). May be missing: False.
         steps_per_iteration: env steps of an iteration.
     """
 
@@ -45,9 +45,8 @@ class Learner(Protocol):
     divisor: int
     steps_per_iteration: int
 
-    def init(self, key: "Key", bank: "Bank | None" = None, shown: "Shown | None" = None) -> Any:
-        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts; ``shown`` is
-        for a learner that imitates."""
+    def init(self, key: "Key", bank: "Bank | None" = None) -> Any:
+        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts."""
         ...
 
     def place(self, state: Any) -> Any:
