@@ -76,11 +76,12 @@ def test_the_bundled_policy_of_the_task_teaches():
     assert teachers.find(ManipulationEnv(cfg, "native")).meta["env"] == "nero_lift"
     other = ManipulationEnv(registry.env_cfg("so101_lift", "rgb_fixed"), "native")
     assert teachers.find(other).meta["env"] == "so101_lift"
-    nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, gravity_compensation=True))
+    slow = dataclasses.replace(cfg.robot.arm, speed=(0.5,) * 7)
+    nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, arm=slow))
     with pytest.raises(UserError, match=r"no bundled policy can teach nero this task: train one .* --distill.teacher RUN"):
         teachers.find(ManipulationEnv(nobody, "native"))
     with pytest.raises(UserError, match=r"cannot teach here: it is of another robot \(piper; here nero\)"):
-        teachers.find(ManipulationEnv(cfg, "native"), "assets/policies/piper_lift.safetensors")
+        teachers.find(ManipulationEnv(cfg, "native"), str(policy.shipped("piper_lift")))
 
 
 def test_what_does_not_go_together_is_refused(quick):
