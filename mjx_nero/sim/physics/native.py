@@ -3,6 +3,7 @@
 A program calls the host once a control step with all environments of a batch. The library computes in double precision.
 """
 
+import collections
 import contextlib
 import copy
 import dataclasses
@@ -26,12 +27,15 @@ from mjx_nero.sim.physics import Footprint, fusion, host
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
-# One batch at a time uses all the cores and its work arrays.
+# One batch at a time uses all the cores and its work arrays. The last few of those are kept, by physics and number of environments:
+# they are large where fields are drawn, since every environment has a model of its own then.
 _lock = threading.Lock()
+_arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDict()
+_KEPT = 8
 
 
 class NativePhysics:
-    """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept.
+    """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept for a while.
 
     The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
     physics step: a fair first guess, and a function of the state.
@@ -46,7 +50,6 @@ class NativePhysics:
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
-        self._made: dict[int, tuple[np.ndarray, ...]] = {}  # by number of environments
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step; leading axes are environments. The state becomes NaN where MuJoCo gives up."""
@@ -84,9 +87,7 @@ class NativePhysics:
         given, fields = np.split(packed.reshape(n, -1), [end], axis=1)
         after = result.reshape(n, -1)
         with _lock, quiet():
-            if n not in self._made:
-                self._made[n] = self._make(n)
-            models, present, start, warmstart, ctrl, states, sensors = self._made[n]
+            models, present, start, warmstart, ctrl, states, sensors = self._work_arrays(n)
             self._set(models, present, fields)
             start[:, 1:], warmstart[:], ctrl[:] = given[:, :nqv], given[:, nqv:nqvv], given[:, None, nqvv:]
             self._rollout(
@@ -131,6 +132,15 @@ class NativePhysics:
         m = self.model
         told = (2 + self.decimation) * (m.nq + 2 * m.nv) + self.decimation * (m.nu + m.nsensordata)
         return Footprint(in_program=8.0 * told + (m.nbuffer if self._fields else 0))
+
+    def _work_arrays(self, n: int) -> tuple:
+        key = self._key, n
+        if key not in _arrays:
+            _arrays[key] = self._make(n)
+            if len(_arrays) > _KEPT:
+                _arrays.popitem(last=False)
+        _arrays.move_to_end(key)
+        return _arrays[key]
 
     def _make(self, n: int) -> tuple:
         m, steps = self.model, self.decimation
