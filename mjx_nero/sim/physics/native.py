@@ -27,8 +27,8 @@ from mjx_nero.sim.physics import Footprint, fusion, host
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
-# One batch at a time uses all the cores and its work arrays. The last few of those are kept, by physics and number of environments:
-# they are large where fields are drawn, since every environment has a model of its own then.
+# One batch at a time uses all the cores and its work arrays. The last few of these are kept, by physics and number of worlds;
+# they are large where fields are drawn, since every world has a model of its own then.
 _lock = threading.Lock()
 _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDict()
 _KEPT = 8
