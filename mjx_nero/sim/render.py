@@ -212,6 +212,8 @@ def write_episodes(
 
 def inset(frame: np.ndarray, pictures: Sequence[np.ndarray]) -> np.ndarray:
     """Puts small pictures into the lower left corner of a frame, a third of its height each, side by side."""
+    if not pictures:
+        return frame
     frame, at = frame.copy(), 0
     for picture in pictures:
         times = max(1, len(frame) // 3 // len(picture))

@@ -15,6 +15,10 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learner.names()), _cfgs)
+    from mjx_nero.learn import machines  # with what help does without
+
+    cli.setup_jax()
+    machines.join()  # before a task's config, whose making computes
     args.learner = _learner(args, registry.env_cfg(args.env, args.preset, args.robot))
     parser.only(dotted, learner.names(), args.learner)
     from mjx_nero.tools import train_run  # with Brax, which help does without

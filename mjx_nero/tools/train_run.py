@@ -25,8 +25,6 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         dotted: fields by prefix.
         flags: those that the user gave.
     """
-    cli.setup_jax()
-    machines.join()  # before a task's config, whose making computes
     sizes = {k: v for k, v in (("num_envs", args.num_envs), ("num_timesteps", args.num_timesteps)) if v}
     learner.find(args.learner)
     track.check(args.track)

@@ -233,7 +233,7 @@ def test_a_program_counts_and_goes_on():
 def test_memory_of_warp(env):
     physics = object.__new__(WarpPhysics)  # making one needs Warp
     physics._bytes = 2**18
-    assert warp_mb(types.SimpleNamespace(physics=physics, num_envs=12)) == 3.0
+    assert warp_mb(types.SimpleNamespace(footprint=physics.footprint, num_envs=12)) == 3.0
     assert warp_mb(env) is None
 
 

@@ -15,6 +15,7 @@ from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.learn.runs import logs, training
 from mjx_nero.sim import render
+from mjx_nero.sim.physics import host
 from mjx_nero.sim.physics.native import NativePhysics
 from mjx_nero.tools import cli
 from mjx_nero.types import UserError
@@ -250,11 +251,12 @@ def test_a_gpu_trains_for_as_long_as_the_task_needs(monkeypatch):
 def test_ctrl_c_while_native_physics_runs(call, tmp_path, monkeypatch):
     """JAX wraps what happens in a callback in an error of its own."""
 
-    def step(self, packed):
+    def step(self, packed, result):
         os.kill(os.getpid(), signal.SIGINT)
-        return np.zeros((*packed.shape[:-1], self._sizes[2]), np.float32)
+        result.fill(0.0)
 
     monkeypatch.setattr(NativePhysics, "_step", step)
+    monkeypatch.setattr(host, "_known", {})  # the physics of tests before
     code, out, err = call("eval", "--agent", "zero", "--episodes", 8, "--impl", "native", "--json", "result.json")
     assert (code, out, list(tmp_path.iterdir())) == (130, "", [])
     assert err.endswith("interrupted\n") and "Traceback" not in err

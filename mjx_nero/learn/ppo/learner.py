@@ -164,7 +164,7 @@ class Learner:
             return jax.device_put(part, sharding)
 
         parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(TrainState)}
-        return TrainState(**{name: part and put(part, getattr(_SPECS, name)) for name, part in parts.items()})
+        return TrainState(**{name: None if part is None else put(part, getattr(_SPECS, name)) for name, part in parts.items()})
 
     def policy(self, state: TrainState) -> tuple:
         """Returns normalizer and network parameters from the first device, for programs that run only there."""
