@@ -132,14 +132,16 @@ def test_the_arm_goes_where_it_is_told(bench):
 def test_speeds_and_loads_are_read(bench):
     bench.start()
     home = np.array(bench.told["joints"]["home"])
+    fastest = 0.0
     for k in range(30):
         due = bench.clock.now() + 0.02
         feedback = bench.guard.read()
         np.testing.assert_allclose(feedback.velocity[:5], bench.plant.velocity()[:5], atol=2e-3)  # a count a second, and more
         np.testing.assert_allclose(feedback.load, np.clip(bench.plant.load(), -1, 1), atol=1e-3)
+        fastest = max(fastest, feedback.velocity[0])
         bench.guard.command(home + np.array([0.02 * k, 0, 0, 0, 0, 0]))
         bench.clock.sleep_until(due)
-    assert feedback.velocity[0] > 0.5
+    assert fastest > 0.5
 
 
 def test_torque_comes_only_when_the_goal_is_where_the_servo_is(bench):
