@@ -212,7 +212,9 @@ def test_in_a_browser(browser):
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.by import By
 
-    page = view.open_view(env_name="nero_reach", agent="ik", port=18080, overrides={"scene.view_distance": 1.4, **STRONG})
+    # One long episode: a slow browser takes more than one of the usual length until it pauses.
+    overrides = {"scene.view_distance": 1.4, "episode_length_s": 120.0, **STRONG}
+    page = view.open_view(env_name="nero_reach", agent="ik", port=18080, overrides=overrides)
     try:
         browser.get(page.url)
         canvas = wait(lambda: browser.find_elements(By.TAG_NAME, "canvas"))[0]
