@@ -164,7 +164,8 @@ class Learner:
             return jax.device_put(part, sharding)
 
         parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(TrainState)}
-        return TrainState(**{name: None if part is None else put(part, getattr(_SPECS, name)) for name, part in parts.items()})
+        placed: dict[str, Any] = {name: put(part, getattr(_SPECS, name)) for name, part in parts.items() if part is not None}
+        return dataclasses.replace(state, **placed)
 
     def policy(self, state: TrainState) -> tuple:
         """Returns normalizer and network parameters from the first device, for programs that run only there."""
