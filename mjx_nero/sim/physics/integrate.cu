@@ -4,8 +4,9 @@
 //
 // where F are the forces of dampers and drives and, for a body that flies freely, those of its spin.
 //
-// The body of a function of (world, problem) that dynamics.py compiles, after the model's sizes and tables.
+// The body of a function of (tid, problem) that dynamics.py compiles, after the model's sizes and tables.
 
+const int world = tid;
 const auto& in = problem;
 const float h = in.timestep.data[world % in.timestep.shape[0]];
 const float* M = in.M.data + (size_t)world * in.M.shape[1];

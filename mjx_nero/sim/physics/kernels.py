@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 
-def make(name: str, constants: Mapping[str, int | Iterable[int]], values: Mapping[str, Any], n: int) -> Callable[[], None]:
-    """A source of this folder as a function without arguments, a thread for each of ``n`` environments.
+def make(
+    name: str, constants: Mapping[str, int | Iterable[int]], values: Mapping[str, Any], n: int, threads: int = 1
+) -> Callable[[], None]:
+    """A source of this folder as a function without arguments, so many threads for each of ``n`` environments.
 
     Args:
-        name: the source's, without ``.cu``: the body of a function of (world, problem).
+        name: the source's, without ``.cu``: the body of a function of (tid, problem).
         constants: numbers and tables that it is compiled with.
         values: the fields of ``problem``: Warp's arrays, and whole numbers.
     """
@@ -26,13 +28,14 @@ def make(name: str, constants: Mapping[str, int | Iterable[int]], values: Mappin
         setattr(problem, key, x)
 
     @wp.func_native("".join(map(_constant, constants, constants.values())) + source(name))
-    def work(world: int, problem: Problem): ...  # type: ignore[valid-type]
+    def work(tid: int, problem: Problem): ...  # type: ignore[valid-type]
 
     @wp.kernel(module="unique", enable_backward=False)
     def environments(problem: Problem):  # type: ignore[valid-type]
         work(wp.tid(), problem)
 
-    return lambda: wp.launch(environments, dim=n, inputs=[problem], block_dim=32)
+    block = 32 if wp.get_device().is_cuda else 1
+    return lambda: wp.launch(environments, dim=n * threads, inputs=[problem], block_dim=block)
 
 
 def source(name: str) -> str:

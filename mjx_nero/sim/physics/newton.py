@@ -9,21 +9,16 @@ constraints' cost, with elliptic or pyramidal friction cones), so the solution i
 The source, ``newton.cu``, compiles for the CPU as well, with one thread for all 32: slow, for tests.
 """
 
-import functools
 import math
 from collections.abc import Callable
-from importlib import resources
 from typing import Any
 
 import mujoco
 
+from mjx_nero.sim.physics import kernels
+
 _SHARED_BYTES = 48 * 1024  # of a block, on every GPU that Warp supports
 _DOFS = 64  # a bit for each
-
-
-@functools.cache
-def _solver() -> str:
-    return resources.files(__package__).joinpath("newton.cu").read_text()
 
 
 def floats(nv: int, njmax: int, dense: bool) -> int | None:
@@ -60,27 +55,12 @@ def make(model, data) -> Callable[[], None]:
     numbers = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "SIZE": size}
     numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
     numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
-    source = "".join(f"constexpr int {name} = {value};\n" for name, value in numbers.items()) + _solver()
-    arrays = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_warmstart")}
+    arrays: dict[str, Any] = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_warmstart")}
     arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
     arrays |= {f"efc_J_{name}": getattr(data.efc, f"J_{name}") for name in ("rownnz", "rowadr", "colind")}
     arrays |= {f"contact_{name}": getattr(data.contact, name) for name in ("friction", "dim", "efc_address")}
     arrays |= {name: getattr(model, name) for name in ("M_rownnz", "M_rowadr", "M_colind")}
     arrays |= {name: getattr(model.opt, name) for name in ("impratio_invsqrt", "tolerance", "ls_tolerance")}
     arrays |= {"qacc": data.qacc, "solver_niter": data.solver_niter}
-    types: dict[str, Any] = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in arrays.items()}
-    Problem = wp.struct(type("Problem", (), {"__annotations__": {**types, "iterations": int, "ls_iterations": int}}))
-    problem = Problem()
-    for name, x in arrays.items():
-        setattr(problem, name, x)
-    problem.iterations, problem.ls_iterations = model.opt.iterations, model.opt.ls_iterations
-
-    @wp.func_native(source)
-    def solve(tid: int, problem: Problem): ...  # type: ignore[valid-type]
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def newton(problem: Problem):  # type: ignore[valid-type]
-        solve(wp.tid(), problem)
-
-    threads = 32 if wp.get_device().is_cuda else 1
-    return lambda: wp.launch(newton, dim=data.nworld * threads, inputs=[problem], block_dim=threads)
+    arrays |= {"iterations": int(model.opt.iterations), "ls_iterations": int(model.opt.ls_iterations)}
+    return kernels.make("newton", numbers, arrays, data.nworld, threads=32 if wp.get_device().is_cuda else 1)

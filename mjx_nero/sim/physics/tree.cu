@@ -6,8 +6,9 @@
 // between the root of the tree and its own. Spatial vectors are (angular, linear), in the world's axes about the first joint of the
 // tree: MuJoCo takes its centre of mass, and whoever reads ``subtree_com`` only asks what ``cdof`` is about.
 //
-// The body of a function of (world, problem) that dynamics.py compiles, after the model's sizes and tables.
+// The body of a function of (tid, problem) that dynamics.py compiles, after the model's sizes and tables.
 
+const int world = tid;
 struct V {
     float x, y, z;
     CUDA_CALLABLE V operator+(V b) const { return {x + b.x, y + b.y, z + b.z}; }
