@@ -162,9 +162,9 @@ def test_a_serial_adapter_is_another_bus(bench, adapter, told, kind):
     """In real time, as the lines of a terminal are."""
     over = threading.Event()
     thread = threading.Thread(target=adapter.serve, args=(over.is_set,), daemon=True)
-    thread.start()
     bench.plant._clock = clock = WallClock()
     bench.plant.reset(bench.home)
+    thread.start()
     arm = agilex.of(kind, told, clock, adapter.name)
     arm.connect()
     arm.engage()

@@ -3,8 +3,11 @@
 import collections
 import copy
 import dataclasses
+import functools
 import pathlib
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -14,6 +17,8 @@ from mjx_nero.deploy.places import Sender
 
 _SLOW = 0.02  # [s], damping over stiffness
 _LONGEST = 0.5  # [s] that are caught up at once; a program that stood still longer finds the arm where it left it
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclasses.dataclass
@@ -31,8 +36,19 @@ class Faults:
     stiffness: float = 1.0
 
 
+def _alone(method: Method) -> Method:
+    """Lets one thread at a time into a plant: MuJoCo's data does not survive two, and an emulator may serve in a thread."""
+
+    @functools.wraps(method)
+    def locked(plant: "Plant", *args: Any, **kwargs: Any) -> Any:
+        with plant._lock:
+            return method(plant, *args, **kwargs)
+
+    return cast(Method, locked)
+
+
 class Plant:
-    """Position drives with objects around them.
+    """Position drives with objects around them. Several threads may use it.
 
     Args:
         model: compiled scene, or a file of one (``.mjb``) whose actuators are the drives.
@@ -56,6 +72,7 @@ class Plant:
         base: Sequence[float] = (0.0, 0.0, 0.0),
         tracker: Sender | None = None,
     ):
+        self._lock = threading.RLock()
         if not isinstance(model, mujoco.MjModel):
             model = mujoco.MjModel.from_binary_path(str(model))
         self.model = copy.copy(model)  # the drives' gains change
@@ -71,6 +88,7 @@ class Plant:
         self._waiting: collections.deque[tuple[float, np.ndarray]] = collections.deque()
         self.reset(start)
 
+    @_alone
     def reset(self, start: np.ndarray, objects: dict[str, np.ndarray] | None = None) -> None:
         """The arm at rest somewhere, its drives told to stay; objects at positions [m] in the root frame."""
         mujoco.mj_resetData(self.model, self.data)
@@ -84,6 +102,7 @@ class Plant:
         self._begun = self._clock.now()
         self._tell()
 
+    @_alone
     def stiffen(self) -> None:
         """Makes drives that follow slowly position servos: ten times as stiff, and critically damped."""
         soft = -self._bias[:, 2] > _SLOW * self._gain
@@ -104,6 +123,7 @@ class Plant:
                 powers = (q[leader] - m.qpos0[leader]) ** np.arange(5)
                 q[follower] = m.qpos0[follower] + powers @ m.eq_data[e, :5]
 
+    @_alone
     def advance(self) -> None:
         """Catches up with the clock."""
         now = self._clock.now() - self._begun
@@ -134,18 +154,22 @@ class Plant:
             for name, at in self.objects.items():
                 self._tracker(name, self.data.qpos[at:][:3] - self._base, self.data.qpos[at:][3:7])
 
+    @_alone
     def place(self, name: str) -> np.ndarray:
         """An object's position in the root frame [m]."""
         return self.data.qpos[self.objects[name] :][:3] - self._base
 
+    @_alone
     def position(self) -> np.ndarray:
         """Present positions of the joints [rad or m]."""
         return self.data.qpos[self._qpos].copy()
 
+    @_alone
     def velocity(self) -> np.ndarray:
         """Present velocities of the joints [rad/s or m/s]."""
         return self.data.qvel[self._dof].copy()
 
+    @_alone
     def load(self) -> np.ndarray:
         """Shares of the torque that the drives have, signed."""
         return self.data.actuator_force[self._act] / self._effort
@@ -155,6 +179,7 @@ class Plant:
         """Time since its beginning [s]."""
         return self._clock.now() - self._begun
 
+    @_alone
     def target(self, targets: np.ndarray, later: float = 0.0) -> None:
         """New targets of the drives [rad or m], in force after what ``faults.late`` says, and ``later`` [s]."""
         self._waiting.append((self.time + self.faults.late + later, np.array(targets, float)))
