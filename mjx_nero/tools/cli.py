@@ -56,6 +56,11 @@ class Parser(argparse.ArgumentParser):
         text = "physics: warp or jax (both MJX), or native, MuJoCo's C library (default: the fastest on this machine)"
         self.add_argument("--impl", default="auto", help=text)
 
+    def add_address(self) -> None:
+        """``--host`` and ``--port`` of a page."""
+        self.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
+        self.add_argument("--port", type=at_most(65535), default=8080, help="port to listen at (default: %(default)s)")
+
     def add_seed(self, default: int, several: bool = False) -> None:
         """``--seed`` and, if several may be given, ``--seeds``."""
         group = self.add_mutually_exclusive_group()

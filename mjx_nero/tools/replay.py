@@ -136,8 +136,7 @@ def main(argv: Sequence[str]) -> None:
     add("--identified", type=cli.path(".yaml", ".yml"), help="file of identify, whose drives the simulation takes")
     add("--dt", type=cli.positive_float, default=0.005, help="physics step, s (default: %(default)s)")
     add("--no-view", action="store_true", help="say how far they differ, and no more")
-    add("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
-    add("--port", type=cli.at_most(65535), default=8080, help="(default: %(default)s)")
+    parser.add_address()
     args, _ = parser.parse(argv)
     robot = registry.robot(args.robot)
     run = run_of(args.log, robot, args.dt, args.identified)
@@ -153,14 +152,9 @@ def main(argv: Sequence[str]) -> None:
 def _serve(robot: RobotCfg, run: Run, host: str, port: int) -> None:
     """Serves the page until Ctrl-C."""
     need("viser", "view")
-    from mjx_nero.tools.view import door, inner
+    from mjx_nero.tools.view import door
 
-    page = inner.Inner()
-    try:
-        guard = door.Door(host, port, page.path)
-    except UserError:
-        page.close()
-        raise
+    page, guard = door.open_page(host, port)
     picture, over = Picture(page.server, scene.robot_model(robot, whole=True), robot, run), threading.Event()
     print(f"{guard.url}  (Ctrl-C ends it)", flush=True)
     try:

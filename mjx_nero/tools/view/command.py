@@ -40,8 +40,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
-    parser.add_argument("--port", type=cli.at_most(65535), default=8080, help="port to listen at (default: %(default)s)")
+    parser.add_address()
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     given = parser.given(argv)  # else what the run says
     serve(
@@ -154,7 +153,7 @@ def open_view(
         UserError: as the command.
     """
     need("viser", "view")
-    from mjx_nero.tools.view import door, hand, hand_panel, inner, orders, panel, scene, session
+    from mjx_nero.tools.view import door, hand, hand_panel, orders, panel, scene, session
 
     described = _described(run) if run else {}
     env_name = env_name or described.get("env_name", "nero_lift")
@@ -165,12 +164,7 @@ def open_view(
     chosen = _chosen(agent, list(makers), env_name)
     home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
-    page = inner.Inner()
-    try:
-        guard = door.Door(host, port, page.path)
-    except UserError:
-        page.close()
-        raise
+    page, guard = door.open_page(host, port)
     work = orders.Orders()
     controls = panel.Panel(page.server, sim, makers, chosen, work)
     recording = hand.Recording(sim, demos, env_name, preset) if demos else None

@@ -9,10 +9,14 @@ import pathlib
 import secrets
 import socket
 import threading
+from typing import TYPE_CHECKING
 
 from mjx_nero.tools.view import request
 from mjx_nero.tools.view.log import LOG
 from mjx_nero.types import UserError
+
+if TYPE_CHECKING:
+    from mjx_nero.tools.view import inner
 
 PATIENCE_S = 10.0  # for a request's head
 GUESTS = 64  # at a time who still stand before the door, and as many behind it
@@ -24,6 +28,22 @@ _ANSWER = (
     "Cache-Control: no-store\r\nReferrer-Policy: no-referrer\r\n{more}Connection: close\r\n\r\n{text}"
 )
 _STRANGER = "Open the address that the program printed, with its token.\n"
+
+
+def open_page(host: str, port: int) -> "tuple[inner.Inner, Door]":
+    """Opens a page's server and the door before it (see ``Door``).
+
+    Raises:
+        UserError: the address cannot be listened at, or viser cannot be served so.
+    """
+    from mjx_nero.tools.view import inner  # which needs viser
+
+    page = inner.Inner()
+    try:
+        return page, Door(host, port, page.path)
+    except UserError:
+        page.close()
+        raise
 
 
 class Door:
