@@ -86,7 +86,7 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
         cells = line.split(",")
         if len(cells) != len(head):
             raise UserError(f"{path} line {i} has {len(cells)} cells, the first line {len(head)}")
-        row = [_number(cells[c], f"{path} line {i} {head[c]}") for c in columns]
+        row = [number(cells[c], f"{path} line {i} {head[c]}") for c in columns]
         for part in (row[1 : n + 1], row[n + 1 :]):
             if 0 < sum(map(math.isnan, part)) < n:
                 raise UserError(f"{path} line {i} has news of some joints and not of others: give all or none")
@@ -105,9 +105,18 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
     return log
 
 
-def _number(text: str, where: str) -> float:
+def number(text: str, where: str, empty: bool = True) -> float:
+    """Reads a cell, not a number if it is empty.
+
+    Args:
+        where: names the cell in messages.
+        empty: whether it may be empty.
+
+    Raises:
+        UserError: the cell holds something else, or too large a number.
+    """
     text = text.strip().strip('"')
-    if not text:
+    if not text and empty:
         return math.nan
     try:
         value = float(text)

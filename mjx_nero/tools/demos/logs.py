@@ -1,8 +1,8 @@
 """Episodes from logs of real runs (``deploy --log``), one a log, with the features of ``demos --holds arm``."""
 
 import csv
+import functools
 import hashlib
-import math
 import pathlib
 from collections.abc import Sequence
 
@@ -16,11 +16,11 @@ from mjx_nero.data import episode as names
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
+from mjx_nero.identify.log import number
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 MAX_BYTES = 256_000_000
-_LARGEST = 1e4  # of a number
 _JITTER = 0.2  # of a step's length: a log whose steps differ by more on average has no rate
 
 
@@ -86,13 +86,13 @@ def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.nda
     at: list[float] | None = None
     rows: list[tuple[float, list[float], list[float]]] = []
     for line, cells in _table(path, joints):
-        where = f"{path} line {line}"
+        read = functools.partial(number, where=f"{path} line {line}", empty=False)
         if cells["position." + joints[0]]:
-            at = [_number(cells[f"position.{joint}"], where) for joint in joints]
+            at = [read(cells[f"position.{joint}"]) for joint in joints]
         if cells.get("held"):
             break
         if cells["target." + joints[0]] and cells.get("inferred") and at is not None:
-            rows.append((_number(cells["time"], where), at, [_number(cells[f"target.{joint}"], where) for joint in joints]))
+            rows.append((read(cells["time"]), at, [read(cells[f"target.{joint}"]) for joint in joints]))
     if len(rows) < 2:
         raise UserError(f"{path} has {len(rows)} steps of a policy: give the log of a run of 'deploy'")
     times, positions, targets = (np.array(column) for column in zip(*rows, strict=True))
@@ -119,13 +119,3 @@ def _table(path: pathlib.Path, joints: Sequence[str]) -> list[tuple[int, dict[st
             raise UserError(f"{path} line {line} has {len(cells)} cells, the first line {len(head)}")
         out.append((line, dict(zip(head, cells, strict=True))))
     return out
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _LARGEST:
-        raise UserError(f"{where} takes numbers up to {_LARGEST:g}, got {short(text)}")
-    return value
