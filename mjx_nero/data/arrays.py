@@ -20,14 +20,7 @@ _LENGTHS = "lengths"  # of a piece's episodes, beside the features
 
 
 class ArraysForm:
-    """A data set in a folder that is claimed, or only read.
-
-    Attributes:
-        lengths, success, numbers: of the episodes there, as ``Dataset`` has them.
-
-    Raises:
-        UserError: what is there is damaged.
-    """
+    """See ``dataset.Form``."""
 
     def __init__(self, path: pathlib.Path, schema: Schema):
         self.path, self.schema = path, schema

@@ -20,7 +20,14 @@ FORMS = {
 
 
 class Form(Protocol):
-    """A data set that is being written."""
+    """A data set in a folder that is claimed, or only read. A form is made of the folder and the schema.
+
+    Attributes:
+        lengths, success, numbers: of the episodes there, as ``Dataset`` has them.
+
+    Raises:
+        UserError: what is there is damaged.
+    """
 
     lengths: np.ndarray
     success: np.ndarray
