@@ -77,7 +77,7 @@ class ArraysForm:
         folder.commit(
             self.path,
             {
-                _name(len(self._pieces)): lambda path: save_file(arrays, path),
+                _name(len(self._pieces)): lambda path: _save(arrays, path),
                 INDEX: lambda path: path.write_text(json.dumps(pieces)),
             },
         )
@@ -113,6 +113,13 @@ class ArraysForm:
     def dataset(self) -> Dataset:
         """The data set as it is."""
         return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
+
+
+def _save(arrays: dict[str, np.ndarray], path: pathlib.Path) -> None:
+    try:
+        save_file(arrays, path)
+    except SafetensorError as error:  # a full disk's, too
+        raise OSError(str(error)) from None
 
 
 def _array(episode: Episode, name: str, feature: Feature) -> np.ndarray:

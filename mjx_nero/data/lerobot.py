@@ -162,34 +162,33 @@ class LeRobotForm:
 
     def _about(self, episodes: Sequence[Episode], of_pictures: Mapping[str, Sequence[stats.Stats]]) -> pa.Table:
         """A row an episode: where it lies, what it is, and its own statistics, which LeRobot's tools put together."""
-        chunk, file = divmod(self._pieces, lf.CHUNK)
-        rows, begin, own, fps = list[dict[str, Any]](), int(self.lengths.sum()), self._own(episodes), self.schema.fps
-        at = 0
-        for i, episode in enumerate(episodes):
-            n = len(episode)
-            values = {**episode.arrays, **{name: column[at : at + n, None] for name, column in own.items()}}
-            rows.append(
-                {
-                    "episode_index": len(self.lengths) + i,
-                    "tasks": [self.schema.task],
-                    "length": n,
-                    "data/chunk_index": chunk,
-                    "data/file_index": file,
-                    "dataset_from_index": begin + at,
-                    "dataset_to_index": begin + at + n,
-                    "success": episode.success,
-                    "number": episode.number,
-                    "meta/episodes/chunk_index": chunk,
-                    "meta/episodes/file_index": file,
-                    **lf.statistics(values),
-                }
-            )
-            for name in self._pictures:
-                place = {"chunk_index": chunk, "file_index": file, "from_timestamp": at / fps, "to_timestamp": (at + n) / fps}
-                rows[-1] |= {f"videos/{name}/{what}": x for what, x in place.items()}
-                rows[-1] |= {f"stats/{name}/{what}": x for what, x in lf.per_channel(of_pictures[name][i]).items()}
-            at += n
-        return pa.table({name: [row[name] for row in rows] for name in rows[0]})
+        n, lengths = len(episodes), np.array([len(episode) for episode in episodes])
+        chunk, file = (np.full(n, x) for x in divmod(self._pieces, lf.CHUNK))
+        ends, begin, fps = np.cumsum(lengths), int(self.lengths.sum()), self.schema.fps
+        values = {
+            **{name: np.concatenate([episode.arrays[name] for episode in episodes]) for name in episodes[0].arrays},
+            **{name: column[:, None] for name, column in self._own(episodes).items()},
+        }
+        columns = {
+            "episode_index": len(self.lengths) + np.arange(n),
+            "tasks": [[self.schema.task]] * n,
+            "length": lengths,
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": begin + ends - lengths,
+            "dataset_to_index": begin + ends,
+            "success": [episode.success for episode in episodes],
+            "number": [episode.number for episode in episodes],
+            "meta/episodes/chunk_index": chunk,
+            "meta/episodes/file_index": file,
+            **lf.statistics(values, lengths),
+        }
+        for name in self._pictures:
+            columns |= {f"videos/{name}/chunk_index": chunk, f"videos/{name}/file_index": file}
+            columns |= {f"videos/{name}/from_timestamp": (ends - lengths) / fps, f"videos/{name}/to_timestamp": ends / fps}
+            of_each = [lf.per_channel(found) for found in of_pictures[name]]
+            columns |= {f"stats/{name}/{what}": [found[what] for found in of_each] for what in of_each[0]}
+        return pa.table(columns)
 
 
 def _frames(name: str, episodes: Sequence[Episode], found: list[stats.Stats]) -> Iterator[np.ndarray]:

@@ -33,15 +33,25 @@ OWN = {  # columns of every step that the format asks for
 }
 
 
-def statistics(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """``stats/<feature>/<statistic>``, computed of all features at once."""
-    together = stats.of(np.concatenate(list(values.values()), axis=1))
+def statistics(values: Mapping[str, np.ndarray], lengths: np.ndarray) -> dict[str, pa.Array]:
+    """``stats/<feature>/<statistic>`` of each episode, computed of all features at once.
+
+    Args:
+        values: name -> [steps, numbers], one episode after another.
+    """
+    together = stats.of_each(np.concatenate(list(values.values()), axis=1, dtype=np.float32), lengths)
     ends = np.cumsum([x.shape[1] for x in values.values()])[:-1]
-    out: dict[str, np.ndarray] = {}
+    out: dict[str, pa.Array] = {}
     for what, found in together.items():
-        parts = [found] * len(values) if what == "count" else np.split(found, ends)
-        out |= {f"stats/{name}/{what}": part for name, part in zip(values, parts, strict=True)}
+        parts = [found] * len(values) if what == "count" else np.split(found, ends, axis=1)
+        out |= {f"stats/{name}/{what}": rows(part) for name, part in zip(values, parts, strict=True)}
     return out
+
+
+def rows(values: np.ndarray) -> pa.Array:
+    """A column of lists [n, numbers]."""
+    n, size = values.shape
+    return pa.ListArray.from_arrays(np.arange(n + 1, dtype=np.int32) * size, np.ravel(values))
 
 
 def info(schema: Schema, episodes: int, steps: int) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import numpy as np
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 SAMPLES = 100  # pictures of an episode that its statistics are of, at most, as LeRobot has them
+TOGETHER = 16  # episodes of equal length whose statistics are computed at once: they fit into a processor's cache
 Stats = dict[str, np.ndarray]
 
 
@@ -13,21 +14,44 @@ def of(values: np.ndarray) -> Stats:
     A quantile is interpolated between the two nearest steps, as ``numpy.quantile`` does.
 
     Args:
-        values: [steps, numbers].
+        values: [..., steps, numbers].
 
     Returns:
-        name -> [numbers], float64; of ``count`` [1], int64.
+        name -> [..., numbers], float64; of ``count`` [1], int64.
     """
-    ordered = np.sort(values.T.astype(np.float32), axis=1)  # along contiguous memory
-    mean, std = ordered.mean(axis=1, dtype=np.float64), ordered.std(axis=1, dtype=np.float64)
-    out = {"min": ordered[:, 0].astype(np.float64), "max": ordered[:, -1].astype(np.float64), "mean": mean, "std": std}
-    for name, share in QUANTILES.items():
-        at = share * (len(values) - 1)
-        low = int(at)
-        high = min(low + 1, len(values) - 1)
-        ends = ordered[:, [low, high]].astype(np.float64)
-        out[name] = ends[:, 0] + (at - low) * (ends[:, 1] - ends[:, 0])
-    return {**out, "count": np.array([len(values)])}
+    rows = np.ascontiguousarray(np.asarray(values, np.float32).swapaxes(-1, -2))  # whatever follows goes along memory
+    n = rows.shape[-1]
+    at = {name: (int(share * (n - 1)), share * (n - 1) % 1) for name, share in QUANTILES.items()}
+    mean = rows.mean(axis=-1, dtype=np.float64)
+    out = {"mean": mean, "std": rows.std(axis=-1, dtype=np.float64)}
+    rows.partition(sorted({0, n - 1, *(min(low + i, n - 1) for low, _ in at.values() for i in (0, 1))}), axis=-1)
+    out |= {"min": rows[..., 0].astype(np.float64), "max": rows[..., -1].astype(np.float64)}
+    for name, (low, between) in at.items():
+        ends = (rows[..., i].astype(np.float64) for i in (low, min(low + 1, n - 1)))
+        first, second = ends
+        out[name] = first + between * (second - first)
+    return {**out, "count": np.array([n])}
+
+
+def of_each(values: np.ndarray, lengths: np.ndarray) -> Stats:
+    """The same of each episode.
+
+    Args:
+        values: [steps, numbers], one episode after another.
+        lengths: steps of each episode [n].
+
+    Returns:
+        name -> [n, numbers]; of ``count`` [n, 1].
+    """
+    begins, out = np.cumsum(lengths) - lengths, dict[str, np.ndarray]()
+    for length in np.unique(lengths):
+        alike = np.flatnonzero(lengths == length)
+        for which in np.array_split(alike, -(-len(alike) // TOGETHER)):
+            found = of(values[begins[which, None] + np.arange(length)])
+            found["count"] = np.full((len(which), 1), length)
+            for name, x in found.items():
+                out.setdefault(name, np.empty((len(lengths), x.shape[1]), x.dtype))[which] = x
+    return out
 
 
 def of_pictures(frames: list[np.ndarray]) -> Stats:

@@ -1,10 +1,11 @@
 """What is written is what is read: both forms, in pieces, after kills, on a full disk, and in the wrong folder."""
 
+import contextlib
 import dataclasses
-import errno
 import json
 import os
 import pathlib
+import resource
 import subprocess
 import sys
 
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 from lerobots import lerobot_python
 
-from mjx_nero import files
 from mjx_nero.data import Episode, Feature, Schema, open_dataset, writer
 from mjx_nero.data.episode import picture
 from mjx_nero.errors import UserError
@@ -137,20 +137,32 @@ def test_folders_of_something_else_are_refused(form, tmp_path):
             pass
 
 
+@contextlib.contextmanager
+def full_disk(size: int):
+    """No file grows beyond ``size`` bytes, as if the disk were full: the kernel refuses, however a library writes."""
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, usual[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+
+
+@pytest.mark.parametrize("films", [False, True])
 @pytest.mark.parametrize("form", FORMS)
-def test_a_full_disk_is_one_line_and_leaves_what_was_whole(form, tmp_path, monkeypatch):
-    with writer(tmp_path, schema(), form) as out:
-        out.put([episode(0)])
-
-    def full(_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(UserError, match="No space left on device; what was written before is whole: make room, and give"):
-        with writer(tmp_path, schema(), form) as out, monkeypatch.context() as patch:
-            patch.setattr(files, "sync", full)
-            out.put([episode(1)])
-    assert open_dataset(tmp_path).numbers.tolist() == [0]
+def test_a_full_disk_is_one_line_and_leaves_what_was_whole(form, films, tmp_path):
+    make, about = (filmed, with_camera()) if films else (episode, schema())
+    with writer(tmp_path, about, form) as out:
+        out.put([make(0)])
+    with pytest.raises(UserError, match="File too large.*; what was written before is whole: make room, and give"):
+        with writer(tmp_path, about, form) as out, full_disk(40_000):
+            out.put([make(i, 1200) for i in range(1, 3)])
+    found = open_dataset(tmp_path)
+    assert found.numbers.tolist() == [0] and len(found.column("action")) == len(make(0))
     assert not list(tmp_path.rglob("*.part*"))
+    with writer(tmp_path, about, form) as out:
+        out.put([make(1)])
+    assert open_dataset(tmp_path).numbers.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -204,7 +216,7 @@ def filmed(number: int, steps: int = 6) -> Episode:
     def frames():
         for i in range(steps):
             frame = np.full((32, 48, 3), (20, 60, 90), np.uint8)
-            frame[8:24, 4 * i : 4 * i + 16] = (230, 180, 40 + 10 * number)
+            frame[8:24, 4 * (i % 8) : 4 * (i % 8) + 16] = (230, 180, 40 + 10 * number)
             yield frame
 
     return dataclasses.replace(episode(number, steps), pictures={"observation.images.front": frames})
