@@ -75,6 +75,32 @@ def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
     assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another --out" in err
 
 
+def test_an_episode_may_end_with_its_success(call, tmp_path):
+    """It is the beginning of the whole one, to the bit, up to where the hand has been at the goal for 0.1 s, whatever plays
+    beside it and before it."""
+    argv = ["--env", "nero_reach", "--agent", "policy", "--all", "--form", "arrays", "--env.success.hold_s", 0.1]
+    argv += ["--env.episode_length_s", 2.5, "--episodes", 7]
+    for flags in (["--side-by-side", 7, "--out", "whole"], ["--side-by-side", 3, "--ends", "success", "--out", "early"]):
+        code, _, err = call("mjx_nero", "demos", *argv, *flags)
+        assert code == 0, err
+    cfg = registry.env_cfg("nero_reach")
+    near, hold = cfg.success.condition.params["threshold"], round(0.1 / (cfg.sim.dt * cfg.sim.decimation))
+    whole, early = (open_dataset(tmp_path / name) for name in ("whole", "early"))
+    assert early.numbers.tolist() == list(range(7)) and early.success.sum() >= 6
+    at = [early.schema.features[names.ENVIRONMENT].names.index(f"{thing}.x") for thing in ("hand", "goal")]
+    for one, part in zip(whole.episodes(), early.episodes(), strict=True):
+        poses = one.arrays[names.ENVIRONMENT]
+        away = np.linalg.norm(poses[1:, at[0] : at[0] + 3] - poses[1:, at[1] : at[1] + 3], axis=1)  # after each step
+        held = np.convolve(away < near, np.ones(hold))[: len(away)] == hold
+        length = int(held.argmax()) + 1 if held.any() else len(one)
+        assert len(part) == length and part.success == (held.any() or one.success)
+        for name in (names.QPOS, names.EXECUTED, names.SEEN, names.REWARD):
+            np.testing.assert_array_equal(part.arrays[name], one.arrays[name][:length])
+        ends = part.arrays[names.SUCCESS].ravel()
+        assert ends[-1] == part.success and not ends[:-1].any() and part.arrays[names.DONE].ravel()[-1]
+    assert early.lengths.mean() < 0.8 * whole.lengths.mean()
+
+
 def test_it_is_shown_and_played_again(made, call):
     code, out, err = call("mjx_nero", "demos", "--inspect", made)
     assert code == 0, err

@@ -7,6 +7,7 @@ would not go by itself. The executed action is kept beside its label, the action
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import mjx_nero.sim.quiet  # noqa: F401
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.data import Episode
@@ -27,9 +28,10 @@ from mjx_nero.learn import device_memory
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
-from mjx_nero.types import DelayMemory, Key, Scenery, View
+from mjx_nero.types import DelayMemory, Key, View
 
 SMOOTH_S = 0.2  # [s] time constant of the noise; drives would not follow noise that changes at every step
+SEGMENT = 10  # control steps between two looks at which episodes have ended, where they may end early
 _NOISE = 0xDA27  # folded into an episode's key
 
 
@@ -44,6 +46,7 @@ class Player:
         deltas: actions are steps of the hand, instead of the joints' targets.
         noise: standard deviation of the noise on the arm's actions, in the agent's units.
         cameras: cameras whose pictures episodes keep.
+        early: an episode ends as soon as success has held for as long as the task asks, and the next one begins in its place.
 
     Raises:
         UserError: so many episodes of such a length do not fit into memory.
@@ -59,13 +62,15 @@ class Player:
         deltas: bool = False,
         noise: float = 0.0,
         cameras: Cameras | None = None,
+        early: bool = False,
     ):
-        self._cameras = cameras
+        self._cameras, self._early = cameras, early
         self.env, self.agent, self.units, self.size, self.kept, self.noise = env, agent, units, size, kept, noise
         self._arm = len(env.cfg.robot.arm.joints)
         robot = env.cfg.robot
         self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
-        self._run = jax.jit(self._play)
+        self._steps = min(SEGMENT, env.episode_length) if early else env.episode_length
+        self._begin, self._play, self._refill = (jax.jit(f) for f in (self._begin_all, self._play_all, self._refill_all))
         one = jax.eval_shape(
             self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
         )
@@ -77,52 +82,86 @@ class Player:
         if self._cameras:
             self._cameras.close()
 
-    def __call__(self, first: int, seed: int) -> list[Episode]:
-        """Plays the next episodes, from number ``first`` on."""
-        numbers = np.arange(first, first + self.size)
-        kept, length, success = jax.device_get(self._run(jnp.asarray(numbers), jax.random.PRNGKey(seed)))
-        arrays, qpos, scenery = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
+    def __call__(self, first: int, seed: int) -> Iterator[Episode]:
+        """Plays episodes in the order of their numbers, from ``first`` on, without end."""
+        key, numbers = jax.random.PRNGKey(seed), np.arange(first, first + self.size)
+        slots, due, following = self._begin(jnp.asarray(numbers), key), first, first + self.size
+        parts: list[list] = [[] for _ in numbers]
+        won, done = np.zeros(self.size, bool), dict[int, Episode]()
+        while True:
+            slots, played = self._play(slots, jnp.asarray(numbers), key)
+            kept, alive, wins = jax.device_get(played)
+            kept = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
+            counts, ended = alive.sum(axis=0).astype(int), np.asarray(slots[-1]) == 0
+            won |= wins.any(axis=0)
+            for i in range(self.size):
+                parts[i].append(_cut(kept, i, counts[i]))
+                if ended[i]:
+                    done[int(numbers[i])] = self._episode(parts[i], bool(won[i]), int(numbers[i]))
+                    parts[i], won[i], numbers[i], following = [], False, following, following + 1
+            while due in done:
+                yield done.pop(due)
+                due += 1
+            slots = self._refill(slots, jnp.asarray(ended), jnp.asarray(numbers), key)
 
-        def episode(i: int) -> Episode:
-            own = {name: x[i, : length[i]] for name, x in arrays.items()}
-            made = Episode(own, bool(success[i]), int(numbers[i]))
-            if not (cameras := self._cameras):
-                return made
-            shown = qpos[i, : length[i]], scenery[i]
-            films = {names.PICTURES + name: functools.partial(cameras.frames, name, *shown) for name in cameras.names}
-            return dataclasses.replace(made, pictures=films)
+    def _episode(self, parts: list, success: bool, number: int) -> Episode:
+        arrays = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
+        made = Episode(arrays, success, number)
+        if not (cameras := self._cameras):
+            return made
+        shown = jax.tree.map(lambda *x: np.concatenate(x), *(part[1:] for part in parts))
+        films = {names.PICTURES + name: functools.partial(cameras.frames, name, *shown) for name in cameras.names}
+        return dataclasses.replace(made, pictures=films)
 
-        return [episode(i) for i in range(self.size)]
+    def _begin_all(self, numbers: Array, key: Key) -> tuple:
+        """Starts an episode in every slot: its state, the agent's memory, the noise, the steps played, and whether it goes on."""
+        state = jax.vmap(self.env.reset)(_keys(numbers, key))
+        n = self.size
+        return state, self.agent.init(state), jnp.zeros((n, self._arm)), jnp.zeros(n, jnp.int32), jnp.ones(n)
 
-    def _play(self, numbers: Array, key: Key) -> tuple[tuple[dict[str, Array], Array | None, Scenery | None], Array, Array]:
-        """Returns features and what pictures need, leaves [steps, n, ...]; lengths and successes [n]."""
-        env, keys = self.env, _keys(numbers, key)
-        apart = jax.vmap(jax.random.fold_in, (0, None))(keys, _NOISE)
+    def _refill_all(self, slots: tuple, ended: Bool[Array, " n"], numbers: Array, key: Key) -> tuple:
+        def fresh(new: Array, old: Array) -> Array:
+            return jnp.where(ended.reshape(ended.shape + (1,) * (new.ndim - 1)), new, old)
 
-        def step(carry: tuple, at: Array) -> tuple:
-            state, memory, off, alive = carry
+        return jax.tree.map(fresh, self._begin_all(numbers, key), slots)
+
+    def _play_all(self, slots: tuple, numbers: Array, key: Key) -> tuple[tuple, Any]:
+        """Plays a segment. Returns the slots, and of each step [steps, n, ...] what is kept (features and what pictures need),
+        whether its episode went on before it, and whether it is a success."""
+        env, apart = self.env, jax.vmap(jax.random.fold_in, (0, None))(_keys(numbers, key), _NOISE)
+
+        def step(slots: tuple, _: None) -> tuple:
+            state, memory, off, at, alive = slots
             clean, memory = self.agent.act(None, memory, state, key)
             off = self._next_noise(off, apart, at)
             action = clean.at[:, : self._arm].add(off) if self.noise else clean
             after = jax.vmap(env.step)(state, action)
-            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state)) if self._cameras else (None, None)
+            if self._early:
+                after = jax.vmap(self._ended)(after)
+            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state)) if self._cameras else ()
             kept = jax.vmap(self._record)(state, clean, after), *drawn
-            won = alive * (after.done > 0) * (after.metrics["success"] > 0)
-            return (after, memory, off, alive * (1 - after.done)), (kept, alive, won)
+            won = (alive > 0) & (after.done > 0) & (after.metrics["success"] > 0)
+            return (after, memory, off, at + 1, alive * (1 - after.done)), (kept, alive, won)
 
-        state = jax.vmap(env.reset)(keys)
-        begin = state, self.agent.init(state), jnp.zeros((self.size, self._arm)), jnp.ones(self.size)
-        played: Any = jax.lax.scan(step, begin, jnp.arange(env.episode_length))
-        _, (kept, alive, won) = played
-        return kept, alive.sum(axis=0).astype(jnp.int32), won.sum(axis=0) > 0
+        return jax.lax.scan(step, slots, length=self._steps)
 
-    def _next_noise(self, off: Float[Array, "n na"], keys: Key, at: Array) -> Float[Array, "n na"]:
-        """Filters white noise by a first-order filter that keeps its standard deviation at every step."""
+    def _ended(self, state: State) -> State:
+        """The state as one that ends a success, where that has held."""
+        held = state.info["carry"].memory["success.hold"] >= max(1, round(self.env.cfg.success.hold_s / self.env.dt))
+        success = jnp.where(held, 1.0, state.metrics["success"])
+        return state.replace(done=jnp.where(held, 1.0, state.done), metrics={**state.metrics, "success": success})
+
+    def _next_noise(self, off: Float[Array, "n na"], keys: Key, at: Int[Array, " n"]) -> Float[Array, "n na"]:
+        """Filters white noise by a first-order filter that keeps its standard deviation at every step.
+
+        Args:
+            at: steps of each episode so far.
+        """
         if not self.noise:
             return off
-        stays = np.exp(-self.env.dt / SMOOTH_S)
-        drawn = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, at), (self._arm,)))(keys)
-        return jnp.where(at > 0, stays, 0.0) * off + self.noise * jnp.where(at > 0, np.sqrt(1 - stays**2), 1.0) * drawn
+        stays, later = np.exp(-self.env.dt / SMOOTH_S), at[:, None] > 0
+        drawn = jax.vmap(lambda key, at: jax.random.normal(jax.random.fold_in(key, at), (self._arm,)))(keys, at)
+        return jnp.where(later, stays, 0.0) * off + self.noise * jnp.where(later, np.sqrt(1 - stays**2), 1.0) * drawn
 
     def _record(self, state: State, clean: Float[Array, " na"], after: State) -> dict[str, Float[Array, " n"]]:
         """Collects the features of one environment's step: its state before, label, executed action, and outcome."""
@@ -154,6 +193,12 @@ class Player:
         (pos,), (quat,) = self._hand.poses(targets)
         turn = math.quat_log(math.quat_mul(quat, math.quat_conj(view.ee_quat_w)))
         return jnp.concatenate([pos - view.ee_pos_w, turn, self.units.shown(targets)[self._arm :]])
+
+
+def _cut(kept: tuple, slot: int, steps: int) -> tuple:
+    """The steps of a slot out of what is kept of a segment, leaves [n, steps, ...]."""
+    features, *drawn = kept
+    return {name: x[slot, :steps] for name, x in features.items()}, *jax.tree.map(lambda x: x[slot, :steps], drawn)
 
 
 def environment_state(env: ManipulationEnv, view: View) -> Float[Array, " n"]:

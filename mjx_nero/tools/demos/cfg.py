@@ -25,6 +25,8 @@ class DemosCfg:
             has a label to learn from).
         episodes: in the data set, in all.
         all: keep episodes that fail, too.
+        ends: task (an episode ends where the task ends it, most often by its time), or success (as soon as success has held for
+            as long as the task asks).
         noise: standard deviation of what is added to the arm's actions, smooth in time, in the unit of the action (rad for
             experts); the clean action stands beside what was done.
         actions: joints (targets of all drives), or hand (steps of the hand, and targets of the gripper).
@@ -47,6 +49,7 @@ class DemosCfg:
     through: Annotated[str, OneOf("drives", "task")] = flag("drives")
     episodes: Annotated[int, Bounds(1, 10_000_000)] = flag(1000)
     all: bool = flag(False)
+    ends: Annotated[str, OneOf("task", "success")] = flag("task")
     noise: NonNegative = flag(0.0)
     actions: Annotated[str, OneOf(*ACTIONS)] = flag("joints")
     holds: Annotated[str, OneOf("all", "arm")] = flag("all")

@@ -1,6 +1,7 @@
 """The command line of ``demos``."""
 
 import contextlib
+import itertools
 import pathlib
 import time
 from collections.abc import Sequence
@@ -77,10 +78,11 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
     with contextlib.closing(player), writer(out, schema, cfg.form) as form:
         before, tries, none = len(form.lengths), 0, 0
         first = int(form.numbers[-1]) + 1 if before else 0
+        episodes = player(first, cfg.seed)
         while len(form.lengths) < cfg.episodes:
-            played = player(first, cfg.seed)
+            played = list(itertools.islice(episodes, player.size))
             kept = [episode for episode in played if episode.success or cfg.all]
-            first, tries, none = first + len(played), tries + len(played), 0 if kept else none + len(played)
+            tries, none = tries + len(played), 0 if kept else none + len(played)
             if kept:
                 form.put(kept[: cfg.episodes - len(form.lengths)])
                 console.line(screen, f"{out}: {len(form.lengths)} of {cfg.episodes} episodes; {len(kept)}/{len(played)} kept")

@@ -83,6 +83,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "through": "task" if acts else cfg.through,
         "seed": cfg.seed,
         "all": cfg.all,
+        "ends": cfg.ends,
         "noise": cfg.noise,
         "actions": cfg.actions,
         "holds": cfg.holds,
@@ -96,7 +97,8 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     if cameras:
         held |= {names.PICTURES + name: names.picture(*size[::-1]) for name, size in cameras.sizes.items()}
     schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), held, about)
-    return schema, Player(env, agent, shown, size, tuple(held), cfg.actions == "hand", cfg.noise, cameras)
+    early = cfg.ends == "success"
+    return schema, Player(env, agent, shown, size, tuple(held), cfg.actions == "hand", cfg.noise, cameras, early)
 
 
 def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
