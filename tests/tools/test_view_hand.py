@@ -1,14 +1,21 @@
 """A hand on the arm: it goes where the user wants it, and what it does becomes an episode."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
+
+pytest.importorskip("viser")
+
+from pages import wait
 
 import mjx_nero
 from mjx_nero.data import episode as names
 from mjx_nero.data import open_dataset
 from mjx_nero.errors import UserError
-from mjx_nero.tools.view import agents
+from mjx_nero.tools import view
+from mjx_nero.tools.view import agents, hand_panel, tape
 from mjx_nero.tools.view.hand import NAME, Hand, Recording
 from mjx_nero.tools.view.session import Session
 
@@ -77,3 +84,59 @@ def test_what_the_hand_does_is_saved(shown, tmp_path):
     place = list(found.schema.features[names.ENVIRONMENT].names).index("cube.x")
     np.testing.assert_array_equal(first[names.ENVIRONMENT][:, place], first[names.QPOS][:, 9])
     session.recorders.clear()
+
+
+def test_a_tape_shows_what_was_recorded(shown, tmp_path):
+    """From the recorder and from the data set alike; then the physics goes on from where it stood."""
+    session, _, _ = shown
+    recording = Recording(session, tmp_path / "d", "nero_lift", "default", "arrays")
+    session.reset()
+    recording.begin()
+    for _ in range(5):
+        session.step()
+    before = [qpos for qpos, _ in recording._steps]
+    session.move_goal(0, np.array([0.3, 0.1, 0.3]))
+    live = session.frame
+    tapes = [recording.tape()]
+    recording.save()
+    tapes.append(tape.of_dataset(tmp_path / "d", 0, live))
+    for each in tapes:
+        session.replay(each)
+        for step, qpos in enumerate(before):
+            session.step()
+            assert session.frame.step == step
+            np.testing.assert_allclose(session.frame.qpos[0], qpos, atol=1e-6)
+            assert np.abs(session.frame.scenery.goal_pos_w[0] - [0.3, 0.1, 0.3]).max() > 1e-3  # as it was
+        session.step()
+        np.testing.assert_array_equal(session.frame.qpos, live.qpos)
+    session.step()
+    assert session.frame.step == live.step + 1
+    with pytest.raises(UserError, match="has 1 episodes: --episode takes a number from 0 to 0"):
+        tape.of_dataset(tmp_path / "d", 1, live)
+    other = dataclasses.replace(live, qpos=live.qpos[:, :5])
+    with pytest.raises(UserError, match="scenes of 16 positions, and this environment 5: pass its --env"):
+        tape.of_dataset(tmp_path / "d", 0, other)
+    session.recorders.clear()
+
+
+def test_corrections_are_recorded_while_the_user_steers(tmp_path):
+    """Taking over begins an episode, giving back saves it; what the policy does by itself is not in it."""
+    page = view.open_view(env_name="nero_lift", agent="zero", port=18500, demos=tmp_path / "d")
+    try:
+        hands = page.hands
+        hands._when.value = hand_panel.WHEN[1]
+        recording, session = hands._recording, page.session
+        wait(lambda: session.frame.step > 2)
+        assert len(recording) == 0
+        hands._hand.shift((0.0, 0.01, 0.0))
+        assert page.panel.agent.value == NAME
+        wait(lambda: len(recording) > 5)
+        hands.give_back()
+        assert page.panel.agent.value == "zero"
+        found = open_dataset(tmp_path / "d")
+        assert len(found) == 1 and found.lengths[0] > 5 and len(recording) == 0
+        step = session.frame.step
+        wait(lambda: session.frame.step > step + 3)
+        assert len(recording) == 0
+    finally:
+        page.close()

@@ -4,12 +4,13 @@ import functools
 import pathlib
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
 from mjx_nero import config, files
 from mjx_nero.config import values
+from mjx_nero.data import open_dataset
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
@@ -18,6 +19,9 @@ from mjx_nero.learn.runs.folder import CONFIG
 from mjx_nero.tools import cli
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
+
+if TYPE_CHECKING:
+    from mjx_nero.tools.view import leader as leaders
 
 WATCH_S = 2.0  # how often a followed run is looked at
 
@@ -38,9 +42,16 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--demos", type=cli.path(), metavar="DIR", help="record demonstrations of your own: a data set, new or one to go on with"
     )
+    parser.add_argument(
+        "--episode", type=cli.number(int), metavar="K", help="with --demos: replay that episode, from 0; its environment, too"
+    )
+    parser.add_argument("--leader", metavar="PORT", help="serial port of LeRobot's SO-101 leader arm, which the robot follows")
+    parser.add_argument("--calibration", type=cli.path(".json"), help="with --leader: its calibration file, LeRobot's")
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
     parser.add_address()
+    from mjx_nero.tools.view import leader
+
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     given = parser.given(argv)  # else what the run says
     serve(
@@ -56,6 +67,8 @@ def main(argv: Sequence[str]) -> None:
         port=args.port,
         overrides=dotted["env"],
         demos=args.demos,
+        episode=args.episode,
+        leader=leader.at(args.leader, args.calibration) if args.leader else None,
     )
 
 
@@ -83,10 +96,13 @@ class View:
         server: viser's.
         session: what it shows.
         panel: its controls.
+        hands: those of the user's hand.
     """
 
-    def __init__(self, page, door, orders, session, panel, run: pathlib.Path | None, env_name: str):
-        self._page, self._door, self._orders, self.session, self.panel = page, door, orders, session, panel
+    def __init__(self, page, door, orders, session, panel, hands, run: pathlib.Path | None, env_name: str):
+        self._page, self._door, self._orders = page, door, orders
+        self.session, self.panel, self.hands = session, panel, hands
+        self.leader: leaders.Leader | None = None  # that is read
         self.url, self.server = door.url, page.server
         self._run, self._env_name = run, env_name
         self._seen: pathlib.Path | None = None
@@ -118,6 +134,8 @@ class View:
     def close(self) -> None:
         """Ends simulation and servers."""
         self._ended.set()
+        if self.leader:
+            self.leader.close()
         self.session.stop()
         if self._thread:
             self._thread.join(timeout=5)
@@ -139,6 +157,8 @@ def open_view(
     port: int = 8080,
     overrides: Mapping[str, Any] | None = None,
     demos: pathlib.Path | None = None,
+    episode: int | None = None,
+    leader: "leaders.Readable | None" = None,
 ) -> View:
     """Serves the page, and lets the environments run.
 
@@ -148,30 +168,54 @@ def open_view(
         host: address to listen at.
         port: the first free one from here on.
         demos: data set to record to, of the first environment.
+        episode: of that data set, to replay at first.
+        leader: an arm that the user moves by hand, connected.
 
     Raises:
         UserError: as the command.
     """
     need("viser", "view")
-    from mjx_nero.tools.view import door, hand, hand_panel, orders, panel, scene, session
+    from mjx_nero.tools.view import hand, session, tape
+    from mjx_nero.tools.view import leader as leaders
 
-    described = _described(run) if run else {}
+    described = _described(run) if run else _played(demos) if demos and episode is not None else {}
     env_name = env_name or described.get("env_name", "nero_lift")
     preset = preset or described.get("preset", "default")
     cfg = registry.env_cfg(env_name, preset, robot)
     env = ManipulationEnv(config.override(cfg.uncorrupted(), overrides or {}), impl="native", num_envs=num_envs)
     makers = agents.known(env, env_name, list(policies), preset)
+    if leader and leaders.same_joints(env):
+        makers[leaders.NAME] = lambda: leaders.agent(env)
     chosen = _chosen(agent, list(makers), env_name)
     home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
-    page, guard = door.open_page(host, port)
+    if demos and episode is not None:
+        sim.replay(tape.of_dataset(demos, episode, sim.frame))
+    recording = hand.Recording(sim, demos, env_name, preset) if demos else None
+    return _served(sim, makers, chosen, recording, leader, (host, port), run, env_name)
+
+
+def _served(sim, makers, chosen: str, recording, leader, where: tuple[str, int], run: pathlib.Path | None, env_name: str) -> View:
+    """Puts a session's page together and starts both.
+
+    Raises:
+        UserError: as ``open_view``.
+    """
+    from mjx_nero.tools.view import door, hand, hand_panel, orders, panel, scene
+    from mjx_nero.tools.view import leader as leaders
+
+    page, guard = door.open_page(*where)
     work = orders.Orders()
     controls = panel.Panel(page.server, sim, makers, chosen, work)
-    recording = hand.Recording(sim, demos, env_name, preset) if demos else None
     steered = hand.Hand(sim, lambda: hands.take_over())
-    hands = hand_panel.HandPanel(page.server, controls, steered, recording, work)
-    picture = scene.Scene(page.server, sim, env.mj_model, work, steered)
-    view = View(page, guard, work, sim, controls, run, env_name)
+    read, follow = None, None
+    if leader:
+        read, follow = leaders.attached(leader, sim, controls, steered, lambda name: hands.take_over(name))
+    hands = hand_panel.HandPanel(page.server, controls, steered, recording, work, follow)
+    page.gamepad = hands.gamepad
+    picture = scene.Scene(page.server, sim, sim.env.mj_model, work, steered)
+    view = View(page, guard, work, sim, controls, hands, run, env_name)
+    view.leader = read
 
     def shown(frame) -> None:
         picture.show(frame)
@@ -187,6 +231,12 @@ def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
     if found is None:
         raise UserError(f"nobody called {agent!r} can act in {env_name}: choose one of {', '.join(names)}")
     return found
+
+
+def _played(demos: pathlib.Path) -> dict[str, Any]:
+    """What a data set is of."""
+    about = open_dataset(demos).schema.about
+    return {"env_name": about["env"], "preset": about["preset"]}
 
 
 def _described(run: pathlib.Path) -> dict[str, Any]:

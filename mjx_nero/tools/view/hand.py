@@ -2,7 +2,7 @@
 
 import pathlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -20,7 +20,8 @@ from mjx_nero.learn.play.recorder import Record
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import kinematics
 from mjx_nero.tools.demos import making
-from mjx_nero.tools.view.session import Session
+from mjx_nero.tools.view import tape
+from mjx_nero.tools.view.session import Frame, Session
 
 NAME = "your hand"
 STEP = 0.01  # [m] of a key
@@ -102,6 +103,11 @@ class Hand:
         """Wants the gripper so far open, from 0 to 1."""
         self._steer(lambda: setattr(self, "open", float(np.clip(share, 0.0, 1.0))))
 
+    def put(self, pos: np.ndarray, quat: np.ndarray, share: float) -> None:
+        """Wants it at a pose of the world, and the gripper so far open."""
+        wanted = {"pos": np.asarray(pos, float), "quat": np.asarray(quat, float), "open": float(np.clip(share, 0.0, 1.0))}
+        self._steer(lambda: self.__dict__.update(wanted))
+
     def _steer(self, change: Callable[[], None]) -> None:
         begins = self._take_over()
         if begins:  # whoever acts now is given parameters when it begins
@@ -153,6 +159,11 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self._steps)
+
+    def tape(self) -> Iterator[Frame]:
+        """What was recorded, to be shown."""
+        goals = [np.concatenate([one.scenery.goal_pos_w, one.scenery.goal_quat_w]) for _, one in self._steps]
+        return tape.frames(self._session.frame, [qpos.astype(float) for qpos, _ in self._steps], np.array(goals))
 
     def begin(self) -> None:
         """Records from now on."""

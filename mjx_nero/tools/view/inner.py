@@ -13,9 +13,11 @@ from typing import Any
 import viser
 import websockets.asyncio.server as ws
 from viser import _messages
+from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from mjx_nero.tools.view import messages
+from mjx_nero.tools.view import gamepad, messages
+from mjx_nero.tools.view.gamepad import Gamepad
 from mjx_nero.tools.view.log import LOG
 from mjx_nero.types import UserError
 
@@ -34,15 +36,18 @@ class Inner:
     Attributes:
         server: viser's.
         path: of the socket.
+        gamepad: hears what pages say of theirs.
 
     Raises:
         UserError: this viser listens in another way.
     """
 
     def __init__(self) -> None:
+        self.gamepad: Gamepad | None = None  # heard from the moment that it is there
         self._folder = pathlib.Path(tempfile.mkdtemp(prefix="mjx_nero_view_"))
         self.path = self._folder / "page"
-        with _listening_at(self.path, self._read), contextlib.redirect_stdout(io.StringIO()):  # it prints its address
+        listening = _listening_at(self.path, self._read, self._hear_gamepad)
+        with listening, contextlib.redirect_stdout(io.StringIO()):  # it prints its address
             self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         if not self.path.is_socket():
             self.close()
@@ -66,6 +71,10 @@ class Inner:
             LOG.warning("a message was ignored: %s", error)
             return None
 
+    def _hear_gamepad(self, raw: bytes) -> None:
+        if self.gamepad:
+            self.gamepad.hear(raw)
+
 
 def tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Logs an event loop's errors that nobody waits for, one line now and then."""
@@ -73,11 +82,20 @@ def tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
-def _listening_at(path: pathlib.Path, read: Callable[[bytes], bytes | None]) -> Iterator[None]:
+def _listening_at(
+    path: pathlib.Path, read: Callable[[bytes], bytes | None], hear_gamepad: Callable[[bytes], None]
+) -> Iterator[None]:
     """viser takes a host and a port alone; while it starts, what it starts with listens at ``path`` instead."""
     original, version = ws.serve, f"viser-v{viser.__version__}"
 
     def serve(handler, host, port, **kwargs):
+        async def handle(connection: Any) -> None:
+            if getattr(connection.request, "path", "") != gamepad.PATH:
+                return await handler(connection)
+            connection.read = hear_gamepad  # it gives nothing on, so this ends with the connection
+            with contextlib.suppress(ConnectionClosed):
+                await connection.recv()
+
         kwargs.update(
             create_connection=functools.partial(_Connection, read=read),
             max_size=messages.LONGEST,
@@ -88,7 +106,7 @@ def _listening_at(path: pathlib.Path, read: Callable[[bytes], bytes | None]) -> 
             close_timeout=2,
             logger=LOG,
         )
-        return original(handler, unix=True, path=str(path), **kwargs)
+        return original(handle, unix=True, path=str(path), **kwargs)
 
     ws.serve = serve  # type: ignore[assignment,misc]
     try:
@@ -109,6 +127,10 @@ def _guard(connection: ws.ServerConnection, request: Request, response: Response
     response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
     response.headers["Referrer-Policy"] = "no-referrer"
     response.headers["Cache-Control"] = "no-store"
+    if response.headers.get("Content-Type", "").startswith("text/html"):
+        response.body = gamepad.with_script(bytes(response.body))
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
 
 
 class _Connection(ws.ServerConnection):
@@ -116,7 +138,7 @@ class _Connection(ws.ServerConnection):
 
     def __init__(self, *args: Any, read: Callable[[bytes], bytes | None], **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self._read = read
+        self.read = read
 
     async def recv(self, decode: bool | None = None) -> Any:
         while True:
@@ -127,6 +149,6 @@ class _Connection(ws.ServerConnection):
                 if len(fragments) > FRAGMENTS:  # empty ones have no size that a limit would meet
                     await self.close(_TOO_BIG)
                     raise self.protocol.close_exc
-            message = self._read(b"".join(fragments))
+            message = self.read(b"".join(fragments))
             if message is not None:
                 return message

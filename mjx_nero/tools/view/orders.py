@@ -11,12 +11,12 @@ class Orders:
     pile up work; one that fails is a line in the terminal and nothing more."""
 
     def __init__(self) -> None:
-        self._waiting: dict[Hashable, Callable[[], None]] = {}
+        self._waiting: dict[Hashable, Callable[[], object]] = {}
         self._changed, self._ended = threading.Condition(), False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def give(self, name: Hashable, work: Callable[[], None]) -> None:
+    def give(self, name: Hashable, work: Callable[[], object]) -> None:
         """Asks for ``work``, in place of what still waits under ``name``."""
         with self._changed:
             self._waiting[name] = work

@@ -3,7 +3,7 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -78,6 +78,12 @@ class Panel:
             self._message.content = ""
         except UserError as error:
             self._message.content = f"**{error}**"
+
+    def replay(self, tape: Iterator[Frame]) -> None:
+        """Shows a tape, from a pause, too."""
+        self._session.replay(tape)
+        if not self._session.running:
+            self._pause()
 
     def _pause(self) -> None:
         self._session.running = not self._session.running

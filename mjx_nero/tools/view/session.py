@@ -3,9 +3,10 @@
 import collections
 import dataclasses
 import functools
+import itertools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -62,6 +63,7 @@ class Session:
         self._see = jax.jit(self._see_all)
         self._lock, self._stop, self._single = threading.RLock(), threading.Event(), False
         self._changed = False
+        self._tape: Iterator[Frame] = iter(())
         self._dragged = np.zeros(size, bool)
         self._command = np.zeros((size, 3), np.float32)  # of the goals that the user has dragged
         self._state = self._reset(self._split())
@@ -77,13 +79,18 @@ class Session:
     def reset(self) -> None:
         """Fresh episodes; goals are where the task draws them."""
         with self._lock:
-            self._dragged[:] = False
+            self._tape, self._dragged[:] = iter(()), False
             self.history.clear()
             self.successes.clear()
             self._state = self._reset(self._split())
             self._memory = self._init(self._state)
             self.frame = self._look(jnp.zeros((self.size, self.env.action_size)))
             self._changed = True
+
+    def replay(self, tape: Iterator[Frame]) -> None:
+        """Shows the frames of a tape, one a step; the physics stands still until it ends, or until ``reset``."""
+        with self._lock:
+            self._tape = itertools.chain(tape, [self.frame])
 
     def single_step(self) -> None:
         """One control step, also while paused."""
@@ -132,8 +139,11 @@ class Session:
         self._stop.set()
 
     def step(self) -> None:
-        """One control step of all environments."""
+        """One control step of all environments, or one frame of a tape."""
         with self._lock:
+            if (frame := next(self._tape, None)) is not None:
+                self.frame = frame
+                return
             key = self._split()
             action, memory = self._act(self.params, self._memory, self._state, key)
             self._state, record = self._step(self._state, action, key)

@@ -1,0 +1,194 @@
+"""A leader arm steers the robot: LeRobot's SO-101 leader, which a person moves by hand.
+
+An SO-ARM does with its joints what the leader does with its own. Another robot's hand goes the way that the leader's hand goes,
+from where both are when it takes over, and its gripper opens as far.
+"""
+
+import functools
+import pathlib
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_nero import math
+from mjx_nero.data.units import LEROBOT
+from mjx_nero.deploy.arm import ArmError, Feedback
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.errors import UserError
+from mjx_nero.interop import description
+from mjx_nero.learn.play import rollout
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim import kinematics, scene
+from mjx_nero.tools.view.hand import NAME as HAND
+from mjx_nero.tools.view.hand import Hand
+from mjx_nero.tools.view.log import LOG
+from mjx_nero.tools.view.panel import Panel
+from mjx_nero.tools.view.session import Session
+
+NAME = "leader arm"
+HZ = 50.0
+PATIENCE_S = 0.5  # without an answer; then the robot stays where it is
+_MODEL = "so_arm101"
+
+
+class Readable(Protocol):
+    """An arm that can be read."""
+
+    def connect(self) -> None: ...
+    def read(self) -> Feedback: ...
+    def close(self) -> None: ...
+
+
+def at(port: str, calibration: pathlib.Path | None) -> Readable:
+    """The leader at a serial port.
+
+    Raises:
+        UserError: there is no calibration file, or nothing answers as it says.
+    """
+    from mjx_nero.deploy.drivers import so_leader
+
+    if calibration is None:
+        raise UserError("--leader needs --calibration: LeRobot's file of the leader, as lerobot-calibrate writes it")
+    try:
+        import serial  # noqa: F401
+    except ModuleNotFoundError:
+        raise UserError("--leader needs pyserial, of the extra 'deploy': pip install 'mjx-nero[deploy]'") from None
+    made = so_leader.of(description.robot(registry.robot(_MODEL)), port, calibration, Clock())
+    made.connect()
+    return made
+
+
+class Clock:
+    """The wall's."""
+
+    def now(self) -> float:
+        """[s]."""
+        return time.monotonic()
+
+    def sleep_until(self, at: float) -> None:
+        """Waits."""
+        time.sleep(max(0.0, at - self.now()))
+
+
+def same_joints(env: ManipulationEnv) -> bool:
+    """Whether the robot has the leader's joints."""
+    return env.cfg.robot.name in LEROBOT
+
+
+def agent(env: ManipulationEnv) -> rollout.Agent:
+    """Takes the joints to its parameters [joints], at the drives' speed."""
+    robot = env.cfg.robot
+    step = jnp.array(robot.arm.speed + robot.gripper.speed, jnp.float32) * env.dt
+
+    def act(wanted, points, state, key):
+        points = jax.vmap(lambda point: rate_limit(wanted, point, step=step))(points)
+        return points, points
+
+    return rollout.through_actions(env, rollout.Agent(act, init=jax.vmap(lambda state: env.view(state).joint_pos)))
+
+
+class Leader:
+    """Reads an arm in a thread, and hands on where it is.
+
+    Args:
+        arm: connected.
+        follow: called with the positions of its joints [rad].
+
+    Attributes:
+        position: of its joints, as last read [rad].
+    """
+
+    def __init__(self, arm: Readable, follow: Callable[[np.ndarray], None]):
+        self._arm, self._follow, self._ended = arm, follow, threading.Event()
+        self.position = arm.read().position
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the thread and closes the port; the arm stays limp."""
+        self._ended.set()
+        self._thread.join(timeout=2)
+        self._arm.close()
+
+    def _run(self) -> None:
+        heard = time.monotonic()
+        while not self._ended.wait(1 / HZ):
+            try:
+                self.position, heard = self._arm.read().position, time.monotonic()
+                self._follow(self.position)
+            except ArmError as error:
+                if time.monotonic() - heard > PATIENCE_S:
+                    LOG.warning("the leader arm is silent, and the robot stays where it is: %s", error)
+
+
+class Way:
+    """The way of a leader's hand, which the hand of another robot goes, too."""
+
+    def __init__(self, hand: Hand):
+        robot = registry.robot(_MODEL)
+        chain = kinematics.Chain(scene.robot_model(robot), robot.joints, [robot.ee_site])
+        self._hand, self._poses = hand, jax.jit(lambda joints: tuple(x[0] for x in chain.poses(joints)))
+        self._fingers = tuple(np.array(x) for x in (robot.gripper.open, robot.gripper.close))
+        self._from: tuple | None = None
+
+    def begin(self) -> None:
+        """From where both hands are at the next step."""
+        self._hand.here()
+        self._from = None
+
+    def step(self, joints: np.ndarray) -> None:
+        """Takes the robot's hand along.
+
+        Args:
+            joints: of the leader [rad].
+        """
+        pos, quat = self._poses(jnp.asarray(joints, jnp.float32))
+        if self._from is None:
+            self._from = pos, quat, self._hand.pos.copy(), jnp.asarray(self._hand.quat, jnp.float32)
+        pos0, quat0, own, own_quat = self._from
+        turned = math.quat_mul(math.quat_mul(quat, math.quat_conj(quat0)), own_quat)
+        opened, closed = self._fingers
+        n = len(opened)
+        self._hand.put(
+            own + np.asarray(pos - pos0), np.asarray(turned), float(np.mean((joints[-n:] - closed) / (opened - closed)))
+        )
+
+
+def attached(
+    arm: Readable, session: Session, panel: Panel, hand: Hand, take_over: Callable[[str], bool]
+) -> tuple[Leader, Callable[[], object]]:
+    """Returns the arm as it is read, and what lets it take over.
+
+    Args:
+        take_over: lets an agent of the user's act, by its name.
+    """
+    if same_joints(session.env):
+
+        def copy(joints: np.ndarray) -> None:
+            if panel.agent.value == NAME:
+                session.params = jnp.asarray(joints, jnp.float32)
+
+        made = Leader(arm, copy)
+        panel.parameters[NAME] = lambda: jnp.asarray(made.position, jnp.float32)
+        return made, functools.partial(take_over, NAME)
+
+    way, follows = Way(hand), threading.Event()
+
+    def go(joints: np.ndarray) -> None:
+        if follows.is_set() and panel.agent.value == HAND:
+            way.step(joints)
+        else:
+            follows.clear()
+
+    def begin() -> None:
+        way.begin()
+        take_over(HAND)
+        follows.set()
+
+    return Leader(arm, go), begin

@@ -1,0 +1,53 @@
+"""Tapes: what was recorded, as frames that a session shows instead of its physics."""
+
+import dataclasses
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_nero.data import Schema, open_dataset
+from mjx_nero.data import episode as names
+from mjx_nero.errors import UserError
+from mjx_nero.tools.view.session import Frame
+
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def frames(frame: Frame, qpos: Sequence[np.ndarray], goals: np.ndarray) -> Iterator[Frame]:
+    """A frame a step, of the first environment; everything else stays as in ``frame``.
+
+    Args:
+        qpos: positions of the physics [steps, nq].
+        goals: pose of the goal [steps, 7], wxyz.
+    """
+    for i, (at, goal) in enumerate(zip(qpos, goals, strict=True)):
+        both, pos, quat = (np.array(x) for x in (frame.qpos, frame.scenery.goal_pos_w, frame.scenery.goal_quat_w))
+        both[0], pos[0], quat[0] = at, goal[:3], goal[3:]
+        seen: Any = {"goal_pos_w": pos, "goal_quat_w": quat}
+        yield dataclasses.replace(frame, qpos=both, step=i, scenery=dataclasses.replace(frame.scenery, **seen))
+
+
+def of_dataset(path: pathlib.Path, index: int, frame: Frame) -> Iterator[Frame]:
+    """An episode of a data set.
+
+    Raises:
+        UserError: there is no such episode, or the data set is of another scene.
+    """
+    found = open_dataset(path)
+    if not 0 <= index < len(found):
+        raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
+    if missing := {names.QPOS, names.ENVIRONMENT} - set(found.schema.features):
+        raise UserError(f"{path} has no {' and no '.join(sorted(missing))}: it is not of an environment here")
+    size = found.schema.features[names.QPOS].size
+    if size != frame.qpos.shape[1]:
+        raise UserError(f"{path} has scenes of {size} positions, and this environment {frame.qpos.shape[1]}: pass its --env")
+    episode = found.episodes((names.QPOS, names.ENVIRONMENT))[index]
+    return frames(frame, list(episode.arrays[names.QPOS].astype(float)), episode.arrays[names.ENVIRONMENT][:, goal(found.schema)])
+
+
+def goal(schema: Schema) -> list[int]:
+    """Where the goal's pose is in ``episode.ENVIRONMENT``."""
+    known = schema.features[names.ENVIRONMENT].names
+    return [known.index(f"goal.{axis}") for axis in _POSE]
