@@ -25,6 +25,7 @@ from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import events, terms
 from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
+from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import cameras, linkage, obstacles, scene, touch
 from mjx_nero.sim.cameras.look import Look
@@ -302,8 +303,14 @@ class ManipulationEnv(Env):
         boxes, look = self._obstacles.views(sim.fields), carry.memory.get(LOOK, {})
         return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
 
-    def _pictures(self, sim: Sim, carry: Carry) -> dict[str, Picture]:
-        return self.cameras(sim, self._scenery(sim, carry))
+    def _pictures(self, sim: Sim, carry: Carry, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:
+        return self.cameras(sim, self._scenery(sim, carry), due)
+
+    def _due(self, carry: Carry) -> dict[str, Bool[Array, ""]]:
+        """Says which cameras' pictures the sensors look at now; empty where all are, always."""
+        lenses = {f"sensors.{name}": term.made for name, term in self.cfg.sensors.items()}
+        rare = {name: lens for name, lens in lenses.items() if isinstance(lens, Lens) and lens.every > 1}
+        return {lens.camera: lens.due(carry.memory[name]) for name, lens in rare.items()}
 
     def _differing(self) -> Mapping[str, Any]:
         """The objects whose drawn size or colour differs from episode to episode."""
@@ -328,6 +335,8 @@ class ManipulationEnv(Env):
         """Computes the observation groups and their new memory; ``key`` draws their noise."""
         cfg, recall = self.cfg, terms.Recall(carry.memory)
         view = sensed = self._viewer(sim, carry, carry.action)
+        if due := self._due(carry):  # what reads ``view`` sees every step's pictures
+            sensed = dataclasses.replace(view, cameras=self._pictures(sim, carry, due))
         for name, term in cfg.sensors.items():
             sensed = recall.through(f"sensors.{name}", term.made, sensed)
         if cfg.sensors:

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from mjx_nero.config.bounds import Count, NonNegative, PositiveRange, Share, Steps
 from mjx_nero.mdp.memory import Delay
@@ -69,6 +69,10 @@ class Lens:
     every: Count = 1
     delay: Steps = (0, 0)
     hold: Share = 1.0
+
+    def due(self, memory: tuple) -> Bool[Array, ""]:
+        """Whether the next ``step`` looks at the picture; otherwise none has to be drawn for it."""
+        return memory[3][0] % self.every == 0 if self.every > 1 else jnp.ones((), bool)
 
     def init(self, key: Key, view: View) -> tuple:
         """Draws the episode's camera, and fills rate and delay with the first picture."""

@@ -60,6 +60,53 @@ def materials(key: Key, model: Model, *, change: Share, shade: PositiveRange = (
     return {"mat_rgba": (rows, _recolored(key, model.fields["mat_rgba"][rows], change, shade))}
 
 
+def photographs(
+    key: Key, model: Model, *, geoms: tuple[str, ...], share: Share = 1.0, shade: PositiveRange = (0.6, 1.2)
+) -> Drawn:
+    """Shows a random photograph of ``SceneCfg.photographs`` on each geom, with probability ``share`` and multiplied by ``shade``.
+
+    Without photographs it draws nothing.
+    """
+    if not (shown := _materials(model, "photograph_")).size:
+        return {}
+    rows = model.rows("geom", geoms)
+    k_which, k_there, k_shade = jax.random.split(key, 3)
+    there = jax.random.bernoulli(k_there, share, rows.shape)
+    plain = jax.random.uniform(k_shade, (len(rows), 1), minval=shade[0], maxval=shade[1]) * jnp.ones((1, 3))
+    rgba = model.fields["geom_rgba"][rows]
+    seen = rgba.at[:, :3].set(jnp.where(there[:, None], jnp.minimum(plain, 1.0), rgba[:, :3]))
+    return {"geom_matid": (rows, _chosen(k_which, model, rows, shown, there)), "geom_rgba": (rows, seen)}
+
+
+def patterns(key: Key, model: Model, *, geoms: tuple[str, ...] = (), share: Share) -> Drawn:
+    """Shows a random pattern of ``SceneCfg.patterns`` on each geom, in its colour, with probability ``share``; without patterns
+    nothing.
+
+    Args:
+        geoms: empty: all of the robot, which then has one pattern.
+    """
+    if not (shown := _materials(model, "pattern_")).size:
+        return {}
+    rows = model.rows("geom", geoms) if geoms else np.array(list(model.index["robot"].values()), int)
+    k_which, k_there = jax.random.split(key)
+    if geoms:
+        there = jax.random.bernoulli(k_there, share, rows.shape)
+        return {"geom_matid": (rows, _chosen(k_which, model, rows, shown, there))}
+    own, there = model.fields["geom_matid"][rows], jax.random.bernoulli(k_there, share)
+    rgba = jnp.where(there, model.fields["mat_rgba"][own], model.fields["geom_rgba"][rows])  # the colour was the material's
+    which = jnp.asarray(shown)[jax.random.randint(k_which, (), 0, len(shown))]
+    return {"geom_matid": (rows, jnp.where(there, which, own)), "geom_rgba": (rows, rgba)}
+
+
+def _materials(model: Model, prefix: str) -> np.ndarray:
+    return np.array([row for name, row in model.index["material"].items() if name.startswith(prefix)], int)
+
+
+def _chosen(key: Key, model: Model, rows: np.ndarray, shown: np.ndarray, there: Array) -> Array:
+    which = jnp.asarray(shown, jnp.int32)[jax.random.randint(key, rows.shape, 0, len(shown))]
+    return jnp.where(there, which, model.fields["geom_matid"][rows])
+
+
 def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range, z: Range, there: Share = 1.0) -> Drawn:
     """Puts geoms without collisions at random places, turned about the vertical; each is hidden below the table unless ``there``.
 

@@ -12,6 +12,7 @@ from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive
 from mjx_nero.sim import robot_file, touch
 from mjx_nero.sim.cameras import cfg as cameras
+from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
@@ -111,6 +112,8 @@ class SceneCfg:
         look_at, view_distance: point that people's cameras look at, and their distance from it.
         distractors: how many things that touch nothing cameras may see (``mdp.looks.places`` puts them somewhere).
         backdrop: a wall stands behind the robot, for cameras alone.
+        photographs: folder with pictures of the user's (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.
+        patterns: how many patterns ``mdp.looks.patterns`` may show.
         cameras: what terms and policies see through, by name; none cost nothing.
         renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: the first with
             MuJoCo's C library as physics, the second otherwise.
@@ -129,6 +132,8 @@ class SceneCfg:
     view_distance: Positive = 1.1
     distractors: Annotated[int, Bounds(0, 100)] = 0
     backdrop: bool = False
+    photographs: str = ""
+    patterns: Annotated[int, Bounds(0, 100)] = 0
     cameras: Mapping[str, CameraCfg] = dataclasses.field(default_factory=dict)
     renderer: Annotated[str, OneOf("auto", "mujoco", "warp")] = "auto"
 
@@ -200,6 +205,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         _add_visuals(spec, scene, goal, robot)
         cameras.add(spec, scene.cameras)
         _add_props(spec, scene, robot)
+        textures.add(spec, scene.photographs, scene.patterns)
     else:
         spec.discard_visual()
     spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None

@@ -98,6 +98,13 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
             "props_color": Term(looks.colors, params={"geoms": names, **any_color}),
             "props_size": Term(looks.sizes, params={"geoms": names, "scale": (0.4, 1.5)}),
             **beside,
+            # Last, so that scenes without photographs and patterns look as they did before there were any.
+            "backdrop_photograph": Term(looks.photographs, params={"geoms": ("backdrop",), "share": 0.8}),
+            "table_photograph": Term(looks.photographs, params={"geoms": ("table_top",), "share": 0.3}),
+            "table_pattern": Term(looks.patterns, params={"geoms": ("table_top",), "share": 0.5}),
+            "objects_pattern": Term(looks.patterns, params={"geoms": objects, "share": 0.3}),
+            "props_pattern": Term(looks.patterns, params={"geoms": names, "share": 0.5}),
+            "robot_pattern": Term(looks.patterns, params={"share": 0.3}),
         },
         sensors={**cfg.sensors, **{f"lens_{name}": Term(images.Lens, params={"camera": name, **lens}) for name in scene.cameras}},
     )

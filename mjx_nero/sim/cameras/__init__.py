@@ -11,10 +11,10 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import CameraCfg
+from mjx_nero.sim.cameras.look import nominal
 from mjx_nero.types import Picture, Scenery, Sim
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
@@ -24,12 +24,15 @@ _UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
 class Drawer(Protocol):
     """Draws the pictures of a model's cameras."""
 
-    def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
+    def __call__(
+        self, qpos: jax.Array, fields: Mapping[str, Array], due: Bool[Array, " cameras"] | None = None
+    ) -> dict[str, Picture]:
         """Draws the pictures of one world, by camera; vmap it for many. Pure.
 
         Args:
             qpos: [nq].
             fields: fields of the drawn model that differ from world to world, by MuJoCo's names.
+            due: False: nobody looks at that camera's picture, which may be anything. None: all are looked at.
         """
         ...
 
@@ -70,12 +73,17 @@ class Cameras:
         self._objects = {name: int(model.geom(name).id) for name in objects}
         self._obstacles = {name: int(model.geom(name).id) for name in obstacles}
         names = [*(("geom_size", "geom_rgba") if objects else ()), *(("geom_pos", "geom_quat", "geom_size") if obstacles else ())]
-        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in dict.fromkeys((*names, *fields))}
+        self._nominal = {name: nominal(model, name) for name in dict.fromkeys((*names, *fields))}
+        self._names = tuple(cfg)
         module, kind = _DRAWERS[renderer]
         self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
 
-    def __call__(self, sim: Sim, scenery: Scenery) -> dict[str, Picture]:
-        """Returns the pictures by camera."""
+    def __call__(self, sim: Sim, scenery: Scenery, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:
+        """Returns the pictures by camera.
+
+        Args:
+            due: by camera, False where nobody looks at the picture, which then may be anything.
+        """
         now = {name: jnp.asarray(scenery.look.get(name, value)) for name, value in self._nominal.items()}
         for name, geom in self._objects.items():
             look = scenery.objects[name]
@@ -85,7 +93,9 @@ class Cameras:
             box = scenery.obstacles[name]
             for field, value in (("geom_pos", box.pos_w), ("geom_quat", box.quat_w), ("geom_size", box.size / 2)):
                 now[field] = now[field].at[geom].set(value)
-        return self.draw(sim.qpos, now)
+        if not due:
+            return self.draw(sim.qpos, now)
+        return self.draw(sim.qpos, now, jnp.stack([due.get(name, jnp.ones((), bool)) for name in self._names]))
 
 
 def renderer(asked: str, impl: str) -> str:

@@ -23,6 +23,7 @@ DRAWABLE = (
     "geom_pos",
     "geom_quat",
     "geom_size",
+    "geom_matid",
     "mat_rgba",
 )  # all drawers read them for every picture
 
@@ -43,8 +44,10 @@ class Look:
 
     def __init__(self, model: mujoco.MjModel, terms: Mapping[str, Callable[[Key, Model], Drawn]]):
         self._terms = terms
-        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in DRAWABLE}
+        self._nominal = {name: nominal(model, name) for name in DRAWABLE}
         self._index = {
+            "material": {model.mat(i).name: i for i in range(model.nmat)},
+            "robot": {str(i): int(i) for i in np.flatnonzero(model.geom_matid >= 0)},  # nothing else has a material of its own
             "camera": {model.camera(i).name.removeprefix(MARK): i for i in range(model.ncam) if _ours(model, i)},
             "geom": {model.geom(i).name: i for i in range(model.ngeom) if model.geom(i).name},
         }
@@ -70,6 +73,12 @@ class Look:
 
     def _model(self, drawn: Mapping[str, Array]) -> Model:
         return Model({**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}, self._index)
+
+
+def nominal(model: mujoco.MjModel, field: str) -> np.ndarray:
+    """A field of the model, in float32, or in int32 where it has whole numbers."""
+    found = np.array(getattr(model, field))
+    return found.astype(np.int32 if np.issubdtype(found.dtype, np.integer) else np.float32)
 
 
 def _ours(model: mujoco.MjModel, camera: int) -> bool:

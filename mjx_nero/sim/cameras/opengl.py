@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.render import NO_GL
@@ -46,11 +46,14 @@ class OpenGL:
         weakref.finalize(self, _close, self._thread, self._renderers)
         self._thread.submit(self._open).result()
 
-    def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
+    def __call__(
+        self, qpos: jax.Array, fields: Mapping[str, Array], due: Bool[Array, "*n cameras"] | None = None
+    ) -> dict[str, Picture]:
         """Draws the pictures of one world, or of as many as the leading axes say."""
         lead = qpos.shape[:-1]
         drawn = [fields[name].reshape(*lead, -1) for name in self._fields]
-        packed = jnp.concatenate([qpos, *drawn], axis=-1)
+        wanted = jnp.ones((*lead, len(self._cfg))) if due is None else due
+        packed = jnp.concatenate([x.astype(jnp.float32) for x in (wanted, qpos, *drawn)], axis=-1)
         shapes = [jax.ShapeDtypeStruct((*lead, *s.shape), s.dtype) for s in self._shapes]
         images = iter(jax.pure_callback(self._draw_all, shapes, packed, vmap_method="broadcast_all"))
         return {name: Picture(**dict(zip(c.kinds, images, strict=False))) for name, c in self._cfg.items()}
@@ -71,15 +74,20 @@ class OpenGL:
             raise UserError(NO_GL) from error
 
     def _draw_all(self, packed: Array) -> list[np.ndarray]:
-        """(qpos, fields) of all worlds -> the images. JAX calls this function back, so calling JAX in here would deadlock."""
+        """(which cameras are due, qpos, fields) of all worlds -> the images.
+
+        JAX calls this function back, so calling JAX in here would deadlock.
+        """
         rows = np.asarray(packed).reshape(-1, packed.shape[-1])
-        images = [np.empty((len(rows), *s.shape), s.dtype) for s in self._shapes]
+        images = [np.zeros((len(rows), *s.shape), s.dtype) for s in self._shapes]
         self._thread.submit(self._draw_rows, rows, images).result()
         return [image.reshape(*packed.shape[:-1], *image.shape[1:]) for image in images]
 
     def _draw_rows(self, rows: np.ndarray, images: list[np.ndarray]) -> None:
-        model, data, nq = self._model, self._data, self._model.nq
-        for i, row in enumerate(rows):
+        model, data, nq, cameras = self._model, self._data, self._model.nq, len(self._cfg)
+        for i, (due, row) in enumerate(zip(rows[:, :cameras] > 0, rows[:, cameras:], strict=True)):
+            if not due.any():
+                continue
             data.qpos[:] = row[:nq]
             at = nq
             for name, shape in self._fields.items():
@@ -89,9 +97,10 @@ class OpenGL:
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
             out = iter(images)
-            for name, cfg in self._cfg.items():
+            for wanted, (name, cfg) in zip(due, self._cfg.items(), strict=True):
                 for kind, image in zip(cfg.kinds, itertools.islice(out, len(cfg.kinds)), strict=True):
-                    image[i] = self._shot(self._renderers[cfg.shape], MARK + name, kind)
+                    if wanted:
+                        image[i] = self._shot(self._renderers[cfg.shape], MARK + name, kind)
 
     def _shot(self, renderer: mujoco.Renderer, camera: str, kind: str) -> np.ndarray:
         with _mode(renderer, kind):

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
+from mjx_nero.sim.cameras.look import nominal
 from mjx_nero.sim.physics import possible
 from mjx_nero.sim.physics.mujoco_warp import WARP, world_fields
 from mjx_nero.types import Picture
@@ -34,12 +35,16 @@ class RayTracer:
         }
         self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
+        self._where_due = self._as_jax(sometimes=True)
 
-    def __call__(self, qpos: jax.Array, fields: Mapping[str, Array]) -> dict[str, Picture]:
+    def __call__(
+        self, qpos: jax.Array, fields: Mapping[str, Array], due: Bool[Array, "*n cameras"] | None = None
+    ) -> dict[str, Picture]:
         """Draws the pictures of one world, or of as many as the leading axes say."""
         lead = qpos.shape[:-1]
-        given = [qpos, *(fields[name].reshape(*lead, -1) for name in self._fields)]
-        rgb, depth, segmentation = self._batched(jnp.concatenate(given, axis=-1) if self._fields else qpos)
+        given = [qpos, *(_bits(fields[name].reshape(*lead, -1)) for name in self._fields)]
+        packed = jnp.concatenate(given, axis=-1) if self._fields else qpos
+        rgb, depth, segmentation = self._batched(packed) if due is None else self._where_due(packed, due.any(axis=-1))
         images = {
             "rgb": jnp.stack([(rgb >> shift).astype(jnp.uint8) for shift in (16, 8, 0)], axis=-1),
             "depth": depth,
@@ -71,7 +76,8 @@ class RayTracer:
         tree = 200 * m.ngeom + 120 * (m.nbody + m.ngeom + m.nsite + m.ncam + m.nlight)
         return pictures + tree + 4 * sum(math.prod(shape) for shape in self._fields.values())
 
-    def _as_jax(self) -> Callable:
+    def _as_jax(self, sometimes: bool = False) -> Callable:
+        """The function of JAX that draws; ``sometimes``: it also takes which worlds are due, and draws all of them or none."""
         import warp as wp
 
         # As in ``physics.mujoco_warp``: XLA calls this function on the stream that it computes on.
@@ -99,14 +105,20 @@ class RayTracer:
         call = wp.jax_callable(draw, num_outputs=3, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
 
         @jax.custom_batching.custom_vmap
-        def batched(given):
+        def batched(given, *due):
             lead, rows = given.shape[:-1], given.reshape(-1, given.shape[-1])
             sizes = {f"{kind}_out": (len(rows), max(1, count)) for kind, count in self._pixels.items()}
-            return tuple(x.reshape(lead + x.shape[1:]) for x in call(rows, output_dims=sizes))
+            drawn = functools.partial(call, output_dims=sizes)
+            if not sometimes:
+                return tuple(x.reshape(lead + x.shape[1:]) for x in drawn(rows))
+            shapes = jax.eval_shape(drawn, rows)
+            found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: _zeros(shapes), rows)
+            return tuple(x.reshape(lead + x.shape[1:]) for x in found)
 
         @batched.def_vmap
-        def _(size, is_batched, given):
-            return batched(given if is_batched[0] else jnp.broadcast_to(given, (size, *given.shape))), (True,) * 3
+        def _(size, is_batched, *given):
+            wide = (x if own else jnp.broadcast_to(x, (size, *x.shape)) for x, own in zip(given, is_batched, strict=True))
+            return batched(*wide), (True,) * 3
 
         return batched
 
@@ -156,9 +168,18 @@ class RayTracer:
         if not wp.get_device().is_cuda:  # no graphs there
             return data, drawn, seen, run, model
         if drawn is not None:  # orientations that are zero would make no bounding boxes
-            nominal = [np.ravel(getattr(self._model, name)) for name in self._fields]
-            drawn.assign(np.tile(np.concatenate(nominal).astype(np.float32), (n, 1)))
+            given = [np.ravel(nominal(self._model, name)).view(np.float32) for name in self._fields]
+            drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
         return data, drawn, seen, functools.partial(wp.capture_launch, capture.graph), (model, run)
+
+
+def _zeros(shapes: Any) -> tuple:
+    return tuple(jnp.zeros(x.shape, x.dtype) for x in shapes)
+
+
+def _bits(values: Array) -> Array:
+    """The values as they lie in memory: Warp reads whole numbers there."""
+    return values if jnp.issubdtype(values.dtype, jnp.floating) else jax.lax.bitcast_convert_type(values, jnp.float32)
