@@ -320,10 +320,13 @@ class ManipulationEnv(Env):
     def _appearances(self, sim: Sim, carry: Carry) -> dict[str, Appearance]:
         """Collects drawn sizes and colours of objects; the commanded one of the targets gets the goal's green."""
         fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
+        colors = carry.memory.get(LOOK, {}).get("geom_rgba")
         out = {}
         for name in self._differing():
             geom = model.geom(name).id
             size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
+            if colors is not None:
+                rgba = colors[self.mj_model.geom(name).id]
             if name in targets:
                 commanded = carry.memory[TARGET] == targets.index(name)
                 rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)

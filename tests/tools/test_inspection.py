@@ -186,7 +186,7 @@ def test_environments():
     assert (lift.task, lift.robot, lift.presets, lift.action_size, lift.policy) == (
         "lift",
         "nero",
-        ("default", "isaac", "sim2real", "rgb", "depth", "rgbd", "rgb_fixed", "depth_fixed", "rgbd_fixed"),
+        ("default", "isaac", "sim2real", "rgb", "depth", "rgbd", "rgb_fixed", "depth_fixed", "rgbd_fixed", "sim2real_rgb"),
         8,
         True,
     )

@@ -1,12 +1,14 @@
 """What is varied to see how far a policy gets."""
 
+import dataclasses
 import json
 
+import jax
 import pytest
 
 from mjx_nero import UserError, __main__
 from mjx_nero.envs.registry import env_cfg
-from mjx_nero.tools.robustness import command, measure
+from mjx_nero.tools.robustness import command, measure, seen
 from mjx_nero.tools.robustness.sweeps import ALL, Point, sweeps
 
 
@@ -44,6 +46,54 @@ def test_actions_are_as_late_as_asked_for_whatever_the_task_draws():
     bench = measure.Bench("nero_reach", "default", env_cfg("nero_reach"), None, 32, "native", 1)
     rates = {late: bench.success(Point(delay=(late, late)))["success_rate"] for late in (0, 5)}
     assert rates[0] > 0.9 and rates[5] < rates[0] - 0.3
+
+
+def test_a_task_with_cameras_has_what_it_sees():
+    """One property at a time; nothing at the value where all is as it is; the whole look's ranges about what the model has."""
+    found, plain = sweeps(env_cfg("nero_lift", "rgb")), sweeps(env_cfg("nero_lift"))
+    own = set(found) - set(plain)
+    assert {name.split()[0] for name in own} == {"light", "camera", "colour", "patterns", "distractors", "pictures", "whole"}
+    assert "objects seen off by [m]" in plain and "objects seen off by [m]" not in found
+    for name in own:
+        neutral = [point for value, point in found[name] if value == ("factor" in name)]
+        assert neutral == [Point()], name
+    light = dict(found["light [factor]"])[0.5].look.terms
+    assert light["lights"].params == {"turn": 0.0, "brightness": (0.5, 0.5), "tint": 0.0, "dark": 0.0}
+    (moved,) = dict(found["camera moved by [m]"])[0.1].look.terms.values()
+    assert moved.params == {"cameras": ("front",), "offset": 0.1, "turn": 0.0}
+    whole = dict(found["whole look [width]"])
+    one, wide = whole[1.0].look.terms, whole[1.5].look.terms
+    look = env_cfg("nero_lift", "rgb").look
+    assert one["lights"].params == pytest.approx(look["lights"].params) and one["props_left"] == look["props_left"]
+    assert wide["lights"].params["brightness"] == pytest.approx((0.1, 1.6)) and wide["table"].params["change"] == 1.0
+    assert (
+        wide["front_pose"].params["offset"] == pytest.approx(0.03)
+        and wide["props_left"].params["x"] == look["props_left"].params["x"]
+    )
+
+
+@pytest.mark.slow
+def test_the_dark_is_seen(monkeypatch):
+    """A policy that sees is measured in two looks from the same starts: without light its pictures are darker, and it fails."""
+    cfg = dataclasses.replace(env_cfg("nero_lift", "rgb"), episode_length_s=3.0)
+    bench = measure.Bench("nero_lift", "rgb", cfg, None, 4, "native", 1)
+    points = dict(sweeps(cfg)["light [factor]"])
+    dark = dataclasses.replace(points[0.2].look.terms["lights"], params={"turn": 0.0, "brightness": (0.01, 0.01), "tint": 0.0})
+    states = [
+        jax.jit(bench._start)(bench._given(point), jax.vmap(bench.env.reset)(jax.random.split(jax.random.PRNGKey(0), 4)))
+        for point in (
+            points[1.0],
+            Point(look=seen.Look({"lights": dark})),
+            dict(sweeps(cfg)["pictures late [control steps]"])[3.0],
+        )
+    ]
+    lit, unlit, late = (state.obs["pictures"]["front"].astype(float) for state in states)
+    assert unlit.mean() < 0.8 * lit.mean() and (late == lit).all()
+    lags = [state.info["carry"].memory["sensors.lens_front"][4]["rgb"].lag.tolist() for state in states]
+    assert lags == [[0] * 4, [0] * 4, [3] * 4]
+    assert bench.success(points[1.0])["success_rate"] > 0.5
+    monkeypatch.setattr(bench, "_run", None)  # what was played is not played again
+    assert bench.success(Point())["success_rate"] > 0.5
 
 
 FIGURES = {

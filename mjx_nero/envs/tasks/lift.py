@@ -179,6 +179,11 @@ def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:
     return seeing.seen(default(robot, setup), sees)
 
 
+def sim2real_rgb(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
+    """``sim2real`` by pictures of a random look: see ``seeing.lifelike``."""
+    return seeing.lifelike(sim2real(robot, setup))
+
+
 SEEN = {name: functools.partial(seen, sees=name) for name in seeing.PRESETS}
 
 
@@ -189,4 +194,5 @@ def presets(setup: LiftSetup) -> Presets:
         "isaac": functools.partial(isaac, setup=setup),
         "sim2real": functools.partial(sim2real, setup=setup),
         **{name: functools.partial(factory, setup=setup) for name, factory in SEEN.items()},
+        "sim2real_rgb": functools.partial(sim2real_rgb, setup=setup),
     }

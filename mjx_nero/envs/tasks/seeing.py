@@ -1,7 +1,7 @@
 """Tasks seen through cameras: pictures replace the observations of objects.
 
-The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``. A teacher that is told the objects'
-positions trains a student that is not (``learn.distill``).
+The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``; lifts also have ``sim2real_rgb``. A teacher
+that is told the objects' positions trains a student that is not (``learn.distill``).
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ from mjx_nero.types import UserError
 
 SIZE = (64, 64)  # pixels
 DISTRACTORS = 6
+PATTERNS = 12  # of ``lifelike``
 STEPS, STEPS_ON_CPU = 20_000_000, 200_000  # env steps of a training run
 _READS = {"rgb": (images.rgb, ("rgb",)), "depth": (images.depth, ("depth",)), "rgbd": (images.rgbd, ("rgb", "depth"))}
 FIXED = "_fixed"  # suffix of a preset whose episodes all look the same
@@ -108,6 +109,18 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
         },
         sensors={**cfg.sensors, **{f"lens_{name}": Term(images.Lens, params={"camera": name, **lens}) for name in scene.cameras}},
     )
+
+
+def lifelike(cfg: EnvCfg) -> EnvCfg:
+    """A task of ``tasks.sim2real`` seen through cameras: all that differs there, the random look, and patterns on everything.
+
+    It has no curriculum, because the teacher knows all of it from the start.
+    """
+    objects, curriculum = cfg.scene.objects, dataclasses.replace(cfg.curriculum, levels=None)
+    told = {name: term for name, term in cfg.sensors.items() if name not in objects}  # nobody says where objects are
+    cfg = seen(dataclasses.replace(cfg, sensors=told, curriculum=curriculum))
+    budget = dataclasses.replace(cfg.budget, steps=3 * STEPS)
+    return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, patterns=PATTERNS), budget=budget)
 
 
 def _beside(there: Box, base: tuple[float, float, float], side: str) -> dict[str, Range]:

@@ -17,7 +17,8 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
     """Finds the teacher's policy.
 
     Args:
-        given: the policy's file; empty: the bundled policy with the same robot, observations and actions.
+        given: the policy's file; empty: the bundled policy with the same robot, observations and actions, that of the preset
+            ``sim2real`` where actions are late.
 
     Raises:
         UserError: there is no such policy, or it does not fit.
@@ -30,10 +31,11 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
             raise UserError(f"{given} cannot teach here: {fault}")
         return found
     bundled = [(checkpoint.load_meta(path), path) for path in sorted((ASSETS / "policies").glob("*.safetensors"))]
-    able = [path for meta, path in bundled if meta["preset"] == "default" and not _misfit(meta, env)]
+    wanted = "sim2real" if "delay" in env.cfg.actions else "default"
+    able = [path for meta, path in bundled if meta["preset"] == wanted and not _misfit(meta, env)]
     if not able:
         raise UserError(
-            f"no bundled policy can teach {env.cfg.robot.name} this task: train one with the task's default preset, and pass "
+            f"no bundled policy can teach {env.cfg.robot.name} this task: train one with the task's preset {wanted}, and pass "
             "--distill.teacher RUN/policy.safetensors"
         )
     return policy.load(able[0])

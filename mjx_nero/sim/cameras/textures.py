@@ -16,7 +16,7 @@ EDGE = 256  # pixels of a photograph's longer edge, at most
 MOST = 200  # photographs of a folder
 _BYTES = 50_000_000  # of a file
 _ENDINGS = (".png", ".jpg", ".jpeg")
-_TIMES = 2.0  # a photograph along each edge of a box: a camera sees but a part of a wall
+_TIMES = 2.0  # along each edge of a box: a camera sees but a part of a wall
 _TILE = 64  # pixels of a pattern's edge, which is repeated
 
 
@@ -31,16 +31,16 @@ def add(spec: mujoco.MjSpec, folder: str, patterns: int) -> None:
         UserError: there are no photographs in the folder, or one cannot be read.
     """
     for i, picture in enumerate(photographs(pathlib.Path(folder)) if folder else ()):
-        _material(spec, f"{PHOTO}{i}", picture, uniform=False, repeat=_TIMES)
+        _material(spec, f"{PHOTO}{i}", picture)
     for i in range(patterns):
-        _material(spec, f"{PATTERN}{i}", pattern(i), uniform=True, repeat=4.0 * 1.5 ** (i % 5))
+        _material(spec, f"{PATTERN}{i}", pattern(i))
 
 
-def _material(spec: mujoco.MjSpec, name: str, picture: np.ndarray, uniform: bool, repeat: float) -> None:
+def _material(spec: mujoco.MjSpec, name: str, picture: np.ndarray) -> None:
     height, width, _ = picture.shape
     made: Any = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3)
     made.data = np.ascontiguousarray(picture).tobytes()
-    material = spec.add_material(name=name, texuniform=uniform, texrepeat=[repeat, repeat])
+    material = spec.add_material(name=name, texrepeat=[_TIMES, _TIMES], specular=0.0)  # both renderers shine through it unlike
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 

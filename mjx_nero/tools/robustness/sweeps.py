@@ -7,6 +7,7 @@ from typing import Any
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.tasks import sim2real
 from mjx_nero.mdp.terms import Term
+from mjx_nero.tools.robustness import seen
 
 ALL = "all at once"
 
@@ -19,11 +20,13 @@ class Point:
         terms: of randomization, with ranges of no width; or, of all at once, with the preset's.
         delay: of the actions [control steps], the least and the most.
         offset: of where objects are seen, along each axis at most [m].
+        look: what the world looks like, in a task with cameras.
     """
 
     terms: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     delay: tuple[int, int] = (0, 0)
     offset: float = 0.0
+    look: seen.Look = seen.Look()
 
 
 # Parameter -> (term of the preset, its parameter, values). The object is the first of the scene.
@@ -56,8 +59,9 @@ def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Point]]]:
     for name, (term, parameter, values) in _FIELDS.items():
         if (term := term.format(object=(things or [""])[0])) in terms:
             out[name] = [(v, Point({term: _only(terms[term], {parameter: (v, v)})})) for v in values]
+    out |= {name: [(value, Point(look=look)) for value, look in points] for name, points in seen.sweeps(cfg).items()}
     out["action delay [control steps]"] = [(steps, Point(delay=(steps, steps))) for steps in _DELAYS]
-    if things:
+    if things and not cfg.scene.cameras:  # who sees is not told
         out["objects seen off by [m]"] = [(offset, Point(offset=offset)) for offset in _OFFSETS]
     out[ALL] = [(width, _wide(terms, width)) for width in (0.0, 0.5, 1.0, 1.5)]
     return out
