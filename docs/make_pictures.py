@@ -1,7 +1,8 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
-docs/gallery/, an episode of every environment, and docs/failures/, three failures of tasks that fall short. A name makes one.
+docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, and docs/failures/, three failures of tasks
+that fall short. A name makes one.
 """
 
 import dataclasses
@@ -28,6 +29,7 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
     "thousand": (1000, (640, 360), 5, 45),
 }
 
+SEEING = ("nero_lift", "piper_lift")  # have bundled policies of the preset rgb
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
@@ -66,6 +68,13 @@ def gallery(folder: pathlib.Path) -> None:
         film(folder / f"{name}.webp", played, np.argmax(played.episodes.success, keepdims=True))
 
 
+def seeing(folder: pathlib.Path) -> None:
+    """The same of the policies that act on pictures, which are in the corner."""
+    for name in SEEING:
+        played = evaluation.play(evaluation.EvalCfg(name, preset="rgb", episodes=4, record=4, backend="mujoco"))
+        film(folder.with_name("gallery") / f"{name}_rgb.webp", played, np.argmax(played.episodes.success, keepdims=True))
+
+
 def failures(folder: pathlib.Path) -> None:
     """The first three of 200 episodes that fail, one after another, as ``eval.py --failures`` shows them."""
     for name in FALL_SHORT:
@@ -81,15 +90,17 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
     with render.Renderer(played.env.mj_model, 640, 480, samples=0, shadows=1024) as renderer:
         for k in range(len(which)):
             for t in range(0, len(shown.qpos), every):
-                frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.scenery[t, k]))
-                frames.append(frame.resize((320, 240), Image.Resampling.BOX))
+                frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.scenery[t, k])).resize(
+                    (320, 240), Image.Resampling.BOX
+                )
+                frames.append(Image.fromarray(render.inset(np.array(frame), [each[t, k] for each in shown.pictures])))
     write(path, frames, every * played.env.dt, 35)
 
 
 def main() -> None:
     """All pictures, or those named."""
     cli.setup_jax()
-    folders = {"gallery": gallery, "failures": failures}
+    folders = {"gallery": gallery, "seeing": seeing, "failures": failures}
     for name in sys.argv[1:] or (*folders, *PICTURES):
         if name in folders:
             folders[name](HERE / name)
