@@ -14,9 +14,9 @@ import mjx_nero
 from mjx_nero.sim import render
 
 ROOT = pathlib.Path(__file__).parents[1]
-NAMES = ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm", "04_onto_the_arm")
+NAMES = ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm", "04_onto_the_arm", "05_what_it_sees")
 NOTEBOOKS = tuple(ROOT / "notebooks" / f"{name}.ipynb" for name in NAMES)
-NERO_LIFT, COBOTTA_MOTION, OWN_ARM, ONTO_ARM = NOTEBOOKS
+NERO_LIFT, COBOTTA_MOTION, OWN_ARM, ONTO_ARM, SEES = NOTEBOOKS
 STEPS = 12_288  # 8 iterations of PPO with the first notebook's 64 environments
 ARM_STEPS = 245_760  # 80 with the third's 128: most reaches succeed
 
@@ -74,6 +74,7 @@ PICTURES = {
     COBOTTA_MOTION: (5, 3),
     OWN_ARM: (3, 2),
     ONTO_ARM: (2, 0),
+    SEES: (2, 3),
 }  # plotted always, drawn where the machine can draw
 
 
@@ -220,3 +221,16 @@ def test_onto_the_arm_finds_the_delay_and_succeeds(onto_outputs):
     assert _figure(r"delay found: (\d+) ms", text) == pytest.approx(40, abs=2)
     assert _figure(r"identified: off by ([\d.]+) mrad", text) < 1
     assert _figure(r"softer and late drives: (\d+)%", text) < 50 < _figure(r"that was found: (\d+)%", text)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _can_draw(), reason="no offscreen OpenGL here")
+def test_the_policy_of_the_notebook_sees_and_goes_blind(tmp_path):
+    outputs = _run(SEES, tmp_path)
+    _check(outputs, SEES)  # how far it is off, what makes it blind; first pictures, where it looks, the worst seen
+    text = _text(outputs)
+    assert _figure(r"success rate over 3 episodes: ([\d.]+)", text) > 0.5
+    assert _figure(r"cube seen off by: (\d+) mm at the start", text) < 40
+    near = _figure(r"light .* 1: (\d+) mm", text)
+    assert _figure(r"light \[factor\]: 0.1: (\d+) mm", text) > 1.5 * near
+    assert _figure(r"knocked .* 8: (\d+) mm", text) > 1.5 * _figure(r"knocked by \[pixels\]: 0: (\d+) mm", text)

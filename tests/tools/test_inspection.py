@@ -12,9 +12,11 @@ from rich.console import Console
 import mjx_nero
 from mjx_nero.envs import registry
 from mjx_nero.sim import robot_file
+from mjx_nero.sim.cameras import opengl
 from mjx_nero.sim.robot import GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools import inspection
+from mjx_nero.tools.inspection import cameras
 from mjx_nero.types import UserError
 
 NERO, COBOTTA = (registry.robot(name) for name in ("nero", "cobotta_pro_900"))
@@ -280,3 +282,12 @@ def test_an_environment_that_fails_is_not_taken_for_one_without_a_robot(monkeypa
 def test_unknown_names_list_the_known_ones():
     with pytest.raises(UserError, match="choose one of .*nero, .*nero_lift.*, or the folder of a robot"):
         inspection.find("something")
+
+
+def test_a_sheet_of_pictures_draws_each_once(monkeypatch):
+    """Sixty-four states by two cameras; the steps between them draw nothing."""
+    drawn = []
+    monkeypatch.setattr(opengl.OpenGL, "_draw_rows", lambda self, rows, images: drawn.append(len(rows)))
+    seen = cameras.see(registry.env_cfg("nero_lift", "rgb"))
+    assert sum(drawn) == 64
+    assert {name: each.rgb.shape for name, each in seen.pictures.items()} == dict.fromkeys(("front", "wrist"), (64, 64, 64, 3))

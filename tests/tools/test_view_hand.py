@@ -119,6 +119,22 @@ def test_a_tape_shows_what_was_recorded(shown, tmp_path):
     session.recorders.clear()
 
 
+def test_what_the_hand_did_is_played_again_in_physics(shown, tmp_path, call):
+    """The hand stands still, so a start at rest comes to the same."""
+    session, _, _ = shown
+    session.recorders.clear()
+    recording = Recording(session, tmp_path / "d", "nero_lift", "default", "arrays", fields={"episode_length_s": 3.0})
+    session.reset()
+    recording.begin()
+    for _ in range(10):
+        session.step()
+    recording.save()
+    session.recorders.clear()
+    code, out, err = call("mjx_nero", "demos", "--replay", tmp_path / "d")
+    assert code == 0 and "episode 0 (number 0): 10 steps, succeeds" in out, err
+    assert float(out.split("differs by at most ")[1].split()[0]) < 0.02
+
+
 def test_corrections_are_recorded_while_the_user_steers(tmp_path):
     """Taking over begins an episode, giving back saves it; what the policy does by itself is not in it."""
     page = view.open_view(env_name="nero_lift", agent="zero", port=18500, demos=tmp_path / "d")

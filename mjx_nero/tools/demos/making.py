@@ -190,7 +190,7 @@ def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
     about: dict[str, Any] = dict(schema.about)
     robot = about.get("robot_folder") or about["robot"]
     cfg = registry.env_cfg(about["env"], about["preset"], robot).uncorrupted()
-    cfg = config.override(cfg, about["env_fields"])
+    cfg = config.override(cfg, about.get("env_fields", {}))
     return ManipulationEnv(by_drives(cfg, about["through"]) if drives or about["through"] == "drives" else cfg, impl="native")
 
 

@@ -1,10 +1,12 @@
 """Plays an episode of a data set again: the drives are told what they were told, and physics has to come to the same."""
 
+import dataclasses
 import pathlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import State
 
 from mjx_nero import console
 from mjx_nero.data import Dataset, Episode, open_dataset, units
@@ -49,7 +51,8 @@ def _episode(found: Dataset, index: int) -> Episode:
     """
     if names.QPOS not in found.schema.features:
         raise UserError("this data set has no positions of the physics: it is not of an environment here")
-    return found.episodes((names.EXECUTED, names.QPOS))[index]
+    known = [name for name in (names.EXECUTED, names.QPOS, names.ENVIRONMENT) if name in found.schema.features]
+    return found.episodes(known)[index]
 
 
 def again(env: ManipulationEnv, found: Dataset, episode: Episode) -> tuple[np.ndarray, Scenery]:
@@ -58,14 +61,26 @@ def again(env: ManipulationEnv, found: Dataset, episode: Episode) -> tuple[np.nd
     Args:
         env: by drive targets.
     """
-    about = found.schema.about
-    targets = units.from_json(about["units"]).positions(episode.arrays[names.EXECUTED])
+    targets = units.from_json(found.schema.about["units"]).positions(episode.arrays[names.EXECUTED])
 
     @jax.jit
     def play(targets):
         def step(state, target):
             return env.step(state, target), (state.pipeline_state.qpos, env.scenery(state))
 
-        return jax.lax.scan(step, start(env, episode.number, about["seed"]), targets)[1]
+        return jax.lax.scan(step, _begin(env, found, episode), targets)[1]
 
     return jax.device_get(play(jnp.asarray(targets, jnp.float32)))
+
+
+def _begin(env: ManipulationEnv, found: Dataset, episode: Episode) -> State:
+    """The state in which an episode starts; that of a user's hand, which no seed draws, at rest where the recording begins."""
+    about = found.schema.about
+    if "seed" in about:
+        return start(env, episode.number, about["seed"])
+    state = env.reset(jax.random.PRNGKey(0))
+    at = found.schema.features[names.ENVIRONMENT].names.index("goal.x")
+    pos, quat = np.split(episode.arrays[names.ENVIRONMENT][0, at : at + 7], [3])
+    carry = state.info["carry"].replace(command=pos - np.asarray(env.cfg.robot.base_pos, np.float32), command_quat=quat)
+    sim = dataclasses.replace(state.pipeline_state, qpos=jnp.asarray(episode.arrays[names.QPOS][0]))
+    return state.replace(pipeline_state=sim, info={**state.info, "carry": carry})

@@ -9,6 +9,7 @@ import numpy as np
 from mjx_nero import console
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
+from mjx_nero.mdp.images import Lens
 from mjx_nero.sim.cameras import places
 
 WORLDS = 32
@@ -38,9 +39,12 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
     """
     found = cfg.scene.cameras or places.find(cfg.robot)
     found = {name: dataclasses.replace(c, kinds=tuple({*c.kinds, "rgb", "segmentation"})) for name, c in found.items()}
-    env = ManipulationEnv(
-        dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, cameras=found)), impl=impl, num_envs=WORLDS
-    )
+    # Neither observations nor lenses look at pictures here, so that steps draw none.
+    told = {name: group for name, group in cfg.observations.items() if not group.apart}
+    sensors = {name: term for name, term in cfg.sensors.items() if not isinstance(term.made, Lens)}
+    seen = dataclasses.replace(cfg.scene, cameras=found)
+    cfg = dataclasses.replace(cfg, scene=seen, observations=told, sensors=sensors)
+    env = ManipulationEnv(cfg, impl=impl, num_envs=WORLDS)
     step, draw = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(lambda state: env.view(state).cameras))
     state, shots = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(seed), WORLDS)), []
     aim: Any = None

@@ -191,7 +191,7 @@ def open_view(
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
     if demos and episode is not None:
         sim.replay(tape.of_dataset(demos, episode, sim.frame))
-    recording = hand.Recording(sim, demos, env_name, preset) if demos else None
+    recording = hand.Recording(sim, demos, env_name, preset, fields=overrides) if demos else None
     return _served(sim, makers, chosen, recording, leader, (host, port), run, env_name)
 
 

@@ -2,7 +2,7 @@
 
 import pathlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -124,10 +124,18 @@ class Recording:
 
     Args:
         out: folder of the data set.
-        env_name, preset: what the session plays.
+        env_name, preset, fields: what the session plays.
     """
 
-    def __init__(self, session: Session, out: pathlib.Path, env_name: str, preset: str, form: str = "lerobot"):
+    def __init__(
+        self,
+        session: Session,
+        out: pathlib.Path,
+        env_name: str,
+        preset: str,
+        form: str = "lerobot",
+        fields: Mapping[str, Any] | None = None,
+    ):
         self._session, self._out, self._form = session, out, form
         env = session.env
         self._units = making.units_of(env, "auto")
@@ -137,6 +145,7 @@ class Recording:
             "preset": preset,
             "robot": env.cfg.robot.name,
             "robot_folder": env.cfg.robot.folder,
+            "env_fields": {key: str(value) for key, value in (fields or {}).items()},
             "agent": NAME,
             "through": "task",
             "actions": "joints",
