@@ -180,6 +180,9 @@ def test_a_training_writes_what_the_view_follows(call, tmp_path):
         ),
         (["--run", "."], ". is not the folder of a training"),
         (["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
+        (["--episode", "1"], "--episode is of a data set: pass --demos DIR, too"),
+        (["--leader", "/dev/null"], "--leader needs --calibration: LeRobot's file of the leader"),
+        (["--demos", "nowhere", "--episode", "0"], "nowhere holds no demonstrations of mjx_nero"),
     ],
 )
 def test_mistakes_are_one_line(call, argv, message):

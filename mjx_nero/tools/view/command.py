@@ -53,6 +53,8 @@ def main(argv: Sequence[str]) -> None:
     from mjx_nero.tools.view import leader
 
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    if args.episode is not None and not args.demos:
+        raise UserError("--episode is of a data set: pass --demos DIR, too")
     given = parser.given(argv)  # else what the run says
     serve(
         env_name=args.env if "env" in given else None,

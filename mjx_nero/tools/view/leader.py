@@ -18,6 +18,7 @@ import numpy as np
 from mjx_nero import math
 from mjx_nero.data.units import LEROBOT
 from mjx_nero.deploy.arm import ArmError, Feedback
+from mjx_nero.deploy.guard import WallClock
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
@@ -59,21 +60,9 @@ def at(port: str, calibration: pathlib.Path | None) -> Readable:
         import serial  # noqa: F401
     except ModuleNotFoundError:
         raise UserError("--leader needs pyserial, of the extra 'deploy': pip install 'mjx-nero[deploy]'") from None
-    made = so_leader.of(description.robot(registry.robot(_MODEL)), port, calibration, Clock())
+    made = so_leader.of(description.robot(registry.robot(_MODEL)), port, calibration, WallClock())
     made.connect()
     return made
-
-
-class Clock:
-    """The wall's."""
-
-    def now(self) -> float:
-        """[s]."""
-        return time.monotonic()
-
-    def sleep_until(self, at: float) -> None:
-        """Waits."""
-        time.sleep(max(0.0, at - self.now()))
 
 
 def same_joints(env: ManipulationEnv) -> bool:
