@@ -34,11 +34,12 @@ class Panel:
 @pytest.fixture
 def arm(tmp_path):
     """An emulated leader at its port, and its plant, which a test puts where a person would."""
-    robot = registry.robot("so_arm101")
+    cfg = registry.env_cfg("so101_reach")
+    robot = cfg.robot
     told = json.loads(json.dumps(description.robot(robot)))
     entries = emulated.calibration(told, "so101")
     (tmp_path / "leader.json").write_text(json.dumps(entries))
-    plant = Plant(scene.robot_model(robot), robot.joints, np.array(robot.home), Clock())
+    plant = Plant(scene.build(robot, cfg.scene, cfg.sim, visuals=False), robot.joints, np.array(robot.home), Clock())
     servos = emulated.servos_of(told, "so101", entries, plant)
     servos.faults.turnaround = 0.0
     port, over = emulated.Port(servos), threading.Event()
