@@ -84,14 +84,16 @@ def test_an_episode_may_end_with_its_success(call, tmp_path):
         code, _, err = call("mjx_nero", "demos", *argv, *flags)
         assert code == 0, err
     cfg = registry.env_cfg("nero_reach")
-    near, hold = cfg.success.condition.params["threshold"], round(0.1 / (cfg.sim.dt * cfg.sim.decimation))
+    met, hold = cfg.success.condition.params, round(0.1 / (cfg.sim.dt * cfg.sim.decimation))
     whole, early = (open_dataset(tmp_path / name) for name in ("whole", "early"))
     assert early.numbers.tolist() == list(range(7)) and early.success.sum() >= 6
     at = [early.schema.features[names.ENVIRONMENT].names.index(f"{thing}.x") for thing in ("hand", "goal")]
     for one, part in zip(whole.episodes(), early.episodes(), strict=True):
         poses = one.arrays[names.ENVIRONMENT]
-        away = np.linalg.norm(poses[1:, at[0] : at[0] + 3] - poses[1:, at[1] : at[1] + 3], axis=1)  # after each step
-        held = np.convolve(away < near, np.ones(hold))[: len(away)] == hold
+        hand, goal = (poses[1:, i : i + 7] for i in at)  # after each step
+        there = np.linalg.norm(hand[:, :3] - goal[:, :3], axis=1) < met["threshold"]
+        there &= 2 * np.arccos(np.clip(np.abs((hand[:, 3:] * goal[:, 3:]).sum(1)), 0, 1)) < met["angle"]
+        held = np.convolve(there, np.ones(hold))[: len(there)] == hold
         length = int(held.argmax()) + 1 if held.any() else len(one)
         assert len(part) == length and part.success == (held.any() or one.success)
         for name in (names.QPOS, names.EXECUTED, names.SEEN, names.REWARD):

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("viser")
 
-from pages import wait
+from pages import controls, wait
 
 import mjx_nero
 from mjx_nero.data import episode as names
@@ -140,6 +140,7 @@ def test_corrections_are_recorded_while_the_user_steers(tmp_path):
     page = view.open_view(env_name="nero_lift", agent="zero", port=18500, demos=tmp_path / "d")
     try:
         hands = page.hands
+        assert {"Record (R)", "Discard (D)", "Replay (P)", "Save (S)", "Give back"} <= set(controls(page))
         hands._when.value = hand_panel.WHEN[1]
         recording, session = hands._recording, page.session
         wait(lambda: session.frame.step > 2)

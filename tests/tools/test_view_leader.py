@@ -100,7 +100,7 @@ def test_an_so_arm_does_with_its_joints_what_the_leader_does(arm):
     session.play(leader.agent(env), panel.parameters[leader.NAME]())
     for _ in range(80):
         session.step()
-    np.testing.assert_allclose(session.frame.qpos[0, :6], wanted, atol=0.03)
+    np.testing.assert_allclose(session.frame.qpos[0, :5], wanted[:5], atol=0.03)  # a reach leaves the gripper
     read.close()
 
 

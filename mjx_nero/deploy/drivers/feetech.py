@@ -5,6 +5,7 @@ Registers and signs are those of huggingface/lerobot, ``src/lerobot/motors/feete
     0xFF 0xFF id length instruction-or-error parameters checksum,   checksum = ~(id + length + ... + parameters) & 0xFF
 """
 
+import termios
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -132,7 +133,7 @@ class Bus:
         try:
             self._port.reset_input_buffer()
             self._port.write(request)
-        except OSError as error:  # pyserial's are
+        except (OSError, termios.error) as error:  # pyserial's are, but for that of emptying a port that is gone
             raise ArmError(f"the port is gone: {error}") from None
 
     def _ask(self, servos: Sequence[int], request: bytes, size: int) -> dict[int, bytes]:

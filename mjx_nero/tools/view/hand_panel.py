@@ -55,7 +55,7 @@ class HandPanel:
             if leader:
                 self._button("Follow the leader arm (L)", leader)
                 self._key("follow the leader arm", "L", leader)
-            if recording:
+            if recording is not None:  # one without steps counts as false
                 self._when = gui.add_dropdown("Record", WHEN, initial_value=WHEN[0])
                 for label, key, work in self._recorder(recording):
                     self._button(f"{label} ({key})", work)
@@ -67,7 +67,7 @@ class HandPanel:
             self._key(f"turn the hand by {degrees:g} degrees", key, lambda degrees=degrees: hand.turn(degrees))  # type: ignore[misc]
         self._key("open or close the gripper", "space", self._grip)
         buttons = {gamepad.GRIP: self._grip, gamepad.BACK: self.give_back}
-        if recording:
+        if recording is not None:
             buttons |= {gamepad.RECORD: recording.begin, gamepad.SAVE: self._save, gamepad.DISCARD: recording.discard}
         self.gamepad = gamepad.Gamepad(hand, orders, buttons)
 
@@ -86,7 +86,7 @@ class HandPanel:
         if self._panel.agent.value not in OWN:
             self._before = self._panel.agent.value
         self._panel.agent.value = name
-        if mine := self._of_corrections:
+        if (mine := self._of_corrections) is not None:
             mine.begin()
         return True
 
@@ -94,7 +94,7 @@ class HandPanel:
         """Whoever acted before does so again, as after a policy's error that the user has mended."""
         if self._panel.agent.value in OWN and self._before not in OWN:
             self._panel.agent.value = self._before
-            if (mine := self._of_corrections) and len(mine):
+            if self._of_corrections:
                 self._save()
 
     @property
