@@ -158,8 +158,7 @@ class Drift:
 
 @pytest.fixture(scope="module")
 def drift():
-    if "drift" not in physics.impls():
-        register(physics_backends={"drift": Drift})
+    register(physics_backends={"drift": Drift})
     return "drift"
 
 
