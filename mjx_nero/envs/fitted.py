@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -132,6 +132,17 @@ FITTING: dict[str, Presets] = {
     "place": _presets(_tower, **place.presets()),
     "stack": _presets(_tower, **stack.presets()),
 }
+
+
+def envs(prefix: str, robot: RobotCfg, own: Mapping[str, Presets], **others: RobotCfg) -> Envs:
+    """Lists an arm's environments: its ``own`` tasks, then those of ``FITTING`` that it does not bring itself.
+
+    Args:
+        others: by task, a robot that differs from the arm's usual one, such as other drives.
+    """
+    return {f"{prefix}_{task}": (others.get(task, robot), presets) for task, presets in {**own, **FITTING, **own}.items()}
+
+
 ENVS: Envs = {
     "reach": (None, reach.presets()),
     "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real, **lift.SEEN)),

@@ -103,11 +103,14 @@ def with_recipe(presets: Presets) -> Presets:
     return {**presets, "isaac": isaac}
 
 
-ENVS: Envs = {
-    "so100_lift": (SO_ARM100, with_recipe(lift.presets(LIFT))),
-    "so100_reach": (SO_ARM100, with_recipe(reach.presets(REACH))),
-    "so100_reach_obstacles": (SO_ARM100, reach_obstacles.presets(REACH_OBSTACLES)),
-    "so100_lift_obstacles": (SO_ARM100, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"so100_{task}": (SO_ARM100, presets) for task, presets in fitted.FITTING.items()},
-    "so100_stack": (SO_ARM100, STACK),
-}
+ENVS: Envs = fitted.envs(
+    "so100",
+    SO_ARM100,
+    {
+        "lift": with_recipe(lift.presets(LIFT)),
+        "reach": with_recipe(reach.presets(REACH)),
+        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
+        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
+        "stack": STACK,
+    },
+)

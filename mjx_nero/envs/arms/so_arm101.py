@@ -27,11 +27,14 @@ LIFT = lift.LiftSetup(
 )
 REACH = reach.ReachSetup(scene=reach.scene(SCENE))
 
-ENVS: Envs = {
-    "so101_lift": (SO_ARM101, with_recipe(lift.presets(LIFT))),
-    "so101_reach": (SO_ARM101, with_recipe(reach.presets(REACH))),
-    "so101_reach_obstacles": (SO_ARM101, reach_obstacles.presets(REACH_OBSTACLES)),
-    "so101_lift_obstacles": (SO_ARM101, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"so101_{task}": (SO_ARM101, presets) for task, presets in fitted.FITTING.items()},
-    "so101_stack": (SO_ARM101, STACK),
-}
+ENVS: Envs = fitted.envs(
+    "so101",
+    SO_ARM101,
+    {
+        "lift": with_recipe(lift.presets(LIFT)),
+        "reach": with_recipe(reach.presets(REACH)),
+        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
+        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
+        "stack": STACK,
+    },
+)

@@ -12,16 +12,7 @@ import numpy as np
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
-from mjx_nero.mdp.terms import (
-    ONCE,
-    CommandTerm,
-    DoneTerm,
-    ObservationGroup,
-    ObservationTerm,
-    RewardTerm,
-    Term,
-    privileged,
-)
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg

@@ -9,19 +9,11 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, step_weights, velocity_actions
 from mjx_nero.envs.tasks import seeing
 from mjx_nero.envs.tasks import sim2real as sim2reals
-from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import (
-    CommandTerm,
-    DoneTerm,
-    ObservationGroup,
-    ObservationTerm,
-    RewardTerm,
-    Term,
-    privileged,
-)
+from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -109,12 +101,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum=CurriculumCfg(
-            weights={
-                "action_rate": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-                "joint_vel": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-            }
-        ),
+        curriculum=CurriculumCfg(weights=step_weights(10_000, action_rate=-1e-1, joint_vel=-1e-1)),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
