@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -134,13 +135,25 @@ FITTING: dict[str, Presets] = {
 }
 
 
-def envs(prefix: str, robot: RobotCfg, own: Mapping[str, Presets], **others: RobotCfg) -> Envs:
-    """Lists an arm's environments: its ``own`` tasks, then those of ``FITTING`` that it does not bring itself.
+# The tasks of which an arm may bring its own numbers.
+SETUPS: dict[type, tuple[str, Callable[..., Presets]]] = {
+    lift.LiftSetup: ("lift", lift.presets),
+    reach.ReachSetup: ("reach", reach.presets),
+    follow_target.FollowTargetSetup: ("follow_target", follow_target.presets),
+    pick_place.PickPlaceSetup: ("pick_place", pick_place.presets),
+    reach_obstacles.ReachObstaclesSetup: ("reach_obstacles", reach_obstacles.presets),
+    lift_obstacles.LiftObstaclesSetup: ("lift_obstacles", lift_obstacles.presets),
+}
+
+
+def envs(prefix: str, robot: RobotCfg, *setups: Any, **others: RobotCfg) -> Envs:
+    """Lists an arm's environments: those of its setups, then those of ``FITTING``.
 
     Args:
-        others: by task, a robot that differs from the arm's usual one, such as other drives.
+        others: by task, a robot that differs from the arm's usual one, such as one with other drives.
     """
-    return {f"{prefix}_{task}": (others.get(task, robot), presets) for task, presets in {**own, **FITTING, **own}.items()}
+    own = {name: presets(setup) for setup in setups for name, presets in [SETUPS[type(setup)]]}
+    return {f"{prefix}_{task}": (others.get(task, robot), presets) for task, presets in {**own, **FITTING}.items()}
 
 
 ENVS: Envs = {

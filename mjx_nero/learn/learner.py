@@ -113,6 +113,15 @@ class Kind:
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
 
 
+def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:
+    """Repeats an iteration, as ``Learner.run`` does; returns the state and the mean metrics."""
+    import jax  # names and configs do without
+
+    with jax.default_matmul_precision("float32"):
+        state, metrics = jax.lax.scan(lambda s, _: iterate(s), state, length=iterations)
+    return state, {name: value.mean() for name, value in metrics.items()}
+
+
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
 KINDS: Registry[Kind | str] = Registry(

@@ -110,15 +110,4 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.4, 0.55), (-0.28, -0.2)), goal=((0.4, 0.55), (0.18, 0.28), (0.2, 0.35)), top=0.25, scene=LIFT.scene
 )
 
-ENVS: Envs = fitted.envs(
-    "cobotta",
-    COBOTTA_PRO_900,
-    {
-        "lift": lift.presets(LIFT),
-        "reach": reach.presets(REACH),
-        "follow_target": follow_target.presets(FOLLOW_TARGET),
-        "pick_place": pick_place.presets(PICK_PLACE),
-        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
-        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
-    },
-)
+ENVS: Envs = fitted.envs("cobotta", COBOTTA_PRO_900, LIFT, REACH, FOLLOW_TARGET, PICK_PLACE, REACH_OBSTACLES, LIFT_OBSTACLES)

@@ -86,14 +86,12 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
 ENVS: Envs = fitted.envs(
     "nero",
     NERO,
-    {
-        "lift": lift.presets(LIFT),
-        "reach": reach.presets(REACH),
-        "follow_target": follow_target.presets(FOLLOW_TARGET),
-        "pick_place": pick_place.presets(PICK_PLACE),
-        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
-        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
-    },
+    LIFT,
+    REACH,
+    FOLLOW_TARGET,
+    PICK_PLACE,
+    REACH_OBSTACLES,
+    LIFT_OBSTACLES,
     reach=REACH_NERO,
     reach_obstacles=REACH_NERO,
 )

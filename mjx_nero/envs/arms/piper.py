@@ -55,14 +55,4 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.2, 0.26), (-0.22, -0.16)), goal=((0.28, 0.36), (0.14, 0.22), (0.18, 0.28)), top=0.18, scene=LIFT.scene
 )
 
-ENVS: Envs = fitted.envs(
-    "piper",
-    PIPER,
-    {
-        "lift": lift.presets(LIFT),
-        "reach": reach.presets(REACH),
-        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
-        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
-    },
-    reach=REACH_PIPER,
-)
+ENVS: Envs = fitted.envs("piper", PIPER, LIFT, REACH, REACH_OBSTACLES, LIFT_OBSTACLES, reach=REACH_PIPER)

@@ -2,10 +2,9 @@
 
 import dataclasses
 
-from mjx_nero.envs import fitted
-from mjx_nero.envs.arms.so_arm100 import LIFT_OBSTACLES, REACH_OBSTACLES, SCENE, SO_ARM100, STACK, with_recipe
+from mjx_nero.envs.arms.so_arm100 import SCENE, SO_ARM100, so_arm
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import lift, lift_obstacles, reach, reach_obstacles
+from mjx_nero.envs.tasks import lift, reach
 
 # Mounting and home: the Isaac Lab recipe's.
 ROBOT = SO_ARM101 = dataclasses.replace(
@@ -27,14 +26,4 @@ LIFT = lift.LiftSetup(
 )
 REACH = reach.ReachSetup(scene=reach.scene(SCENE))
 
-ENVS: Envs = fitted.envs(
-    "so101",
-    SO_ARM101,
-    {
-        "lift": with_recipe(lift.presets(LIFT)),
-        "reach": with_recipe(reach.presets(REACH)),
-        "reach_obstacles": reach_obstacles.presets(REACH_OBSTACLES),
-        "lift_obstacles": lift_obstacles.presets(LIFT_OBSTACLES),
-        "stack": STACK,
-    },
-)
+ENVS: Envs = so_arm("so101", SO_ARM101, LIFT, REACH)

@@ -5,6 +5,7 @@ A preset is one list, long or not, and reads as one.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero.config.bounds import Range
@@ -115,7 +116,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
 
 
 def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The preset that learns to grasp. Height and tracking count only for a held cube, and relative positions are observed."""
+    """The preset that learns to grasp. Rewards need a held cube (``carrying``), and relative positions are observed."""
     recipe, held = isaac(robot, setup), setup.held
     state = {
         **arm_state(),
@@ -137,20 +138,30 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
                 },
             ),
         },
-        rewards={
-            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
-            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
-            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
-            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
-            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
-            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
-            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
-            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
-        },
+        rewards=carrying(held),
         curriculum=CurriculumCfg(),
         controllers=setup.controllers(robot),
         training=CALM,
     )
+
+
+def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
+    """Lists rewards for reaching, holding and carrying an object to the goal; height and tracking count only while it is held.
+
+    Args:
+        held: parameters of ``rewards.held``.
+        object: the parameter ``object``, if it is not the cube.
+    """
+    return {
+        "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **object}),
+        "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+        "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
+        "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
+        "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+        "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
+        "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+        "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+    }
 
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
