@@ -101,6 +101,7 @@ class Kind:
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
         differing: (description in a file, the run's own) -> the config's fields that differ, by dotted name, with the file's
             values.
+        graph: a module that draws its policies as ONNX graphs, such as ``imitation.distill.graph``; None: they are PPO's layers.
     """
 
     make: Callable[["Env", Any, int], Learner]
@@ -111,6 +112,7 @@ class Kind:
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
     held: Mapping[str, str] = dataclasses.field(default_factory=dict)
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
+    graph: Any = None
 
 
 def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:
@@ -124,9 +126,8 @@ def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iteratio
 
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
-KINDS: Registry[Kind | str] = Registry(
-    "learner", {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.learn.clone", "distill": "mjx_nero.learn.distill"}
-)
+_OWN = {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.imitation.clone", "distill": "mjx_nero.imitation.distill"}
+KINDS: Registry[Kind | str] = Registry("learner", _OWN)
 
 
 def names() -> tuple[str, ...]:

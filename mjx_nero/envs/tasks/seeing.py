@@ -1,7 +1,7 @@
 """Tasks seen through cameras: pictures replace the observations of objects.
 
 The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``. A teacher that is told the objects'
-positions trains a student that is not (``learn.distill``).
+positions trains a student that is not (``imitation.distill``).
 """
 
 import dataclasses

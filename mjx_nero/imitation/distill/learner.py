@@ -25,10 +25,10 @@ from jaxtyping import Array, Float, Int
 from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
+from mjx_nero.imitation.distill import graph, teachers
+from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
+from mjx_nero.imitation.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.distill import teachers
-from mjx_nero.learn.distill.cfg import ENVS, PRESETS, DistillCfg
-from mjx_nero.learn.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
 from mjx_nero.learn.learner import Kind, Observation, repeated
 from mjx_nero.types import Bank, Key, Shown
 
@@ -218,4 +218,4 @@ _HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
 
 _PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD, graph=graph)
