@@ -48,13 +48,16 @@ import jax.numpy as jnp  # noqa: E402
 from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
-from mjx_nero import __main__  # noqa: E402
+from mjx_nero import __main__, control  # noqa: E402
+from mjx_nero.envs import registry  # noqa: E402
+from mjx_nero.learn import learner  # noqa: E402
+from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
@@ -64,6 +67,19 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if item.get_closest_marker("gpu"):
                 item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def guests_leave():
+    """What a module's tests register is gone when they end: other tests list what the package itself has."""
+    tables = (registry.ROBOTS, registry.ENVS, control.CONTROLLERS, physics.BACKENDS, learner.KINDS)
+    before = [dict(table) for table in tables]
+    yield
+    for table, own in zip(tables, before, strict=True):
+        table.clear()
+        table.update(own)
+    for name in [name for name in sys.modules if name.startswith("mjx_nero_guest_")]:
+        del sys.modules[name]  # so that whoever loads the file again registers again
 
 
 @pytest.fixture(scope="session")

@@ -156,7 +156,7 @@ def _bell(x, width):
     return jnp.exp(-0.5 * (x / width) ** 2)
 
 
-def _boost(p: cfg.TargetCfg | cfg.AxisTargetCfg, distance):
+def _boost(p: cfg.PullCfg, distance):
     beta = _bell(distance, p.proximity_metric_boost_length_scale)
     return beta * p.proximity_metric_boost_scalar + 1.0 - beta
 

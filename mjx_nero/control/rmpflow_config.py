@@ -72,34 +72,34 @@ class JointVelocityCapCfg:
     metric_weight: Gain
 
 
-@dataclasses.dataclass(frozen=True)
-class TargetCfg:
-    """Pull of the frame's origin to its target. The last two keys have no documented effect and none here."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PullCfg:
+    """Pull to a target. The last two keys have no documented effect and none here."""
 
     accel_p_gain: Gain
     accel_d_gain: Gain
+    proximity_metric_boost_scalar: Gain
+    proximity_metric_boost_length_scale: Positive
+    xi_estimator_gate_std_dev: Gain = 20000.0
+    accept_user_weights: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TargetCfg(PullCfg):
+    """Pull of the frame's origin to its target."""
+
     accel_norm_eps: Positive
     metric_alpha_length_scale: Positive
     min_metric_alpha: Share
     max_metric_scalar: Gain
     min_metric_scalar: Gain
-    proximity_metric_boost_scalar: Gain
-    proximity_metric_boost_length_scale: Positive
-    xi_estimator_gate_std_dev: Gain = 20000.0
-    accept_user_weights: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class AxisTargetCfg:
-    """Pull of the frame's axes to the target's. The last two keys have no documented effect and none here."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AxisTargetCfg(PullCfg):
+    """Pull of the frame's axes to the target's."""
 
-    accel_p_gain: Gain
-    accel_d_gain: Gain
     metric_scalar: Gain
-    proximity_metric_boost_scalar: Gain
-    proximity_metric_boost_length_scale: Positive
-    xi_estimator_gate_std_dev: Gain = 20000.0
-    accept_user_weights: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

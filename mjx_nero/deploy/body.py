@@ -24,16 +24,8 @@ def matrix(quat: Vector) -> np.ndarray:
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Multiplies quaternions (wxyz): the turn ``b`` first, then ``a``."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return np.array(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
+    (aw, *av), (bw, *bv) = a, b
+    return np.append(aw * bw - np.dot(av, bv), aw * np.array(bv) + bw * np.array(av) + np.cross(av, bv))
 
 
 def transform(pos: Vector, quat: Vector = STILL) -> np.ndarray:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -132,6 +133,29 @@ FITTING: dict[str, Presets] = {
     "place": _presets(_tower, **place.presets()),
     "stack": _presets(_tower, **stack.presets()),
 }
+
+
+# The tasks of which an arm may bring its own numbers.
+SETUPS: dict[type, tuple[str, Callable[..., Presets]]] = {
+    lift.LiftSetup: ("lift", lift.presets),
+    reach.ReachSetup: ("reach", reach.presets),
+    follow_target.FollowTargetSetup: ("follow_target", follow_target.presets),
+    pick_place.PickPlaceSetup: ("pick_place", pick_place.presets),
+    reach_obstacles.ReachObstaclesSetup: ("reach_obstacles", reach_obstacles.presets),
+    lift_obstacles.LiftObstaclesSetup: ("lift_obstacles", lift_obstacles.presets),
+}
+
+
+def envs(prefix: str, robot: RobotCfg, *setups: Any, **others: RobotCfg) -> Envs:
+    """Lists an arm's environments: those of its setups, then those of ``FITTING``.
+
+    Args:
+        others: by task, a robot that differs from the arm's usual one, such as one with other drives.
+    """
+    own = {name: presets(setup) for setup in setups for name, presets in [SETUPS[type(setup)]]}
+    return {f"{prefix}_{task}": (others.get(task, robot), presets) for task, presets in {**own, **FITTING}.items()}
+
+
 ENVS: Envs = {
     "reach": (None, reach.presets()),
     "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real, **lift.SEEN)),

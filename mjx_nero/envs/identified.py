@@ -8,20 +8,13 @@ from typing import Any
 
 from mjx_nero import files
 from mjx_nero.config import values
-from mjx_nero.config.bounds import LATEST, Positive
+from mjx_nero.config.bounds import LATEST
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.mdp.terms import Term
 from mjx_nero.types import UserError
 
-
-@dataclasses.dataclass(frozen=True)
-class Positives:
-    """A number above zero with its 95% interval."""
-
-    value: Positive
-    low: Positive
-    high: Positive
+DRIVE = ("stiffness", "damping", "armature", "friction")  # numbers of a joint, all above zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +31,10 @@ class Joint:
     """The measured parameters of a joint's drive (see ``identify.plant.Drives``); ``deploy --check`` measures offsets alone."""
 
     offset: Numbers
-    stiffness: Positives | None = None
-    damping: Positives | None = None
-    armature: Positives | None = None
-    friction: Positives | None = None
+    stiffness: Numbers | None = None
+    damping: Numbers | None = None
+    armature: Numbers | None = None
+    friction: Numbers | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +54,10 @@ def read(path: pathlib.Path) -> Identified:
     """
     found = values.read(Identified, files.read_yaml(path), "")
     for name, number in {"delay": found.delay, **_numbers(found)}.items():
-        if not number.low <= number.value <= number.high or abs(number.high) > 1e6 or abs(number.low) > 1e6:
+        least, wanted = (math.ulp(0.0), "0 < low") if name.endswith(DRIVE) else (-1e6, "low")
+        if not least <= number.low <= number.value <= number.high <= 1e6:
             raise UserError(
-                f"{path}: {name} takes low <= value <= high up to 1e6, got {values.short(dataclasses.astuple(number))}"
+                f"{path}: {name} takes {wanted} <= value <= high up to 1e6, got {values.short(dataclasses.astuple(number))}"
             )
     return found
 
@@ -96,13 +90,12 @@ def applied(cfg: EnvCfg) -> EnvCfg:
         )
     joints = [found.joints[name] for name in arm.joints]
     late = dataclasses.replace(cfg, actions=_late(cfg, found.delay))
-    names = ("stiffness", "damping", "armature", "friction")
-    known = [n for n in names if all(getattr(j, n) is not None for j in joints)]
+    known = [n for n in DRIVE if all(getattr(j, n) is not None for j in joints)]
     if not known:
         return late
-    if len(known) < len(names):
-        raise UserError(f"{path} needs {', '.join(names)} of every joint, or of none")
-    ranges = {n: tuple((getattr(j, n).low, getattr(j, n).high) for j in joints) for n in names}
+    if len(known) < len(DRIVE):
+        raise UserError(f"{path} needs {', '.join(DRIVE)} of every joint, or of none")
+    ranges = {n: tuple((getattr(j, n).low, getattr(j, n).high) for j in joints) for n in DRIVE}
     gains: dict[str, Any] = {n: tuple(getattr(j, n).value for j in joints) for n in ("stiffness", "damping")}
     return dataclasses.replace(
         late,

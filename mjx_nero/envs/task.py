@@ -8,7 +8,7 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, observations, success
+from mjx_nero.mdp import actions, curriculum, observations, success
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -40,6 +40,11 @@ def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: Non
         "arm": Term(actions.JointVelocity),
         **(hand if gripper else {}),
     }
+
+
+def step_weights(num_steps: int, **to: float) -> dict[str, Term]:
+    """Lists curriculum terms that give rewards new weights after ``num_steps`` control steps (``mdp.curriculum.step_weight``)."""
+    return {name: Term(curriculum.step_weight, params={"to": weight, "num_steps": num_steps}) for name, weight in to.items()}
 
 
 # Learner settings. Quiet: noise of at most half an action. Calm, for velocities: changing the action costs, too.

@@ -86,6 +86,14 @@ def _starts(progress: Progress) -> Starts:
     return progress.bank, curriculum.chances(progress.last, progress.won, progress.share[0], phases)
 
 
+def begun(env: Env, key: Key, k_phase: Key, num_envs: int, bank: Bank | None) -> State:
+    """Resets a batch from ``for_training``. Episodes start at different phases, so that they do not all end at once."""
+    state = env.reset(jax.random.split(key, num_envs), bank)
+    carry = state.info["carry"]
+    phase = jax.random.randint(k_phase, carry.step.shape, 0, env.unwrapped.episode_length)
+    return state.replace(info={**state.info, "carry": carry.replace(step=phase)})
+
+
 def for_training(env: ManipulationEnv) -> Env:
     """Wraps an environment for training: batched, restarting, with Brax's bookkeeping and, if the task asks, expert starts."""
     made = BraxEpisode(Vectorize(AutoReset(env)))

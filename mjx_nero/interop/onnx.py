@@ -13,8 +13,9 @@ import numpy as np
 
 from mjx_nero.config.bounds import unwrapped
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import description, need, student
+from mjx_nero.interop import description, need
 from mjx_nero.interop.graph import Graph
+from mjx_nero.learn import learner
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.runs.folder import versions
 from mjx_nero.types import UserError
@@ -38,8 +39,9 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
     if isinstance(policy.meta["observation_size"]["state"], dict):
         raise UserError("only a policy that reads one vector can be exported: this one's observations stay apart")
     helper, floats = onnx.helper, onnx.TensorProto.FLOAT
-    drawn, seen = Graph(onnx), student.pictures(policy.meta)
-    (student.build if seen else _build)(policy, drawn)
+    drawn, own = Graph(onnx), _own(policy.meta)
+    seen = own.pictures(policy.meta) if own else {}
+    (own.build if own else _build)(policy, drawn)
     (size,) = policy.meta["observation_size"]["state"]
     inputs = [helper.make_tensor_value_info("observations", floats, ["n", size])]
     for name, (shape, whole) in seen.items():
@@ -52,6 +54,11 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
     helper.set_model_props(made, {name: json.dumps(value) for name, value in metadata(policy, env).items()})
     onnx.checker.check_model(made)
     return made
+
+
+def _own(meta: Mapping[str, Any]) -> Any:
+    """The module by which a learner draws its policies; None: they are PPO's layers."""
+    return learner.find(meta.get("learner", "ppo")).graph
 
 
 def _build(policy: Policy, graph: Graph) -> None:
@@ -127,7 +134,8 @@ def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
 
 def tries(meta: Mapping[str, Any]) -> int:
     """Returns the number of observations of a check: fewer where they are pictures."""
-    return student.TRIES if student.pictures(meta) else 10_000
+    own = _own(meta)
+    return own.TRIES if own else 10_000
 
 
 def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tuple[float, float]:
@@ -146,8 +154,8 @@ def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tu
     normalizer, rng = policy.params[0], np.random.default_rng(seed)
     mean, std = np.asarray(normalizer.mean["state"]), np.asarray(normalizer.std["state"])
     obs = (mean + std * rng.standard_normal((observations, len(mean)))).astype(np.float32)
-    seen = student.random_pictures(policy.meta, observations, rng)
-    act = student.exact(policy) if seen else policy.act
+    own = _own(policy.meta)
+    seen, act = (own.random_pictures(policy.meta, observations, rng), own.exact(policy)) if own else ({}, policy.act)
     given: dict[str, Any] = {"state": jnp.asarray(obs), "pictures": {k.removeprefix("picture_"): v for k, v in seen.items()}}
     ours = np.asarray(act(given))
     theirs, times = np.empty_like(ours), []

@@ -101,6 +101,7 @@ class Kind:
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
         differing: (description in a file, the run's own) -> the config's fields that differ, by dotted name, with the file's
             values.
+        graph: a module that draws its policies as ONNX graphs, such as ``imitation.distill.graph``; None: they are PPO's layers.
     """
 
     make: Callable[["Env", Any, int], Learner]
@@ -111,13 +112,22 @@ class Kind:
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg
     held: Mapping[str, str] = dataclasses.field(default_factory=dict)
     differing: Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]] = lambda there, here: {}
+    graph: Any = None
+
+
+def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:
+    """Repeats an iteration, as ``Learner.run`` does; returns the state and the mean metrics."""
+    import jax  # names and configs do without
+
+    with jax.default_matmul_precision("float32"):
+        state, metrics = jax.lax.scan(lambda s, _: iterate(s), state, length=iterations)
+    return state, {name: value.mean() for name, value in metrics.items()}
 
 
 # The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
-KINDS: Registry[Kind | str] = Registry(
-    "learner", {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.learn.clone", "distill": "mjx_nero.learn.distill"}
-)
+_OWN = {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.imitation.clone", "distill": "mjx_nero.imitation.distill"}
+KINDS: Registry[Kind | str] = Registry("learner", _OWN)
 
 
 def names() -> tuple[str, ...]:

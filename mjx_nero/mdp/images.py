@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
 from mjx_nero.config.bounds import Count, NonNegative, PositiveRange, Share, Steps
-from mjx_nero.mdp.memory import Delay
+from mjx_nero.mdp.memory import delay
 from mjx_nero.types import Key, Picture, UserError, View
 
 _KINDS = ("rgb", "depth", "segmentation")
@@ -83,8 +83,8 @@ class Lens:
         seen = view.cameras[self.camera]
         last = (jnp.zeros((), jnp.int32), seen) if self.every > 1 else ()
         kinds = {kind: image for kind in _KINDS if (image := getattr(seen, kind)) is not None}
-        late = {kind: self._line.init(k_delay, image) for kind, image in kinds.items()} if self._late else {}
-        return key, gain, blur, last, late
+        line = delay(self.delay, self.hold)
+        return key, gain, blur, last, {kind: line.init(k_delay, image) for kind, image in kinds.items()} if line else {}
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
         """Replaces the picture by the one that the camera gives."""
@@ -95,9 +95,10 @@ class Lens:
             count, before = last
             seen = jax.tree.map(lambda new, old: jnp.where(count % self.every == 0, new, old), seen, before)
             last = count + 1, seen
-        passed = {kind: self._line.step(late[kind], getattr(seen, kind)) for kind in late}  # equally late: of one key
-        late = {kind: memory for kind, (memory, _) in passed.items()}
-        seen = dataclasses.replace(seen, **{kind: image for kind, (_, image) in passed.items()})
+        if line := delay(self.delay, self.hold):
+            passed = {kind: line.step(late[kind], getattr(seen, kind)) for kind in late}  # equally late: of one key
+            late = {kind: memory for kind, (memory, _) in passed.items()}
+            seen = dataclasses.replace(seen, **{kind: image for kind, (_, image) in passed.items()})
         return (key, gain, blur, last, late), dataclasses.replace(view, cameras={**view.cameras, self.camera: seen})
 
     def _taken(self, seen: Picture, gain: Array, blur: Array, key: Key) -> Picture:
@@ -117,11 +118,3 @@ class Lens:
             depth = jnp.round(depth / self.depth_step) * self.depth_step if self.depth_step else depth
             depth = jnp.where(jax.random.bernoulli(k_holes, self.holes, depth.shape), 0.0, depth) if self.holes else depth
         return dataclasses.replace(seen, rgb=rgb, depth=depth)
-
-    @property
-    def _line(self) -> Delay:
-        return Delay(self.delay, self.hold)
-
-    @property
-    def _late(self) -> bool:
-        return self.delay != (0, 0)

@@ -43,6 +43,11 @@ class Delay:
         return jax.random.randint(key, (), self.steps[0], self.steps[1] + 1)
 
 
+def delay(steps: Steps, hold: float) -> Delay | None:
+    """Makes a delay; None if nothing is ever late."""
+    return None if steps == (0, 0) else Delay(steps, hold)
+
+
 @dataclasses.dataclass(frozen=True)
 class History:
     """Returns the latest values as one vector, newest last.

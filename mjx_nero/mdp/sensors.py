@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Share, Steps
-from mjx_nero.mdp.memory import Delay
+from mjx_nero.mdp.memory import delay
 from mjx_nero.types import Key, View
 
 
@@ -53,7 +53,8 @@ class ObjectPosition:
         """Draws the episode's offset, and fills the delay with the first position."""
         key, k_offset, k_delay = jax.random.split(key, 3)
         offset = jax.random.uniform(k_offset, (3,), minval=-self.offset, maxval=self.offset)
-        return key, offset, self._line.init(k_delay, view.objects[self.object].pos_w) if self._late else ()
+        late = delay(self.delay, self.hold)
+        return key, offset, late.init(k_delay, view.objects[self.object].pos_w) if late else ()
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
         """Moves the object in the view."""
@@ -61,19 +62,11 @@ class ObjectPosition:
         key, k_noise = jax.random.split(key)
         seen = view.objects[self.object]
         pos = seen.pos_w
-        if self._late:
-            line, pos = self._line.step(line, pos)
+        if late := delay(self.delay, self.hold):
+            line, pos = late.step(line, pos)
         pos = pos + offset + self.noise * jax.random.uniform(k_noise, (3,), minval=-1.0, maxval=1.0)
         objects = {**view.objects, self.object: dataclasses.replace(seen, pos_w=pos)}
         return (key, offset, line), dataclasses.replace(view, objects=objects)
-
-    @property
-    def _line(self) -> Delay:
-        return Delay(self.delay, self.hold)
-
-    @property
-    def _late(self) -> bool:
-        return self.delay != (0, 0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import NonNegative, OneOf, Past, Positive, Share, Steps
 from mjx_nero.mdp.curriculum import toward
-from mjx_nero.mdp.memory import Delay, History
+from mjx_nero.mdp.memory import Delay, History, delay
 from mjx_nero.types import LEVEL, Key, UserError, View
 
 
@@ -95,8 +95,8 @@ class ObservationTerm(Term):
     @property
     def lines(self) -> tuple[Delay | History, ...]:
         """The delay and the history that the value passes through before it is seen."""
-        delay = (Delay(self.delay, self.hold),) if self.delay != (0, 0) else ()
-        return delay + ((History(self.history),) if self.history > 1 else ())
+        late = delay(self.delay, self.hold)
+        return ((late,) if late else ()) + ((History(self.history),) if self.history > 1 else ())
 
 
 @dataclasses.dataclass(frozen=True)

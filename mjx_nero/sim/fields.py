@@ -57,11 +57,15 @@ class Randomization:
             "actuator": {model.actuator(i).name: i for i in range(model.nu)},
         }
         rows: dict[str, set[int]] = {}
-        for name, term in terms.items():
-            for field, (drawn, _) in term(jax.random.PRNGKey(0), self._model({})).items():
-                if field not in DRAWABLE:
-                    raise UserError(f"randomization.{name} draws {field}: only {', '.join(DRAWABLE)} may differ")
-                rows.setdefault(field, set()).update(map(int, drawn))
+
+        def note(key: Key) -> None:
+            for name, term in terms.items():
+                for field, (drawn, _) in term(key, self._model({})).items():
+                    if field not in DRAWABLE:
+                        raise UserError(f"randomization.{name} draws {field}: only {', '.join(DRAWABLE)} may differ")
+                    rows.setdefault(field, set()).update(map(int, drawn))
+
+        jax.eval_shape(note, jax.random.PRNGKey(0))  # rows alone count: what draws the values is not compiled
         _make_room(model, rows)
         bodies = rows.get("body_mass", set()) | rows.get("body_inertia", set()) | rows.get("body_ipos", set())
         trees = {int(model.body_treeid[b]) for b in bodies} | {int(model.dof_treeid[d]) for d in rows.get("dof_armature", ())}

@@ -31,7 +31,8 @@ Success of the bundled policies, and what training took, one table a task. This 
 python -m mjx_nero results --json docs/{json} --markdown docs/{page} --what none
 ```
 Without `--what none` the command first measures everything that the machine can, which takes hours on a GPU; `--what policies
---envs nero_lift` measures one environment's policy. Times count only if the program is alone on the GPU.
+--envs nero_lift` measures one environment's policy, and `--preset sim2real` that of a preset. Times count only if the program is
+alone on the GPU.
 
 - **policy**: success rate of the bundled policy, with its 95% Wilson interval.
 - **seeds**: how many seeds of the default training reached the target; **seconds** (with evaluations, without compilation) and
@@ -54,21 +55,26 @@ def main(argv: Sequence[str]) -> None:
         "--what", help=f"list of {', '.join(WHATS)}; none: only the table (default: all)", default=",".join(WHATS)
     )
     parser.add_argument("--envs", help="list of environments (default: all that can be learnt)")
+    parser.add_argument("--preset", default="default", help="preset that learns, or whose policies play (default: %(default)s)")
     parser.add_argument("--seeds", type=cli.positive, default=8, help="seeds per environment (default: %(default)s)")
     parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes a policy (default: %(default)s)")
     args, _ = parser.parse(argv)
     whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
     envs = cli.choices(args.envs, "env", registry.list_envs()) if args.envs else learnable()
+    envs = [env for env in envs if args.preset in registry.list_presets(env)]
+    if not envs:
+        raise UserError(f"none of these environments has the preset {args.preset!r}")
     files.check_writable(args.json)
     held = read(args.json)
     cli.setup_jax()
     measured_with = {"version": machine.versions()["mjx-nero"], "machine": machine.name(machine.machine())}
     for what in whats:
         for env in envs:
+            shown = named(env, args.preset)
             for name, row in _learning(env, args) if what == "learning" else _policies(env, args):
-                held.setdefault(env, {})[name] = row | measured_with
+                held.setdefault(shown, {})[name] = row | measured_with
                 files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
-                print(f"{env}  {name}  {_seeds(row) if what == 'learning' else _success(row)}", file=sys.stderr)
+                print(f"{shown}  {name}  {_seeds(row) if what == 'learning' else _success(row)}", file=sys.stderr)
             gc.collect()
     cells = list(rows(held))
     table = console.Table("results", _COLUMNS, left=("measured with",))
@@ -84,6 +90,11 @@ def learnable() -> list[str]:
     """Environments with a robot of their own, and with actions that are made to be learnt."""
     cfgs = {name: registry.env_cfg(name) for name in registry.list_envs() if registry.robot_of(name) is not None}
     return [name for name, cfg in cfgs.items() if for_controllers(cfg) is not cfg]
+
+
+def named(env: str, preset: str) -> str:
+    """The name under which a preset's figures are kept: ``nero_lift`` for the default, ``nero_lift sim2real`` for another."""
+    return env if preset == "default" else f"{env} {preset}"
 
 
 def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
@@ -104,19 +115,20 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
 
 def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """All seeds of an environment, by the settings that ``train.py --env`` has."""
-    run, _ = run_cfg.fit_machine(run_cfg.resolve(env, "default", None, {}, {}))
+    run, _ = run_cfg.fit_machine(run_cfg.resolve(env, args.preset, None, {}, {}))
     run = dataclasses.replace(run, eval_every=run.num_timesteps // EVALUATIONS)
     *_, total = learning.measure_learning(run, args.seeds, run.env.budget.success)
     yield "learning", total
 
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """The bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
-    if not policy.shipped(env).exists():
+    """The preset's bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
+    path = policy.shipped(env, args.preset)
+    if not path.exists() or args.preset != "default" and path == policy.shipped(env):
         return
     backends = {"native": "mujoco"} | ({"warp": "mjx"} if warp_available() else {})
     for name, backend in backends.items():
-        cfg = evaluation.EvalCfg(env, agent="policy", episodes=args.episodes, backend=backend)
+        cfg = evaluation.EvalCfg(env, args.preset, agent="policy", episodes=args.episodes, backend=backend)
         result = evaluation.play(cfg).result
         yield name, {n: result[n] for n in ("success_rate", "success_rate_95", "episodes", "nan_count", "overflow_count")}
 
@@ -148,8 +160,9 @@ def page(cells: Sequence[tuple[str, ...]], json_name: str, page_name: str) -> st
 
 def task_of(env: str) -> str:
     """The task's name: an environment's name without the arm's, as ``nero_lift_obstacles`` is ``lift_obstacles``."""
+    env, *preset = env.split()
     names = [name for name in registry.list_envs() if registry.robot_of(name) is None and env.endswith(f"_{name}")]
-    return max(names, key=len, default=env)
+    return " ".join([max(names, key=len, default=env), *preset])
 
 
 def _table(lines: Sequence[tuple[str, ...]]) -> str:

@@ -41,13 +41,19 @@ def test_tracking_by_hand():
 # --- following
 
 
-@pytest.mark.slow
-def test_ik_arrives_and_says_so_in_json(call, tmp_path):
-    dotted = [f"--env.{name}={value}" for name, value in at(0.5, 0.0, 0.5).items()] + ["--env.episode_length_s=3"]
+def followed(call, tmp_path, x):
+    """Three seconds of inverse kinematics towards a target at rest, ``x`` ahead [m]: what is printed, and the result."""
+    dotted = [f"--env.{name}={value}" for name, value in at(x, 0.0, 0.5).items()] + ["--env.episode_length_s=3"]
     argv = ["--env", "cobotta_follow_target", "--preset", "static", "--controller", "ik", "--episodes", 1]
     code, out, err = call("eval", *argv, *dotted, "--json", "result.json")
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert code == 0 and err == "" and "ik" in out and "second half" in out and "grasped" not in out
+    assert code == 0, err
+    return out, err, json.loads((tmp_path / "result.json").read_text())
+
+
+@pytest.mark.slow
+def test_ik_arrives_and_says_so_in_json(call, tmp_path):
+    out, err, result = followed(call, tmp_path, 0.5)
+    assert err == "" and "ik" in out and "second half" in out and "grasped" not in out
     names = {"env", "preset", "controller", "episodes", "success_rate", "position_error_mean", "settled_error_max", "warning"}
     assert names <= result.keys()
     assert not {"agent", "grasp_rate", "time_to_grasp_mean", "dropped_rate"} & result.keys()
@@ -58,12 +64,9 @@ def test_ik_arrives_and_says_so_in_json(call, tmp_path):
 
 @pytest.mark.slow
 def test_ik_does_not_move_towards_what_is_out_of_reach(call, tmp_path):
-    dotted = [f"--env.{name}={value}" for name, value in at(1.0, 0.0, 0.5).items()] + ["--env.episode_length_s=3"]
-    argv = ["--env", "cobotta_follow_target", "--preset", "static", "--controller", "ik", "--episodes", 1]
-    code, _, err = call("eval", *argv, *dotted, "--json", "result.json")
-    result = json.loads((tmp_path / "result.json").read_text())
+    _, err, result = followed(call, tmp_path, 1.0)
     text = "inverse kinematics found no solution in 150 of 150 steps (1 of 1 episodes): the arm did not move there"
-    assert code == 0 and err == f"warning: {text}\n" and result["warning"] == text
+    assert err == f"warning: {text}\n" and result["warning"] == text
     start = np.linalg.norm(HOME - [1.0, 0.0, 0.5])
     assert result["success_rate"] == 0
     assert result["settled_error_max"] == pytest.approx(start, abs=1e-3)

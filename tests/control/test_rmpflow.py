@@ -454,9 +454,8 @@ def bad(tmp_path: pathlib.Path, file: str, old: str, new: str) -> tuple[pathlib.
     return path, str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
+BAD = {
+    "rmpflow_common.yaml": [
         (
             "accel_p_gain: 30.",
             "acel_p_gain: 30.",
@@ -491,16 +490,7 @@ def bad(tmp_path: pathlib.Path, file: str, old: str, new: str) -> tuple[pathlib.
         ("rmp_params:", "rmp_params: [", ["is not YAML in line"]),
         ("rmp_params:", "- rmp_params:", ["is not YAML in line"]),
     ],
-)
-def test_bad_parameters(tmp_path, old, new, words):
-    path, message = bad(tmp_path, "rmpflow_common.yaml", old, new)
-    assert message.startswith(f"{path}") and "\n" not in message
-    assert all(word in message for word in words), message
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
+    "robot_descriptor.yaml": [
         ("- joint_3\n", "- joint3\n", ["cspace[2]", "no joint 'joint3'", "did you mean 'joint_3'?", "joint_6"]),
         ("    - joint_3\n", "", ["cspace must name each joint of the arm once"]),
         ("- joint_3\n", "- joint_2\n", ["cspace must name each joint of the arm once"]),
@@ -514,9 +504,12 @@ def test_bad_parameters(tmp_path, old, new, words):
         ("radius: 0.08}", "size: 0.08}", ["collision_spheres[0].J2[0].size: no key 'size'", "center, radius"]),
         ("collision_spheres:", "collision_sphere:", ["did you mean 'collision_spheres'?"]),
     ],
-)
-def test_bad_descriptor(tmp_path, old, new, words):
-    path, message = bad(tmp_path, "robot_descriptor.yaml", old, new)
+}
+
+
+@pytest.mark.parametrize(("name", "old", "new", "words"), [(name, *case) for name, cases in BAD.items() for case in cases])
+def test_bad_files_of_parameters(tmp_path, name, old, new, words):
+    path, message = bad(tmp_path, name, old, new)
     assert message.startswith(f"{path}") and "\n" not in message
     assert all(word in message for word in words), message
 

@@ -75,8 +75,9 @@ def model():
 class Stepped(cobotta.Cobotta):
     """Its cycles, and the gripper's, run at the ticks of a clock."""
 
-    def _start(self):
-        self._clock.ticks += [self.turn, self._gripper.turn]
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.turning.start = lambda: self._clock.ticks.extend([self.turning.turn, self._gripper.turning.turn])
 
 
 class Bench(arms.Bench):
@@ -196,7 +197,7 @@ def test_threads_keep_the_controllers_pace(told, model):
     bench.arm._do = lambda name, value=None: moves.append(name) or do(name, value)
     time.sleep(0.4)
     rate = len(moves) / (time.monotonic() - begun)
-    assert not bench.arm._error and 80 < rate < 140, (rate, bench.arm._error)
+    assert not bench.arm.turning._error and 80 < rate < 140, (rate, bench.arm.turning._error)
     bench.arm.close()
     assert bench.plant.powered.all() and bench.emulated.torque_cuts == 0
     bench.close()

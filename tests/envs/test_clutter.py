@@ -82,11 +82,11 @@ def test_sizes_and_masses_differ_and_objects_rest_on_the_table(env, starts):
 def test_the_commanded_one_is_what_the_terms_call_target(env, starts):
     target = np.asarray(starts.info["carry"].memory["target"])
     assert set(target) == set(range(6))
-    view = jax.vmap(env.view)(starts)
+    view = jax.jit(jax.vmap(env.view))(starts)
     where = np.stack([poses(env, starts, name) for name in NAMES], axis=1)[np.arange(200), target]
     np.testing.assert_array_equal(view.objects["target"].pos_w, where[:, :3])
     np.testing.assert_array_equal(view.objects["target"].quat_w, where[:, 3:])
-    seen = jax.vmap(env.named_observations)(starts)["state"]
+    seen = jax.jit(jax.vmap(env.named_observations))(starts)["state"]
     np.testing.assert_allclose(seen["object_to_goal"], np.asarray(view.goal_pos_w) - where[:, :3], atol=1e-6)
     assert (where[:, 0] >= 0.3 - 1e-6).all() and (where[:, 0] <= 0.4 + 1e-6).all()
 
@@ -111,7 +111,7 @@ def test_what_counts_as_held_is_above_the_largest_of_its_kind(env, starts):
         lies = poses(env, starts, name)[:, 2].max()
         assert lies < height - 0.004 and height < 1.15 * CFG.scene.objects[name].rest_height + 0.0051
     paid = jax.vmap(lambda view: rewards.object_is_held(view, **CFG.rewards["holding_object"].params))
-    view = jax.vmap(env.view)(starts)
+    view = jax.jit(jax.vmap(env.view))(starts)
     at = view.replace(ee_pos_w=view.objects["target"].pos_w)
     assert float(paid(at).sum()) == 0
     up = dataclasses.replace(view.objects["target"], pos_w=view.objects["target"].pos_w + jnp.array([0.0, 0.0, 0.02]))
@@ -120,7 +120,7 @@ def test_what_counts_as_held_is_above_the_largest_of_its_kind(env, starts):
 
 
 def test_a_picture_shows_what_was_drawn_and_the_commanded_one_in_green(env, starts):
-    looks = jax.vmap(env.scenery)(starts).objects
+    looks = jax.jit(jax.vmap(env.scenery))(starts).objects
     target = np.asarray(starts.info["carry"].memory["target"])
     for i, name in enumerate(NAMES):
         size, rgba = np.asarray(looks[name].size), np.asarray(looks[name].rgba)

@@ -292,7 +292,7 @@ def test_curriculum_follows_the_count_of_steps():
 def test_goal_is_drawn_anew_every_resample_time(finish, start):
     env = make("nero_lift", impl="native", **{"command.resample_s": 0.1})
     advance = jax.jit(env.finish)
-    state, goals = env.reset(jax.random.PRNGKey(0)), []
+    state, goals = jax.jit(env.reset)(jax.random.PRNGKey(0)), []
     for _ in range(12):
         goals.append(np.asarray(state.info["carry"].command))
         state = advance(state, jnp.zeros(8), state.pipeline_state, jnp.zeros(()))

@@ -90,7 +90,7 @@ def test_late_actions_are_as_late_as_the_level_says(env, reset):
         state = reset(KEYS, level)
         lag = state.info["carry"].memory["actions.delay"].lag
         late = np.asarray(lag) > 0
-        after = jax.vmap(env.act)(state, action)[0].info["carry"].memory["actions.arm"][1][:, 0]  # the set-point's rate
+        after = jax.jit(jax.vmap(env.act))(state, action)[0].info["carry"].memory["actions.arm"][1][:, 0]  # the set-point's rate
         moved[level] = np.asarray(after)[late]
     assert len(moved[0.0]) and (moved[1.0] == 0).all()
     np.testing.assert_allclose(moved[0.5], moved[0.0] / 2, rtol=1e-5)
@@ -101,7 +101,7 @@ def test_an_environments_level_follows_its_own_episodes(env, batch, step):
     carry = state.info["carry"]
     assert (carry.memory[LEVEL] == 0).all() and env.first_level == 0
     # One step before the end of the episode; in two environments the cube has long been where it has to be.
-    view = jax.vmap(env.view)(state)
+    view = jax.jit(jax.vmap(env.view))(state)
     there = view.objects["cube"].pos_w - view.root_pos_w
     met = jnp.array([1, 0, 1, 0])
     carry = carry.replace(

@@ -203,7 +203,7 @@ def test_observations_come_late_and_begin_anew_with_the_episode():
 
 def test_an_action_of_another_size_is_refused_in_one_line():
     env = make("nero_lift", impl="native")
-    state = env.reset(jax.random.PRNGKey(0))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     with pytest.raises(UserError, match=r"^an action is 8 numbers, got an array of shape \(7,\): jax.vmap the step"):
         env.step(state, jnp.zeros(7))
 

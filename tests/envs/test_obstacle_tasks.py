@@ -40,7 +40,7 @@ def played(env):
 
 
 def test_every_environment_has_its_own_wall_between_start_and_goal(env, played):
-    view = jax.vmap(env.view)(played[0])
+    view = jax.jit(jax.vmap(env.view))(played[0])
     wall, way = view.obstacles["one"], view.goal_pos_w - view.ee_pos_w
     share = jnp.sum((wall.pos_w - view.ee_pos_w)[:, :2] * way[:, :2], axis=1) / jnp.sum(way[:, :2] ** 2, axis=1)
     assert ((share > 0.25) & (share < 0.75)).all() and len(np.unique(np.asarray(wall.pos_w)[:, 0])) == N
@@ -54,7 +54,7 @@ def test_an_arm_that_stays_touches_nothing_and_one_that_sweeps_hits_the_wall(env
     _, touches, (still, swept) = played
     assert not touches[:, 0].any() and not touches[:26].any()
     assert (touches[:, 1].max(axis=0) > 1.0).all()
-    view = jax.vmap(env.view)(swept)
+    view = jax.jit(jax.vmap(env.view))(swept)
     stopped = jnp.linalg.norm(view.ee_pos_w - view.goal_pos_w, axis=1)
     assert (stopped > 0.1).all()  # behind the wall
     memory = swept.info["carry"].memory
@@ -133,7 +133,7 @@ def test_there_is_room_for_obstacles_between_start_and_goal(arm):
     for task in ("reach_obstacles", "lift_obstacles"):
         env = make(f"{arm}_{task}", impl="native", num_envs=64)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
-        boxes = jax.vmap(env.view)(state).obstacles.values()
+        boxes = jax.jit(jax.vmap(env.view))(state).obstacles.values()
         assert (np.stack([box.pos_w[:, 2] for box in boxes]) > 0).any(axis=0).all()
         still = jax.jit(jax.vmap(env.finish, (0, None, 0, None)))
         held = env.physics.step(state.pipeline_state, state.pipeline_state.ctrl)[0]
@@ -143,10 +143,10 @@ def test_there_is_room_for_obstacles_between_start_and_goal(arm):
 def test_a_touch_costs_a_beginner_a_tenth():
     """And all of it where there is no level: everywhere but in training."""
     env = make("nero_lift_obstacles", impl="native")
-    touched, still = jnp.asarray(2.0), jnp.zeros(env.action_size)
+    touched, still, reset, advance = jnp.asarray(2.0), jnp.zeros(env.action_size), jax.jit(env.reset), jax.jit(env.advance)
     for level, price in ((0.0, -1.0), (0.5, -5.5), (1.0, -10.0), (None, -10.0)):
-        state = env.reset(jax.random.PRNGKey(0), level)
-        after = env.advance(state, still, state.pipeline_state.replace(readings={"touch": touched}), jnp.zeros(()))
+        state = reset(jax.random.PRNGKey(0), level)
+        after = advance(state, still, state.pipeline_state.replace(readings={"touch": touched}), jnp.zeros(()))
         assert float(after.metrics["reward/touching"]) == pytest.approx(price * env.dt)
 
 

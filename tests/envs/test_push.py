@@ -38,7 +38,7 @@ def placed(env, state, off=(0.0, 0.0, 0.0), degrees=0.0):
 def test_the_box_starts_and_ends_where_the_hand_can_point_down(env):
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 300))
     at = env.physics_model.joint("box").qposadr[0]
-    box, shown = np.asarray(state.pipeline_state.qpos[:, at : at + 7]), jax.vmap(env.scenery)(state)
+    box, shown = np.asarray(state.pipeline_state.qpos[:, at : at + 7]), jax.jit(jax.vmap(env.scenery))(state)
     goal = np.concatenate([shown.goal_pos_w, shown.goal_quat_w], axis=1)
     for pose in (box, goal):
         np.testing.assert_allclose([pose[:, :2].min(0), pose[:, :2].max(0)], [[0.3, -0.1], [0.4, 0.2]], atol=5e-3)

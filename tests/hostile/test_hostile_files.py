@@ -116,30 +116,17 @@ REFUSED |= {
         "callback": ('<site name="ee"/>', '<site name="ee"/><geom type="sdf"/>'),
     }.items()
 }
-REFUSED |= {
-    f"model: {name}": functools.partial(bad.robot, model=content)
-    for name, content in {
-        "directory": bad.DIRECTORY,
-        "pipe": bad.PIPE,
-        "endless": bad.ZERO,
-        "empty": "",
-        "binary": bytes(range(256)),
-        "binary model": b"MJB" * 100,
-        "large": "<mujoco>" + " " * 20_000_000 + "</mujoco>",
-    }.items()
+NO_FILE = {"directory": bad.DIRECTORY, "pipe": bad.PIPE, "endless": bad.ZERO, "empty": b""}
+MODELS = {
+    "binary": bytes(range(256)),
+    "binary model": b"MJB" * 100,
+    "large": "<mujoco>" + " " * 20_000_000 + "</mujoco>",
 }
+MESHES = {"link out": bad.SECRET, "text": b"solid", "lying": bytes(80) + b"\xff\xff\xff\xff" + bytes(100), "flat": bad.stl(4)}
 REFUSED |= {
-    f"model's mesh: {name}": functools.partial(bad.robot, mesh=content)
-    for name, content in {
-        "link out": bad.SECRET,
-        "pipe": bad.PIPE,
-        "endless": bad.ZERO,
-        "directory": bad.DIRECTORY,
-        "empty": b"",
-        "text": b"solid",
-        "lying": bytes(80) + b"\xff\xff\xff\xff" + bytes(100),
-        "flat": bad.stl(4),
-    }.items()
+    f"{what}: {name}": functools.partial(bad.robot, **{field: content})
+    for what, field, own in (("model", "model", MODELS), ("model's mesh", "mesh", MESHES))
+    for name, content in {**NO_FILE, **own}.items()
 }
 
 

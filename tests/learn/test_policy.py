@@ -38,7 +38,7 @@ def path(trained, tmp_path):
 
 @pytest.fixture(scope="module")
 def obs(env):
-    return jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(1), 4)).obs
+    return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), 4)).obs
 
 
 def test_loaded_policy_acts_bit_equal(env, trained, path, obs):
@@ -234,4 +234,4 @@ def test_no_policy_ships(env, monkeypatch):
 
 def test_the_policy_that_ships_fits(env):
     loaded = policy.load_for(env, "nero_lift", None)
-    assert loaded.act(env.reset(jax.random.PRNGKey(0)).obs).shape == (8,)
+    assert loaded.act(jax.jit(env.reset)(jax.random.PRNGKey(0)).obs).shape == (8,)

@@ -228,7 +228,7 @@ def test_ended_episodes_freeze():
 
 @pytest.mark.parametrize("early", [True, False])
 def test_accumulate(env, early):
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
     names = (*state.metrics, "return", "length")
     after = state.replace(reward=jnp.array([2.0, 3.0]), done=jnp.array([float(early), 0.0]))
     totals, active = dict.fromkeys(names, jnp.zeros(2)), jnp.ones(2)

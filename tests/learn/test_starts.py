@@ -151,7 +151,7 @@ def test_a_start_is_a_visited_state(env, reset, bank, told):
     """Joints, cube and what the fingers press with are one of the bank's rows; all is at rest, under a goal of its own."""
     assert len(told) == 1 and "grasps in 100%" in told[0] and "some episodes start from its states" in told[0]
     state = reset(bank, certain(PHASES))
-    sim, carry, view = state.pipeline_state, state.info["carry"], jax.vmap(env.view)(state)
+    sim, carry, view = state.pipeline_state, state.info["carry"], jax.jit(jax.vmap(env.view))(state)
     rows = np.asarray(bank.start.object_pos_w["cube"])[PHASES - 1 :: PHASES]
     which = PHASES - 1 + PHASES * np.argmin(np.abs(np.asarray(view.objects["cube"].pos_w)[:, None] - rows).sum(-1), axis=1)
     np.testing.assert_allclose(view.objects["cube"].pos_w, bank.start.object_pos_w["cube"][which], atol=1e-7)
@@ -169,10 +169,10 @@ def test_a_start_is_a_visited_state(env, reset, bank, told):
 def test_a_held_cube_is_still_held(env, reset, bank):
     """After 20 steps without any action."""
     state, step = reset(bank, certain(PHASES)), jax.jit(jax.vmap(env.step))
-    before = jax.vmap(env.view)(state)
+    before = jax.jit(jax.vmap(env.view))(state)
     for _ in range(20):
         state = step(state, jnp.zeros((N, env.action_size)))
-    view = jax.vmap(env.view)(state)
+    view = jax.jit(jax.vmap(env.view))(state)
     moved = (view.objects["cube"].pos_w - view.ee_pos_w) - (before.objects["cube"].pos_w - before.ee_pos_w)
     assert (before.objects["cube"].pos_w[:, 2] > 0.02).all()
     assert np.linalg.norm(moved, axis=1).max() < 0.005, moved
@@ -198,7 +198,7 @@ def test_episodes_start_by_what_came_of_the_last_ones(batch, bank):
     carry = state.info["carry"]
     ending = carry.replace(
         step=jnp.full(N, batch.unwrapped.episode_length - 1, jnp.int32),
-        command=jax.vmap(batch.unwrapped.view)(state).objects["cube"].pos_w,
+        command=jax.jit(jax.vmap(batch.unwrapped.view))(state).objects["cube"].pos_w,
         memory={**carry.memory, "success.hold": jnp.full(N, 1000, jnp.int32)},
     )
     state = state.replace(info={**state.info, "carry": ending})

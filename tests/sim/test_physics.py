@@ -297,7 +297,7 @@ def test_joints_keep_to_the_speed_limit(reach):
 
 
 def test_fingers_open_and_close_fully(env, native):
-    sim = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 1)).pipeline_state
+    sim = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 1)).pipeline_state
     for fingers in ([0.0, -0.001], [0.05, -0.05]):
         ctrl = np.array(sim.ctrl)
         ctrl[:, 7:] = fingers
@@ -317,7 +317,7 @@ def test_only_mjx_jax_does_without_the_fusion(monkeypatch):
 
 def test_backend_is_made_when_first_stepped():
     env = make("nero_lift", impl="jax")
-    env.reset(jax.random.PRNGKey(0))
+    jax.jit(env.reset)(jax.random.PRNGKey(0))
     assert "physics" not in vars(env)
     assert isinstance(env.physics, JaxPhysics) and env.physics is env.physics
 
@@ -345,7 +345,7 @@ def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
 @pytest.mark.gpu
 def test_warp_and_c_agree_without_contacts(native):
     env = make("nero_lift", impl="warp", num_envs=8)
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), 8))
     sim = state.pipeline_state
     sim = sim.replace(qpos=sim.qpos.at[:, CUBE].add(jnp.array([0.0, 0.0, 2.0])))
     step = jax.jit(jax.vmap(env.physics.step))

@@ -16,7 +16,7 @@ from mjx_nero.sim.cameras import opengl
 from mjx_nero.sim.robot import GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools import inspection
-from mjx_nero.tools.inspection import cameras
+from mjx_nero.tools.inspection import cameras, command, report
 from mjx_nero.types import UserError
 
 NERO, COBOTTA = (registry.robot(name) for name in ("nero", "cobotta_pro_900"))
@@ -242,6 +242,8 @@ def test_program_takes_the_folder_of_an_imported_robot(call, tmp_path):
 
 
 def test_list_envs(call, monkeypatch):
+    found = report.environments()  # once: it traces every environment
+    monkeypatch.setattr(command, "environments", lambda: found)
     code, out, err = call(program="list-envs")
     assert (code, err) == (0, "") and "state 47, privileged_state 57" in out
     monkeypatch.setenv("COLUMNS", "80")  # names stay whole however narrow the terminal

@@ -43,6 +43,8 @@ def test_every_environment_has_a_task():
     """Those that are to be learnt belong to tasks of any robot."""
     assert {results.task_of(name) for name in results.learnable()} <= set(registry.list_envs())
     assert results.task_of("drag") == "drag"  # a guest's
+    assert results.task_of(results.named("so101_lift_obstacles", "default")) == "lift_obstacles"
+    assert results.task_of(results.named("so101_lift", "sim2real")) == "lift sim2real"
 
 
 def test_the_page_of_the_documentation_is_what_its_figures_give():
@@ -74,6 +76,7 @@ def test_command(call, tmp_path):
     [
         (("--json", "r.json", "--envs", "nope"), "unknown env nope: choose from"),
         (("--json", "r.json", "--what", "x"), "unknown what x: choose from learning, policies"),
+        (("--json", "r.json", "--envs", "nero_stack", "--preset", "rgb"), "none of these environments has the preset 'rgb'"),
         (("--json", "bad.json"), "bad.json holds no results: name another file"),
         ((), "--json"),
     ],

@@ -53,7 +53,7 @@ def costs(env, optimised) -> dict[str, list[float]]:
     still = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
     still.__dict__["physics"] = Still()
     cfg = dataclasses.replace(run_cfg.learner_cfg(native.cfg, "default"), num_envs=NUM_ENVS)
-    sim = jax.vmap(env.sample)(jax.random.split(jax.random.PRNGKey(0), 8))[0]
+    sim = jax.jit(jax.vmap(env.sample))(jax.random.split(jax.random.PRNGKey(0), 8))[0]
     programs = {
         "physics": throughput.physics(native, 25),
         "step": throughput.step(native, 25),

@@ -1,10 +1,12 @@
 """The browser view: the session behind it, and the page itself in a real browser."""
 
+import functools
 import time
 
 import imageio.v3 as imageio
 import jax.numpy as jnp
 import numpy as np
+import pages
 import pytest
 from flax import struct
 
@@ -17,6 +19,7 @@ from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.scene import Scene
 from mjx_nero.tools.view.session import Session, free_joints
 
+wait = functools.partial(pages.wait, seconds=180)  # a browser that draws in software is slow
 STRONG = {"robot.gravity_compensation": True}  # the drives hold the arm up, so that it gets where it is sent
 
 
@@ -188,14 +191,6 @@ def test_a_training_writes_what_the_view_follows(call, tmp_path):
 def test_mistakes_are_one_line(call, argv, message):
     status, out, err = call("mjx_nero", "view", *argv)
     assert (status, out) == (2, "") and message in err and err.count("\n") == 1
-
-
-def wait(condition, seconds=180):
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.1)
-    return found
 
 
 def on_screen(client, point):

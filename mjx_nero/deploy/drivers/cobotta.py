@@ -15,6 +15,7 @@ import numpy as np
 
 from mjx_nero.deploy.arm import ArmError, Clock, Feedback
 from mjx_nero.deploy.drivers import bcap, rg6
+from mjx_nero.deploy.drivers.turning import Turning
 from mjx_nero.errors import UserError
 
 CYCLE = 0.008  # [s]
@@ -38,10 +39,9 @@ class Cobotta:
         self._address, (self._host, _, port) = host, host.partition(":")
         self._port, self._clock, self._gripper = int(port or bcap.PORT), clock, gripper
         self._dt = float(metadata["control_dt"])
-        self._lock, self._over, self._error = threading.Lock(), threading.Event(), ""
+        self._lock, self.turning = threading.Lock(), Turning(self.cycle)  # the controller sets the pace
         self._grip = np.array(metadata["joints"]["home"], float)[_JOINTS:]
         self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque(maxlen=4)
-        self._thread: threading.Thread | None = None
         self._engaged = False
 
     def ranges(self) -> None:
@@ -98,24 +98,7 @@ class Cobotta:
         self._engaged = True
         if self._gripper:
             self._gripper.engage()
-        self._start()
-
-    def _start(self) -> None:
-        """Lets cycles run; the controller sets their pace."""
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._over.is_set() and not self._error:
-            self.turn()
-
-    def turn(self) -> None:
-        """Runs a cycle, as the thread does again and again; ``read`` and ``command`` tell what fails."""
-        try:
-            if not self._error:
-                self.cycle()
-        except ArmError as error:
-            self._error = str(error)
+        self.turning.start()
 
     def cycle(self) -> None:
         """One target, and the answer to it."""
@@ -132,8 +115,7 @@ class Cobotta:
 
     def read(self) -> Feedback:
         """See ``Arm``: the newest answer; velocities are differences over some cycles."""
-        if self._error:
-            raise ArmError(self._error)
+        self.turning.check()
         if not self._engaged:
             self._remember(self._angles(self._do("HighCurJntEx")[1:]))
         with self._lock:
@@ -147,8 +129,7 @@ class Cobotta:
 
     def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """See ``Arm``: the thread goes there within a control step."""
-        if self._error:
-            raise ArmError(self._error)
+        self.turning.check()
         with self._lock:
             now = self._clock.now()
             self._from, self._to, self._since = self._path(now), position[:_JOINTS].copy(), now
@@ -159,11 +140,9 @@ class Cobotta:
 
     def close(self) -> None:
         """See ``Arm``: leaves slave mode at rest. The controller holds the arm, with its motors on."""
-        self._over.set()
+        self.turning.stop()
         try:
             if self._engaged:
-                if self._thread is not None:
-                    self._thread.join(1.0)
                 for _ in range(_SMOOTH):
                     self.cycle()
                 self._do("slvChangeMode", NORMAL)

@@ -5,10 +5,10 @@ bits 3 and 5 are tripped safety switches. The gripper takes a width only when it
 """
 
 import math
-import threading
 from typing import Any
 
 from mjx_nero.deploy.arm import ArmError
+from mjx_nero.deploy.drivers.turning import Turning
 from mjx_nero.errors import UserError
 
 DEVICE, FORCE, WIDTH, GRIP = 65, 0, 267, 1
@@ -40,7 +40,7 @@ class Rg6:
     def __init__(self, address: str):
         self._address, (self._host, _, port) = address, address.partition(":")
         self._port = int(port or 502)
-        self._over, self._error = threading.Event(), ""
+        self.turning = Turning(self._step, _PERIOD)
         self._seen, self._wanted, self._told = 0.0, -1.0, -1.0
 
     def connect(self) -> None:
@@ -63,20 +63,7 @@ class Rg6:
 
     def engage(self) -> None:
         """Starts to ask and to tell it."""
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._over.wait(_PERIOD):
-            self.turn()
-
-    def turn(self) -> None:
-        """Asks and tells it once, as the thread does; ``read`` tells what fails."""
-        try:
-            if not self._error:
-                self._step()
-        except ArmError as error:
-            self._error = str(error)
+        self.turning.start()
 
     def _step(self) -> None:
         """Reads it, and tells it a new width where there is one and it listens.
@@ -106,8 +93,7 @@ class Rg6:
         Raises:
             ArmError: it was lost.
         """
-        if self._error:
-            raise ArmError(self._error)
+        self.turning.check()
         return self._seen
 
     def command(self, width: float) -> None:
@@ -116,7 +102,5 @@ class Rg6:
 
     def close(self) -> None:
         """Ends the connection; the gripper keeps its grip."""
-        self._over.set()
-        if hasattr(self, "_thread"):
-            self._thread.join(1.0)
+        self.turning.stop()
         self._client.close()

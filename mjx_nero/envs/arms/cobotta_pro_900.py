@@ -110,12 +110,4 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.4, 0.55), (-0.28, -0.2)), goal=((0.4, 0.55), (0.18, 0.28), (0.2, 0.35)), top=0.25, scene=LIFT.scene
 )
 
-ENVS: Envs = {
-    "cobotta_lift": (COBOTTA_PRO_900, lift.presets(LIFT)),
-    "cobotta_reach": (COBOTTA_PRO_900, reach.presets(REACH)),
-    "cobotta_follow_target": (COBOTTA_PRO_900, follow_target.presets(FOLLOW_TARGET)),
-    "cobotta_pick_place": (COBOTTA_PRO_900, pick_place.presets(PICK_PLACE)),
-    "cobotta_reach_obstacles": (COBOTTA_PRO_900, reach_obstacles.presets(REACH_OBSTACLES)),
-    "cobotta_lift_obstacles": (COBOTTA_PRO_900, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"cobotta_{task}": (COBOTTA_PRO_900, presets) for task, presets in fitted.FITTING.items()},
-}
+ENVS: Envs = fitted.envs("cobotta", COBOTTA_PRO_900, LIFT, REACH, FOLLOW_TARGET, PICK_PLACE, REACH_OBSTACLES, LIFT_OBSTACLES)

@@ -83,12 +83,15 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.3, 0.38), (-0.22, -0.16)), goal=((0.3, 0.36), (0.14, 0.22), (0.18, 0.28)), top=0.18, scene=LIFT.scene
 )
 
-ENVS: Envs = {
-    "nero_lift": (NERO, lift.presets(LIFT)),
-    "nero_reach": (REACH_NERO, reach.presets(REACH)),
-    "nero_follow_target": (NERO, follow_target.presets(FOLLOW_TARGET)),
-    "nero_pick_place": (NERO, pick_place.presets(PICK_PLACE)),
-    "nero_reach_obstacles": (REACH_NERO, reach_obstacles.presets(REACH_OBSTACLES)),
-    "nero_lift_obstacles": (NERO, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"nero_{task}": (NERO, presets) for task, presets in fitted.FITTING.items()},
-}
+ENVS: Envs = fitted.envs(
+    "nero",
+    NERO,
+    LIFT,
+    REACH,
+    FOLLOW_TARGET,
+    PICK_PLACE,
+    REACH_OBSTACLES,
+    LIFT_OBSTACLES,
+    reach=REACH_NERO,
+    reach_obstacles=REACH_NERO,
+)

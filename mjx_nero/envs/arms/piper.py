@@ -55,10 +55,4 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.2, 0.26), (-0.22, -0.16)), goal=((0.28, 0.36), (0.14, 0.22), (0.18, 0.28)), top=0.18, scene=LIFT.scene
 )
 
-ENVS: Envs = {
-    "piper_lift": (PIPER, lift.presets(LIFT)),
-    "piper_reach": (REACH_PIPER, reach.presets(REACH)),
-    "piper_reach_obstacles": (PIPER, reach_obstacles.presets(REACH_OBSTACLES)),
-    "piper_lift_obstacles": (PIPER, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"piper_{task}": (PIPER, presets) for task, presets in fitted.FITTING.items()},
-}
+ENVS: Envs = fitted.envs("piper", PIPER, LIFT, REACH, REACH_OBSTACLES, LIFT_OBSTACLES, reach=REACH_PIPER)

@@ -1,13 +1,15 @@
 """SO-ARM100: a 3D-printed arm of hobby servos, with five joints and a jaw that closes on a fixed one."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero.envs import fitted
-from mjx_nero.envs.task import EnvCfg, Envs, Presets
+from mjx_nero.envs.task import EnvCfg, Envs
 from mjx_nero.envs.tasks import lift, lift_obstacles, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -89,25 +91,23 @@ REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
 LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
     cube=((0.12, 0.17), (-0.19, -0.15)), goal=((0.12, 0.2), (0.14, 0.2), (0.12, 0.2)), top=0.12, scene=SCENE
 )
-# None of three cubes: the hand does not point straight down so high.
-STACK: Presets = {"default": fitted.FITTING["stack"]["default"]}
 
 
-def with_recipe(presets: Presets) -> Presets:
-    """Returns the presets, with the recipe's drives in ``isaac``."""
+def so_arm(prefix: str, robot: RobotCfg, *setups: Any) -> Envs:
+    """Lists the environments of either SO-ARM. The preset ``isaac`` has the recipe's drives.
 
-    def isaac(robot: RobotCfg) -> EnvCfg:
-        arm = dataclasses.replace(robot.arm, **_RECIPE)
-        return presets["isaac"](dataclasses.replace(robot, max_step=0.0, arm=arm))
+    None stacks three cubes: the hand does not point straight down so high.
+    """
+    envs = fitted.envs(prefix, robot, *setups, REACH_OBSTACLES, LIFT_OBSTACLES)
+    for task in ("lift", "reach"):
+        _, presets = envs[f"{prefix}_{task}"]
+        envs[f"{prefix}_{task}"] = robot, {**presets, "isaac": functools.partial(_with_recipe, preset=presets["isaac"])}
+    envs[f"{prefix}_stack"] = robot, {"default": fitted.FITTING["stack"]["default"]}
+    return envs
 
-    return {**presets, "isaac": isaac}
+
+def _with_recipe(robot: RobotCfg, preset: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
+    return preset(dataclasses.replace(robot, max_step=0.0, arm=dataclasses.replace(robot.arm, **_RECIPE)))
 
 
-ENVS: Envs = {
-    "so100_lift": (SO_ARM100, with_recipe(lift.presets(LIFT))),
-    "so100_reach": (SO_ARM100, with_recipe(reach.presets(REACH))),
-    "so100_reach_obstacles": (SO_ARM100, reach_obstacles.presets(REACH_OBSTACLES)),
-    "so100_lift_obstacles": (SO_ARM100, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"so100_{task}": (SO_ARM100, presets) for task, presets in fitted.FITTING.items()},
-    "so100_stack": (SO_ARM100, STACK),
-}
+ENVS: Envs = so_arm("so100", SO_ARM100, LIFT, REACH)

@@ -2,10 +2,9 @@
 
 import dataclasses
 
-from mjx_nero.envs import fitted
-from mjx_nero.envs.arms.so_arm100 import LIFT_OBSTACLES, REACH_OBSTACLES, SCENE, SO_ARM100, STACK, with_recipe
+from mjx_nero.envs.arms.so_arm100 import SCENE, SO_ARM100, so_arm
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import lift, lift_obstacles, reach, reach_obstacles
+from mjx_nero.envs.tasks import lift, reach
 
 # Mounting and home: the Isaac Lab recipe's.
 ROBOT = SO_ARM101 = dataclasses.replace(
@@ -27,11 +26,4 @@ LIFT = lift.LiftSetup(
 )
 REACH = reach.ReachSetup(scene=reach.scene(SCENE))
 
-ENVS: Envs = {
-    "so101_lift": (SO_ARM101, with_recipe(lift.presets(LIFT))),
-    "so101_reach": (SO_ARM101, with_recipe(reach.presets(REACH))),
-    "so101_reach_obstacles": (SO_ARM101, reach_obstacles.presets(REACH_OBSTACLES)),
-    "so101_lift_obstacles": (SO_ARM101, lift_obstacles.presets(LIFT_OBSTACLES)),
-    **{f"so101_{task}": (SO_ARM101, presets) for task, presets in fitted.FITTING.items()},
-    "so101_stack": (SO_ARM101, STACK),
-}
+ENVS: Envs = so_arm("so101", SO_ARM101, LIFT, REACH)

@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.regions import Regions
-from mjx_nero.envs.task import SuccessCfg
+from mjx_nero.envs.task import EnvCfg, SuccessCfg
 from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -93,9 +93,25 @@ class Tower:
         """Extra time for closing and opening on all objects [s]."""
         return round(2 * self.slow * (len(self.objects) - 1), 2)
 
-    def sim(self) -> SimCfg:
-        """Returns the simulation settings, with contact buffers sized by a count."""
-        return contacts.sized(self.robot, self.scene, SimCfg())
+    def task(self, length_s: float, **own: Any) -> EnvCfg:
+        """Makes the task of building the tower.
+
+        Args:
+            length_s: duration of an episode with quick fingers [s].
+            own: fields that a task adds, or replaces.
+        """
+        shared = {
+            "robot": self.builder,
+            "scene": self.scene,
+            "sim": contacts.sized(self.robot, self.scene, SimCfg()),  # contact buffers sized by a count
+            "episode_length_s": length_s + self.extra,
+            "rewards": self.rewards(),
+            "success": self.success(),
+            "metrics": self.metrics(),
+            "terminations": self.terminations(),
+            "controllers": self.controllers(),
+        }
+        return EnvCfg(**{**shared, **own})
 
     def success(self) -> SuccessCfg:
         """Requires a built tower that the hand does not touch, for half a second at the end."""

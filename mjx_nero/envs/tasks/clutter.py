@@ -11,17 +11,9 @@ import numpy as np
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
-from mjx_nero.mdp import commands, events, metrics, observations, randomization, rewards, success, terminations
-from mjx_nero.mdp.terms import (
-    ONCE,
-    CommandTerm,
-    DoneTerm,
-    ObservationGroup,
-    ObservationTerm,
-    RewardTerm,
-    Term,
-    privileged,
-)
+from mjx_nero.envs.tasks.lift import carrying
+from mjx_nero.mdp import commands, events, metrics, observations, randomization, success, terminations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -209,16 +201,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
             **{f"{name}_size": Term(randomization.size, params={"object": name, "scale": SIZES}) for name in names},
             "colors": Term(randomization.color, params={"geoms": names}),
         },
-        rewards={
-            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **commanded}),
-            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
-            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
-            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
-            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
-            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
-            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
-            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
-        },
+        rewards=carrying(held, **commanded),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_off_table": DoneTerm(

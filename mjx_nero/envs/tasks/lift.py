@@ -5,23 +5,16 @@ A preset is one list, long or not, and reads as one.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, velocity_actions
+from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, step_weights, velocity_actions
 from mjx_nero.envs.tasks import seeing
 from mjx_nero.envs.tasks import sim2real as sim2reals
-from mjx_nero.mdp import commands, curriculum, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import (
-    CommandTerm,
-    DoneTerm,
-    ObservationGroup,
-    ObservationTerm,
-    RewardTerm,
-    Term,
-    privileged,
-)
+from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -109,12 +102,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum=CurriculumCfg(
-            weights={
-                "action_rate": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-                "joint_vel": Term(curriculum.step_weight, params={"to": -1e-1, "num_steps": 10_000}),
-            }
-        ),
+        curriculum=CurriculumCfg(weights=step_weights(10_000, action_rate=-1e-1, joint_vel=-1e-1)),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
@@ -128,7 +116,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
 
 
 def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The preset that learns to grasp. Height and tracking count only for a held cube, and relative positions are observed."""
+    """The preset that learns to grasp. Rewards need a held cube (``carrying``), and relative positions are observed."""
     recipe, held = isaac(robot, setup), setup.held
     state = {
         **arm_state(),
@@ -150,20 +138,30 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
                 },
             ),
         },
-        rewards={
-            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
-            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
-            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
-            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
-            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
-            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
-            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
-            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
-        },
+        rewards=carrying(held),
         curriculum=CurriculumCfg(),
         controllers=setup.controllers(robot),
         training=CALM,
     )
+
+
+def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
+    """Lists rewards for reaching, holding and carrying an object to the goal; height and tracking count only while it is held.
+
+    Args:
+        held: parameters of ``rewards.held``.
+        object: the parameter ``object``, if it is not the cube.
+    """
+    return {
+        "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **object}),
+        "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+        "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
+        "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
+        "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+        "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
+        "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+        "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+    }
 
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:

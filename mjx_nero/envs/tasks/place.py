@@ -40,11 +40,8 @@ def default(robot: RobotCfg) -> EnvCfg:
         "object_velocity": ObservationTerm(observations.object_velocity, params=named),
         "object_orientation": ObservationTerm(observations.object_orientation, params=named),
     }
-    return EnvCfg(
-        robot=tower.builder,
-        scene=scene,
-        sim=tower.sim(),
-        episode_length_s=7.0 + tower.extra,
+    return tower.task(
+        length_s=7.0,
         actions=lets_go(joint_actions(scale=0.5)),
         command=CommandTerm(
             commands.uniform_pose,
@@ -59,11 +56,6 @@ def default(robot: RobotCfg) -> EnvCfg:
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
-        rewards=tower.rewards(),
-        success=tower.success(),
-        metrics=tower.metrics(),
-        terminations=tower.terminations(),
-        controllers=tower.controllers(),
         training=QUIET,
         budget=Budget(steps=150_000_000),
     )

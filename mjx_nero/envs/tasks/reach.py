@@ -4,9 +4,19 @@ import dataclasses
 import functools
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, joint_actions, velocity_actions
+from mjx_nero.envs.task import (
+    CALM,
+    Budget,
+    CurriculumCfg,
+    EnvCfg,
+    Presets,
+    SuccessCfg,
+    joint_actions,
+    step_weights,
+    velocity_actions,
+)
 from mjx_nero.envs.tasks import sim2real as sim2reals
-from mjx_nero.mdp import commands, curriculum, events, observations, rewards, success, terminations
+from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -99,12 +109,7 @@ def isaac(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        curriculum=CurriculumCfg(
-            weights={
-                "action_rate": Term(curriculum.step_weight, params={"to": -5e-3, "num_steps": 4500}),
-                "joint_vel": Term(curriculum.step_weight, params={"to": -1e-3, "num_steps": 4500}),
-            }
-        ),
+        curriculum=CurriculumCfg(weights=step_weights(4500, action_rate=-5e-3, joint_vel=-1e-3)),
         terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
         training=RUNNER,
         budget=BUDGET,

@@ -1,7 +1,7 @@
 """Tasks seen through cameras: pictures replace the observations of objects.
 
 The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``; lifts also have ``sim2real_rgb``. A teacher
-that is told the objects' positions trains a student that is not (``learn.distill``).
+that is told the objects' positions trains a student that is not (``imitation.distill``).
 """
 
 import dataclasses

@@ -54,11 +54,8 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         **_each(objects, "{}_orientation", observations.object_orientation),
     }
     apart = round(robot.opening / 2 + edge / 2 + BESIDE, 4)
-    return EnvCfg(
-        robot=tower.builder,
-        scene=scene,
-        sim=tower.sim(),
-        episode_length_s=episode_length_s + tower.extra,
+    return tower.task(
+        length_s=episode_length_s,
         actions=lets_go({**velocity_actions(), "gripper": Term(ContinuousGripper)}),
         command=CommandTerm(commands.nothing, resample_s=ONCE),
         events={
@@ -69,10 +66,6 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards={**tower.rewards(), "leaving": leaving},
-        success=tower.success(),
-        metrics=tower.metrics(),
-        terminations=tower.terminations(),
-        controllers=tower.controllers(),
         training=CALM,
         budget=Budget(steps=180_000_000),
     )

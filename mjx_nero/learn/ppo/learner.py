@@ -40,9 +40,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from mjx_nero import config
+from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
-from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn.learner import Kind, Observation, repeated
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
@@ -140,10 +141,7 @@ class Learner:
         if school and shown is not None:
             normalizer = imitation.seen(normalizer, shown)
             params = imitation.cloned(self.networks, normalizer, params, shown, k_net)
-        env_state = self.env.reset(jax.random.split(k_env, self.cfg.num_envs), bank)
-        carry = env_state.info["carry"]
-        phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
-        env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
+        env_state = wrappers.begun(self.env, k_env, k_phase, self.num_envs, bank)
         opt_state = self._optimizer.init(params)
         returns = running_statistics.init_state(specs.Array((), jnp.dtype("float32")), std_eps=jnp.float32(1e-6))
         state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns, school)
@@ -224,9 +222,7 @@ class Learner:
         return run(state)
 
     def _run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
-        with jax.default_matmul_precision("float32"):
-            state, metrics = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
-        return state, {name: jnp.mean(value) for name, value in metrics.items()}
+        return repeated(self._iterate, state, iterations)
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, k_roll, k_update = jax.random.split(state.key, 3)

@@ -40,8 +40,6 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
 
     In a group whose terms stay apart, an encoder reads each term, and their features are concatenated.
 
-    A group whose terms stay apart is read through an encoder for each term, whose features stand side by side.
-
     Raises:
         UserError: an encoder is unknown, or names a term that no network reads apart.
     """

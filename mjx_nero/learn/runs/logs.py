@@ -31,9 +31,6 @@ class Logs:
     Everything runs in the caller's thread. TensorBoard's usual writer has a thread that dies when the disk is full, and then
     blocks its callers forever.
 
-    Everything is written by the caller's own thread: TensorBoard's usual writer has one that dies with a full disk, and whoever
-    then hands it a number waits for ever.
-
     Args:
         warn: called with a line when something is lost for the first time.
         active: False in processes that are not the first, which write nothing.

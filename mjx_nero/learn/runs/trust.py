@@ -8,8 +8,9 @@ import hashlib
 import pathlib
 from collections.abc import Iterable
 
-from mjx_nero import cache, files
+from mjx_nero import files
 from mjx_nero.errors import UserError
+from mjx_nero.learn import cache
 from mjx_nero.learn.runs.folder import CONFIG
 
 

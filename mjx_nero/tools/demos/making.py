@@ -18,8 +18,8 @@ from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
+from mjx_nero.imitation.distill import teachers
 from mjx_nero.learn import policy
-from mjx_nero.learn.distill import teachers
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.learn.play.demonstrations import Player
 from mjx_nero.learn.play.pictures import Cameras

@@ -214,7 +214,7 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
     """
     if cfg:
         env = ManipulationEnv(cfg, impl="jax")
-        state = env.reset(jax.random.PRNGKey(0))
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
         qpos, scenery = jax.device_get((state.pipeline_state.qpos, env.scenery(state)))
         with render.Renderer(env.mj_model, width, height) as renderer:
             return renderer.render(qpos, scenery)

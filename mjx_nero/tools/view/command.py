@@ -59,18 +59,10 @@ def main(argv: Sequence[str]) -> None:
     serve(
         env_name=args.env if "env" in given else None,
         preset=args.preset if "preset" in given else None,
-        robot=args.robot,
         policies=args.policy,
-        agent=args.agent,
-        run=args.run,
-        num_envs=args.num_envs,
-        seed=args.seed,
-        host=args.host,
-        port=args.port,
         overrides=dotted["env"],
-        demos=args.demos,
-        episode=args.episode,
         leader=leader.at(args.leader, args.calibration) if args.leader else None,
+        **{name: getattr(args, name) for name in "robot agent run num_envs seed host port demos episode".split()},
     )
 
 

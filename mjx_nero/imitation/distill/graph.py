@@ -1,4 +1,4 @@
-"""A student of ``learn.distill`` as an ONNX graph: pictures in, normalisation inside."""
+"""The student as an ONNX graph: pictures in, normalisation inside. ``interop.onnx`` brings the graph to draw in (``Graph``)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_nero.interop.graph import Graph
-from mjx_nero.learn.distill import networks
+from mjx_nero.imitation.distill import networks
 from mjx_nero.learn.policy import Policy
 
+Graph = Any
 TRIES = 300  # observations of a check: pictures take a thousand times as long as vectors
 
 

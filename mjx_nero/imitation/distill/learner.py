@@ -23,12 +23,13 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from mjx_nero import config
+from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
+from mjx_nero.imitation.distill import graph, teachers
+from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
+from mjx_nero.imitation.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.distill import teachers
-from mjx_nero.learn.distill.cfg import ENVS, PRESETS, DistillCfg
-from mjx_nero.learn.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
-from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn.learner import Kind, Observation, repeated
 from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
@@ -89,10 +90,7 @@ class Learner:
         """Makes a new student and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.network, self.sizes, k_net)
-        env_state = self.env.reset(jax.random.split(k_env, self.num_envs), bank)
-        carry = env_state.info["carry"]
-        phase = jax.random.randint(k_phase, carry.step.shape, 0, self.env.unwrapped.episode_length)
-        env_state = env_state.replace(info={**env_state.info, "carry": carry.replace(step=phase)})
+        env_state = wrappers.begun(self.env, k_env, k_phase, self.num_envs, bank)
         state = TrainState(
             normalizer, params, self._optimizer.init(params), env_state, key, jnp.zeros((), jnp.int32), jnp.ones(())
         )
@@ -142,9 +140,7 @@ class Learner:
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""
-        with jax.default_matmul_precision("float32"):
-            state, metrics = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
-        return state, {name: jnp.mean(value) for name, value in metrics.items()}
+        return repeated(self._iterate, state, iterations)
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, k_roll, k_update = jax.random.split(state.key, 3)
@@ -222,4 +218,4 @@ _HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
 
 _PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD, graph=graph)

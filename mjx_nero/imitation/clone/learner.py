@@ -21,7 +21,7 @@ from mjx_nero import config
 from mjx_nero.data import open_dataset
 from mjx_nero.data.episode import DONE_BY, SEEN, Dataset
 from mjx_nero.errors import UserError
-from mjx_nero.learn.clone.cfg import PRESETS, CloneCfg
+from mjx_nero.imitation.clone.cfg import PRESETS, CloneCfg
 from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.ppo.cfg import differing
 from mjx_nero.learn.ppo.networks import ACTOR, from_meta, init_params, make_act, make_networks

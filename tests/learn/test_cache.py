@@ -6,7 +6,8 @@ import zlib
 
 import pytest
 
-from mjx_nero import UserError, cache
+from mjx_nero import UserError
+from mjx_nero.learn import cache
 
 
 def nowhere():

@@ -13,7 +13,7 @@ from brax.training.acme import running_statistics, specs
 from flax import linen
 
 from mjx_nero.config.values import read
-from mjx_nero.learn.distill.cfg import StudentCfg
+from mjx_nero.imitation.distill.cfg import StudentCfg
 from mjx_nero.learn.learner import Act, Observation
 from mjx_nero.types import Key
 
