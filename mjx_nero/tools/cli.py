@@ -20,7 +20,7 @@ from typing import Annotated, Any, NoReturn
 from mjx_nero import config
 from mjx_nero.config import bounds, docs, values
 from mjx_nero.errors import UserError, missing
-from mjx_nero.learn import cache
+from mjx_nero.files import cache
 
 LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from mjx_nero import files
 from mjx_nero.errors import UserError
-from mjx_nero.learn import cache
+from mjx_nero.files import cache
 from mjx_nero.learn.runs.folder import CONFIG
 
 

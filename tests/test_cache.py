@@ -7,7 +7,7 @@ import zlib
 import pytest
 
 from mjx_nero import UserError
-from mjx_nero.learn import cache
+from mjx_nero.files import cache
 
 
 def nowhere():
