@@ -13,6 +13,7 @@ Key = jax.Array  # a JAX random key
 TARGET = "target"  # in ``View.objects``: the one of ``CommandTerm.targets`` that the episode commands
 LEVEL = "level"  # in ``Carry.memory``: what share of all that differs an episode has; not there: all of it
 LOOK = "look"  # in ``Carry.memory``: the fields of the drawn model that the episode has (``Scenery.look``); not there: none
+SHAPE = "shape"  # in ``Carry.memory``: which of its shapes each object with a bank has; not there: there is none
 PHASE = "phase"  # in ``Carry.memory``: which of an expert's phases the episode began in (``Start.phase``); not there: in none
 
 
@@ -67,6 +68,7 @@ class Start:
     target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``CommandTerm.targets``
     pull: Float[Array, " nj"] | float = 0.0  # how far the drives' targets are from the joints: what fingers press with [rad, m]
     phase: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # of the expert's; 0: not its
+    shape: dict[str, Int[Array, ""]] = struct.field(default_factory=dict)  # which of its shapes each object with a bank has
 
 
 @struct.dataclass
@@ -97,6 +99,17 @@ class Progress:
 
 
 @struct.dataclass
+class ShapeView:
+    """The shape of an object of a mesh, in its own frame."""
+
+    index: Int[Array, ""]  # which of its bank's
+    points: Float[Array, "n 3"]  # corners of its hull [m]
+    middle: Float[Array, "3"]  # of the box around it [m]
+    edges: Float[Array, "3"]  # of that box [m]
+    code: Float[Array, " k"]  # what a policy sees of it (``sim.objects.shapes.code``) [m]
+
+
+@struct.dataclass
 class ObjectView:
     """An object of the scene, as terms may read it."""
 
@@ -104,6 +117,7 @@ class ObjectView:
     quat_w: Float[Array, "4"]  # wxyz
     linvel_w: Float[Array, "3"]  # [m/s]
     angvel_local: Float[Array, "3"]  # in the object's own frame [rad/s]
+    shape: ShapeView | None = None  # of a mesh
 
 
 @struct.dataclass

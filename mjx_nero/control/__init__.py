@@ -8,6 +8,7 @@ from mjx_nero.config.registry import Registry
 from mjx_nero.control.controller import Controller
 from mjx_nero.control.detour import CarryPast, CarryPastCfg, Detour, DetourCfg
 from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
+from mjx_nero.control.grasp_thing import GraspThing, GraspThingCfg
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
@@ -23,6 +24,7 @@ CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
         "detour": (Detour, DetourCfg()),
         "carry": (CarryPast, CarryPastCfg()),
         "pick_up": (PickUp, PickUpCfg()),
+        "grasp_thing": (GraspThing, GraspThingCfg()),
     },
 )
 

@@ -140,7 +140,7 @@ class PickUp:
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
-        lost = (phase >= UP) & (jnp.linalg.norm(view.ee_pos_w - seen) > self._lost)
+        lost = (phase >= UP) & (self._off(memory, view) > self._lost)
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - wanted), far < 1e-3)
         memory = dataclasses.replace(
             self._again(memory, view, lost),
@@ -153,6 +153,10 @@ class PickUp:
             tries=memory.tries + lost,
         )
         return memory, jnp.concatenate([q + self._lead * qd, fingers])
+
+    def _off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
+        """Distance of the grasp point from where the object is to be held [m]."""
+        return jnp.linalg.norm(view.ee_pos_w - view.objects[self.cfg.object].pos_w)
 
     def _ended(self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""]) -> Bool[Array, ""]:
         """True if the phase is done, or has had enough time.

@@ -19,7 +19,7 @@ from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config import bounds, values
-from mjx_nero.envs import identified
+from mjx_nero.envs import identified, things
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import events, terms
@@ -30,8 +30,10 @@ from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import cameras, linkage, obstacles, scene, touch
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
+from mjx_nero.sim.objects import bank
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, LOOK, PHASE, TARGET, Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
+from mjx_nero.types import LEVEL, LOOK, PHASE, SHAPE, TARGET
+from mjx_nero.types import Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
 
 _MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
@@ -74,7 +76,7 @@ class ManipulationEnv(Env):
     """
 
     def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
-        cfg = identified.applied(cfg)
+        cfg = things.applied(identified.applied(cfg))
         self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), values.read(bounds.Worlds, num_envs, "num_envs")
         self.dt = cfg.sim.dt * cfg.sim.decimation
         if cfg.episode_length_s / self.dt > _LONGEST:
@@ -87,6 +89,7 @@ class ManipulationEnv(Env):
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
+        self._banks = bank.Banks(model, cfg.scene.objects)
         sees = self._pictures if cfg.scene.cameras else None
         self._viewer = Viewer(
             model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.command, self._obstacles, sees
@@ -118,7 +121,7 @@ class ManipulationEnv(Env):
     def physics(self) -> Physics:
         """The physics backend, created at the first step."""
         with jax.ensure_compile_time_eval():  # the first step may run under a trace
-            drawn = self._randomization.names + (obstacles.FIELDS if self.cfg.obstacles else ())
+            drawn = self._randomization.names + self._banks.names + (obstacles.FIELDS if self.cfg.obstacles else ())
             return make_physics(self.physics_model, self.cfg.sim, self.impl, tuple(dict.fromkeys(drawn)))
 
     @functools.cached_property
@@ -132,7 +135,8 @@ class ManipulationEnv(Env):
         with jax.ensure_compile_time_eval():
             where, differ = self.cfg.scene, tuple(self._differing())
             kind = cameras.renderer(where.renderer, self.impl)
-            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), self._look.names)
+            seen = tuple(dict.fromkeys((*self._look.names, *(("geom_rgba",) if self._banks.counts else ()))))
+            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), seen)
 
     @functools.cached_property
     def _look(self) -> Look:
@@ -204,7 +208,7 @@ class ManipulationEnv(Env):
         if starts:
             start = events.visited(k_visited, start, bank=starts[0], chances=starts[1])
             command = jnp.where(start.phase > 0, start.goal_pos_w - base, command)
-        fields = self._randomization(k_fields, level)
+        fields = self._randomization(k_fields, level, self._banks(start.shape))
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
         sim = Sim(
             qpos=qpos,
@@ -221,7 +225,11 @@ class ManipulationEnv(Env):
             action=jnp.zeros(self.action_size),
             command=command,
             command_quat=start.goal_quat_w,
-            memory={**({TARGET: start.target} if self.cfg.command.targets else {}), **({} if level is None else {LEVEL: level})},
+            memory={
+                **({TARGET: start.target} if self.cfg.command.targets else {}),
+                **({} if level is None else {LEVEL: level}),
+                **({SHAPE: start.shape} if self._banks.counts else {}),
+            },
         )
         if starts:  # as if the previous action had asked for these targets
             last = self.actions.invert(sim.ctrl, qpos[self._viewer.qpos_ids])
@@ -243,6 +251,7 @@ class ManipulationEnv(Env):
             object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
             object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
             pull=jnp.zeros(len(self.cfg.robot.home)),
+            shape=dict.fromkeys(self._banks.counts, jnp.zeros((), jnp.int32)),
         )
         return Bank(start, jnp.zeros((), bool))
 
@@ -254,7 +263,7 @@ class ManipulationEnv(Env):
             qpos = qpos.at[coupling.follower].set(coupling.position(qpos))
         for name, (at, _) in self._viewer.objects.items():
             qpos = qpos.at[at : at + 7].set(jnp.concatenate([start.object_pos_w[name], start.object_quat_w[name]]))
-            if "geom_size" in fields:
+            if "geom_size" in fields and self.cfg.scene.objects[name].shape != "mesh":
                 geom = self.physics_model.geom(name).id
                 factor = fields["geom_size"][geom, 0] / self.physics_model.geom_size[geom, 0]
                 qpos = qpos.at[at + 2].add((factor - 1) * self.cfg.scene.objects[name].rest_height)
@@ -300,7 +309,9 @@ class ManipulationEnv(Env):
 
     def _scenery(self, sim: Sim, carry: Carry) -> Scenery:
         goal, _ = self._viewer.goal(carry)
-        boxes, look = self._obstacles.views(sim.fields), carry.memory.get(LOOK, {})
+        boxes, look = self._obstacles.views(sim.fields), dict(carry.memory.get(LOOK, {}))
+        if SHAPE in carry.memory:
+            look |= bank.look(self.mj_model, self._banks.counts, carry.memory[SHAPE])
         return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
 
     def _pictures(self, sim: Sim, carry: Carry, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:

@@ -14,6 +14,7 @@ from mjx_nero.envs.tasks import (
     clutter,
     follow_target,
     lift,
+    lift_any,
     lift_obstacles,
     pick_place,
     place,
@@ -129,6 +130,7 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
 # tasks an arm may bring its own numbers, as ``nero_lift`` brings those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
+    "lift_any": lift_any.presets(),
     "push": push.presets(),
     "place": _presets(_tower, **place.presets()),
     "stack": _presets(_tower, **stack.presets()),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mjx_nero import config
 from mjx_nero.config import values
 from mjx_nero.config.registry import Registry, pick
-from mjx_nero.envs import arms, fitted
+from mjx_nero.envs import arms, fitted, things
 from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.sim import contacts, robot_file
 from mjx_nero.sim.robot import RobotCfg
@@ -89,7 +89,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
     cfg = dataclasses.replace(cfg, sim=cfg.sim.finer(cfg.robot.max_step))
     if chosen.folder:  # imported: nobody has counted the contacts that its work makes
         cfg = dataclasses.replace(cfg, sim=contacts.sized(chosen, cfg.scene, cfg.sim))
-    return config.override(cfg, overrides)
+    return things.applied(config.override(cfg, overrides))
 
 
 def make(

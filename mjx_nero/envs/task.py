@@ -118,6 +118,21 @@ class CurriculumCfg:
 
 
 @dataclasses.dataclass(frozen=True)
+class ThingCfg:
+    """A thing of a mesh that takes the place of a task's object (``envs.things``).
+
+    Attributes:
+        file: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name. Empty: none.
+        scale: of its lengths.
+        density: [kg/m3]; 0: what its ``object.yaml`` says, or else 500.
+    """
+
+    file: str = ""
+    scale: Positive = 1.0
+    density: NonNegative = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvCfg:
     """A whole task. Read ``tasks/lift.py`` for an example. Every field can be overridden by its dotted name.
 
@@ -131,6 +146,7 @@ class EnvCfg:
         obstacles: draws where the scene's obstacles stand, after each episode's start and goal (``mdp.obstacles``).
         pushes: sudden velocities added to objects (``mdp.pushes``).
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
+        object: a thing of a mesh that takes the place of the task's object, as ``--object FILE`` says.
         controllers: controllers of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config
             by dotted name.
         learner: the learner that trains the task by default.
@@ -161,6 +177,7 @@ class EnvCfg:
     obstacles: Term | None = None
     pushes: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     identified: str = ""
+    object: ThingCfg = ThingCfg()
     controllers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     learner: str = "ppo"
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -1,6 +1,8 @@
 """Turns the physics state and the carry into the ``View`` that terms read."""
 
-from collections.abc import Callable, Iterable
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,8 @@ from mjx_nero.mdp.terms import CommandTerm
 from mjx_nero.sim import kinematics
 from mjx_nero.sim.obstacles import Obstacles
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.types import TARGET, Carry, ObjectView, Picture, Sim, View
+from mjx_nero.sim.objects import shapes
+from mjx_nero.types import SHAPE, TARGET, Carry, ObjectView, Picture, ShapeView, Sim, View
 
 
 class Viewer:
@@ -21,7 +24,7 @@ class Viewer:
     Args:
         model: the compiled scene.
         robot: the robot whose joints and end effector to read.
-        objects: names of the scene's objects.
+        objects: the scene's objects; of their configs, if they come with these, the shapes of meshes.
         max_steps: control steps of an episode.
         dt: duration of a control step [s].
         command: how the goal moves, and which objects may be commanded.
@@ -36,7 +39,7 @@ class Viewer:
         self,
         model: mujoco.MjModel,
         robot: RobotCfg,
-        objects: Iterable[str],
+        objects: Iterable[str] | Mapping[str, Any],
         max_steps: int,
         dt: float,
         command: CommandTerm,
@@ -46,6 +49,7 @@ class Viewer:
         self.qpos_ids = np.array([model.joint(j).qposadr[0] for j in robot.joints])
         self.dof_ids = np.array([model.joint(j).dofadr[0] for j in robot.joints])
         self.objects = {name: (int(model.joint(name).qposadr[0]), int(model.joint(name).dofadr[0])) for name in objects}
+        self._shapes = _shapes(objects) if isinstance(objects, Mapping) else {}
         self._ee_pose = kinematics.site_pose_fn(model, robot.ee_site)
         self._gain = np.array(model.actuator_gainprm, np.float32)
         self._default = np.asarray(robot.home, np.float32)
@@ -58,9 +62,14 @@ class Viewer:
         ee_pos, ee_quat = self._ee_pose(sim.qpos)
         goal, goal_linvel = self.goal(carry)
         objects = {name: _object(sim.qpos[at:][:7], sim.qvel[dof:][:6]) for name, (at, dof) in self.objects.items()}
+        for name, table in self._shapes.items():
+            index = carry.memory.get(SHAPE, {}).get(name, jnp.zeros((), jnp.int32))
+            shape = ShapeView(index, *(jnp.asarray(values)[index] for values in table))
+            objects[name] = dataclasses.replace(objects[name], shape=shape)
         target = carry.memory[TARGET] if self._targets else None
         if target is not None:
-            objects[TARGET] = jax.tree.map(lambda *each: jnp.stack(each)[target], *(objects[name] for name in self._targets))
+            each = [dataclasses.replace(objects[name], shape=None) for name in self._targets]
+            objects[TARGET] = jax.tree.map(lambda *each: jnp.stack(each)[target], *each)
         return View(
             joint_pos=sim.qpos[self.qpos_ids],
             joint_vel=sim.qvel[self.dof_ids],
@@ -104,3 +113,14 @@ class Viewer:
 
 def _object(pose: Float[Array, "7"], speed: Float[Array, "6"]) -> ObjectView:
     return ObjectView(pos_w=pose[:3], quat_w=pose[3:], linvel_w=speed[:3], angvel_local=speed[3:])
+
+
+def _shapes(objects: Mapping[str, Any]) -> dict[str, tuple[np.ndarray, ...]]:
+    """The shapes of each object of a mesh, [shapes, ...]: points, middle, edges and code, as in ``ShapeView``."""
+    out = {}
+    for name, item in objects.items():
+        if item.shape == "mesh":
+            boxes = [shapes.box(solid) for solid in item.solids]
+            points, codes = (np.stack([make(solid) for solid in item.solids]) for make in (shapes.points, shapes.code))
+            out[name] = tuple(x.astype(np.float32) for x in (points, np.stack(boxes)[:, 0], np.stack(boxes)[:, 1], codes))
+    return out

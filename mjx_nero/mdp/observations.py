@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from mjx_nero import math
 from mjx_nero.config.bounds import Count, Positive
 from mjx_nero.mdp import success
-from mjx_nero.types import View
+from mjx_nero.types import UserError, View
 
 
 def joint_pos(view: View) -> Float[Array, " nj"]:
@@ -80,6 +80,18 @@ def object_velocity(view: View, *, object: str = "cube") -> Float[Array, "6"]:
 def object_orientation(view: View, *, object: str = "cube") -> Float[Array, "4"]:
     """Orientation of the object, wxyz."""
     return view.objects[object].quat_w
+
+
+def object_shape(view: View, *, object: str = "cube") -> Float[Array, " k"]:
+    """Shape of an object of a mesh, in its own frame: how far it reaches in some directions, and its radii of gyration [m].
+
+    Raises:
+        UserError: the object is no mesh.
+    """
+    shape = view.objects[object].shape
+    if shape is None:
+        raise UserError(f"object_shape reads the shape of a mesh, and {object!r} is none")
+    return shape.code
 
 
 def object_heading(view: View, *, object: str = "cube") -> Float[Array, "2"]:

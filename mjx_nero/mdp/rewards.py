@@ -12,17 +12,31 @@ Heights = float | tuple[float, ...]  # [m]
 
 
 def _ee_distance(view: View, object: str) -> Float[Array, ""]:
-    return jnp.linalg.norm(view.objects[object].pos_w - view.ee_pos_w)
+    """Distance of the grasp point from the object's centre, or from the box around a mesh [m]."""
+    seen = view.objects[object]
+    if seen.shape is None:
+        return jnp.linalg.norm(seen.pos_w - view.ee_pos_w)
+    middle = seen.pos_w + math.rotate(seen.quat_w, seen.shape.middle)
+    return jnp.maximum(math.box_distance(view.ee_pos_w, middle, seen.quat_w, seen.shape.edges), 0.0)
+
+
+def _height(view: View, object: str) -> Float[Array, ""]:
+    """Height of the object's centre above the table, or of the lowest point of a mesh [m]."""
+    seen = view.objects[object]
+    low = 0.0 if seen.shape is None else jnp.min(seen.shape.points @ math.rotation_matrix(seen.quat_w)[2])
+    return seen.pos_w[2] + low
 
 
 def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
     """True if the object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
+    Of a mesh the lowest point counts, and the box around it: its size and the way it lies do not matter.
+
     A cube that was knocked into the air is above the height too, but only a gripped one stays at the grasp point. A tuple gives
     one height per object of ``CommandTerm.targets``; the commanded object's counts.
     """
     height = jnp.array(minimal_height)[view.target] if isinstance(minimal_height, tuple) else minimal_height
-    return (view.objects[object].pos_w[2] > height) & (_ee_distance(view, object) < grasp_radius)
+    return (_height(view, object) > height) & (_ee_distance(view, object) < grasp_radius)
 
 
 def object_ee_distance(view: View, *, std: Positive, object: str = "cube") -> Float[Array, ""]:

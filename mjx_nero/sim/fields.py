@@ -1,6 +1,7 @@
 """Model fields that differ between worlds: those that ``mdp.randomization`` draws, and those derived from them."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,17 +74,23 @@ class Randomization:
         self._derived = {name: np.array(getattr(model, name), np.float32) for name in _DERIVED} if trees else {}
         self.names = tuple(rows) + tuple(self._derived)
 
-    def __call__(self, key: Key, level: Float[Array, ""] | None = None) -> Fields:
-        """Draws the fields of one world; empty without terms. ``level``: see ``types.LEVEL``."""
-        drawn: Fields = {}
+    def __call__(self, key: Key, level: Float[Array, ""] | None = None, given: Mapping[str, Array] | None = None) -> Fields:
+        """Draws the fields of one world; empty without terms. ``level``: see ``types.LEVEL``.
+
+        Args:
+            given: fields that differ already, as those of an object's shape do (``objects.bank``).
+        """
+        given = given or {}
+        drawn: Fields = dict(given)
         for k_term, term in zip(
             jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True
         ):
             for field, (rows, values) in term(k_term, self._model(drawn)).items():
                 drawn[field] = drawn.get(field, jnp.asarray(self._nominal[field])).at[rows].set(values)
-        drawn = {name: toward(level, jnp.asarray(self._nominal[name]), values) for name, values in drawn.items()}
+        nominal: dict[str, Any] = {**self._nominal, **given}
+        drawn = {name: toward(level, jnp.asarray(nominal[name]), values) for name, values in drawn.items()}
         now: Fields = {**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}
-        derived = {name: jnp.asarray(value) for name, value in self._derived.items()}
+        derived = {name: jnp.asarray(given.get(name, value)) for name, value in self._derived.items()}
         for tree in self._trees:
             for name, (rows, values) in tree(now, moved="body_ipos" in drawn).items():
                 derived[name] = derived[name].at[rows].set(values)

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_nero import math
 from mjx_nero.sim import linkage
+from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
 from mjx_nero.types import UserError
@@ -141,6 +142,16 @@ def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
     """Lists the names of the shapes that grip."""
     geoms = model.geoms if isinstance(model, mujoco.MjSpec) else map(model.geom, range(model.ngeom))
     return [geom.name for geom in geoms if "pad" in geom.name]
+
+
+def hand(robot: RobotCfg) -> Hand:
+    """The hand of a robot, as grasps of meshes are looked for.
+
+    Raises:
+        UserError: the robot has no gripper, or its opening is unknown.
+    """
+    cube_for(robot)
+    return Hand(robot.opening, robot.closed, robot.pad, lowest(robot.pad))
 
 
 class _Hand:

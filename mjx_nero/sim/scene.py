@@ -10,10 +10,11 @@ import numpy as np
 
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive
-from mjx_nero.sim import robot_file, touch
+from mjx_nero.sim import objects, robot_file, touch
 from mjx_nero.sim.cameras import cfg as cameras
 from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
+from mjx_nero.sim.objects import body as mesh_body
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
@@ -40,12 +41,17 @@ class ObjectCfg:
             cylinder and everything else as the capsule inside it: a flat pad touches a cylinder's side at a single point that
             jumps about, and MJX-JAX finds no contact there.
         size: edges of a box; radius of a sphere; radius and length of a cylinder, or of a capsule without its ends [m].
-        mass: [kg].
+        mass: [kg]; a mesh has its ``density``.
         friction: sliding [1], spinning and rolling [m].
         condim: contact dimension: 3 slides, 4 also spins, 6 also rolls. The larger of two geoms holds.
         pos: place before the reset events: x, y, and height above the table [m].
         quat: orientation there, wxyz.
         rgba: colour.
+        file: of a ``mesh``: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name.
+            It is cut into convex parts; its place is its centre of mass.
+        bank: further files; in each episode the object has one of all these shapes (``sim.objects.bank``).
+        scale: of a mesh's lengths.
+        density: of a mesh [kg/m3], from which its mass follows; 0: what its ``object.yaml`` says, or else 500.
     """
 
     shape: str = "box"
@@ -56,10 +62,26 @@ class ObjectCfg:
     pos: tuple[float, float, float] = (0.35, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     rgba: tuple[float, float, float, float] = (0.85, 0.3, 0.2, 1.0)
+    file: str = ""
+    bank: tuple[str, ...] = ()
+    scale: Positive = 1.0
+    density: NonNegative = 0.0
+
+    @property
+    def solids(self) -> list[objects.Solid]:
+        """The shapes of a mesh, at its scale."""
+        return [objects.find(file).scaled(self.scale) for file in (self.file, *self.bank)]
+
+    @property
+    def masses(self) -> list[float]:
+        """The masses of the shapes of a mesh [kg]."""
+        return [(self.density or solid.density) * solid.volume for solid in self.solids]
 
     @property
     def rest_height(self) -> float:
         """Height of its centre when it rests on the table [m]."""
+        if self.shape == "mesh":
+            return self.solids[0].height(np.array(self.quat))
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, np.asarray(self.quat) / np.linalg.norm(self.quat))
         up, (first, *rest) = turn[6:], self.size
@@ -179,6 +201,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     whole = bool(scene.obstacles) or scene.self_collision
     spec = _robot_spec(robot, whole)
     spec.modelname = f"{robot.name}_scene"
+    if not visuals:
+        spec.discard_visual()  # before things bring meshes that no geom has yet (``objects.bank``), which it would drop, too
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -194,7 +218,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     for drive in (robot.arm, robot.gripper):
         _add_drives(spec, drive)
     for name, item in scene.objects.items():
-        _add_object(spec, name, item)
+        _add_object(spec, name, item, visuals)
     goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
     if whole:
         pairs = touch.self_pairs(robot) if scene.self_collision else ()
@@ -206,8 +230,6 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         cameras.add(spec, scene.cameras)
         _add_props(spec, scene, robot)
         textures.add(spec, scene.photographs, scene.patterns)
-    else:
-        spec.discard_visual()
     spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
     return touch.unbounded(spec.compile())
 
@@ -255,23 +277,19 @@ def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
     return spec
 
 
-def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectCfg) -> None:
-    if item.shape not in _SHAPES:
-        raise UserError(f"scene.objects.{name}.shape must be one of {', '.join(_SHAPES)}, got {item.shape!r}")
+def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectCfg, visuals: bool) -> None:
+    if item.shape not in (*_SHAPES, "mesh"):
+        raise UserError(f"scene.objects.{name}.shape must be one of {', '.join(_SHAPES)} or mesh, got {item.shape!r}")
+    if item.shape == "mesh":
+        return _add_mesh(spec, name, item, visuals)
     says = _SHAPES[item.shape][1]
     count = {"box": 3, "sphere": 1}.get(item.shape, 2)
     if len(item.size) != count:
         raise UserError(f"scene.objects.{name}.size of a {item.shape} is {says}, got {item.size}")
-    if item.condim not in (1, 3, 4, 6):
-        raise UserError(f"scene.objects.{name}.condim must be 1, 3, 4 or 6, got {item.condim}")
     if item.shape == "can" and item.size[1] <= 2 * item.size[0]:
         raise UserError(f"scene.objects.{name}.size of a can is its radius and more than twice that as length, got {item.size}")
-    if name == "goal" or spec.body(name) or spec.joint(name) or spec.geom(name):
-        raise UserError(f"scene.objects.{name} needs another name: the robot or the scene has one that is called so")
     shape, extent = _geom(item)
-    x, y, above = item.pos
-    body = spec.worldbody.add_body(name=name, pos=[x, y, item.rest_height + above], quat=item.quat)
-    body.add_freejoint(name=name)
+    body = _add_body(spec, name, item)
     body.add_geom(
         name=name,
         type=shape,
@@ -296,6 +314,26 @@ def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectCfg) -> None:
             conaffinity=_OBJECTS,
             group=3,
         )
+
+
+def _add_body(spec: mujoco.MjSpec, name: str, item: ObjectCfg):
+    if item.condim not in (1, 3, 4, 6):
+        raise UserError(f"scene.objects.{name}.condim must be 1, 3, 4 or 6, got {item.condim}")
+    if name == "goal" or spec.body(name) or spec.joint(name) or spec.geom(name):
+        raise UserError(f"scene.objects.{name} needs another name: the robot or the scene has one that is called so")
+    x, y, above = item.pos
+    body = spec.worldbody.add_body(name=name, pos=[x, y, item.rest_height + above], quat=item.quat)
+    body.add_freejoint(name=name)
+    return body
+
+
+def _add_mesh(spec: mujoco.MjSpec, name: str, item: ObjectCfg, visuals: bool) -> None:
+    mesh_body.checked(name, item.solids, item.scale)
+    slides = {"friction": item.friction, "condim": item.condim}
+    table = {**slides, "contype": 0, "conaffinity": _TABLE}
+    others = {**slides, "contype": _OBJECT | _OBJECTS, "conaffinity": _OBJECTS}
+    mesh_body.add(spec, name, item.solids, item.masses, _add_body(spec, name, item), table, others, visuals)
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # several contacts where flat sides meet
 
 
 def side(name: str) -> str:
@@ -342,10 +380,13 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) ->
     hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
     box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.goal_edge / 2
     shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
-    if item := scene.objects.get(scene.goal):
+    item, mesh = scene.objects.get(scene.goal), {}
+    if item and item.shape == "mesh":
+        shape, extent, mesh = mujoco.mjtGeom.mjGEOM_MESH, [0, 0, 0], {"meshname": mesh_body.drawn_name(scene.goal, 0)}
+    elif item:
         shape, extent = _geom(item)
     if scene.goal != "none":
-        goal.add_geom(name="goal", type=shape, size=extent, rgba=[0.2, 0.8, 0.3, 0.4], **hidden)
+        goal.add_geom(name="goal", type=shape, size=extent, rgba=[0.2, 0.8, 0.3, 0.4], **mesh, **hidden)
     if scene.goal == "frame":
         for axis, rgba in zip(np.eye(3), ([0.85, 0.2, 0.2, 1], [0.2, 0.7, 0.25, 1], [0.2, 0.35, 0.9, 1]), strict=True):
             ends = [0, 0, 0, *(0.06 * axis)]

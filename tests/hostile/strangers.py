@@ -24,6 +24,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 if __name__ == "__main__":
     sys.path[:0] = [str(HERE.parents[1]), str(HERE), str(HERE.parent), str(HERE.parent / "tools")]
 
+import bad_meshes  # noqa: E402
 import folders  # noqa: E402
 import fuzz  # noqa: E402
 import misuse  # noqa: E402
@@ -32,7 +33,17 @@ import sweep  # noqa: E402
 import worlds  # noqa: E402
 
 LONGEST = 500  # characters of a message
-SHARES = {"folder": 0.2, "config": 0.15, "names": 0.05, "urdf": 0.1, "files": 0.2, "http": 0.1, "messages": 0.1, "gym": 0.1}
+SHARES = {
+    "folder": 0.15,
+    "config": 0.1,
+    "names": 0.05,
+    "urdf": 0.1,
+    "mesh": 0.1,
+    "files": 0.2,
+    "http": 0.1,
+    "messages": 0.1,
+    "gym": 0.1,
+}
 SIGNALS = 8  # trainings that are ended, whatever the count
 # Each input of these is given to a process of its own: (random numbers, folder) -> what it is, and what is done with it.
 FORKED: dict[str, Callable[[random.Random, pathlib.Path], tuple[str, Callable[[], None]]]] = {
@@ -40,6 +51,7 @@ FORKED: dict[str, Callable[[random.Random, pathlib.Path], tuple[str, Callable[[]
     "config": folders.config,
     "names": folders.names,
     "urdf": worlds.urdf,
+    "mesh": bad_meshes.mesh,
 }
 # Many inputs of these to one process, as what they are given to takes long to start: (seed, count) -> each, and its fault.
 TOGETHER: dict[str, Callable[[int, int], Iterator[tuple[str, str]]]] = {

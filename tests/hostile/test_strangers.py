@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 
+import bad_meshes
 import folders
 import fuzz
 import pytest
@@ -62,7 +63,7 @@ def test_a_sweep_is_of_every_number():
     assert [c for _, c in sweep.files("gains", 5, 3)] == [c for _, c in sweep.files("gains", 5, 3)]
 
 
-@pytest.mark.parametrize("kind", [folders.entries, folders.config, folders.names, worlds.urdf])
+@pytest.mark.parametrize("kind", [folders.entries, folders.config, folders.names, worlds.urdf, bad_meshes.mesh])
 def test_the_same_seed_makes_the_same_input(kind, tmp_path):
     said = []
     for seed, name in ((1, "a"), (1, "b"), (2, "c")):

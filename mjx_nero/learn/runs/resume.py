@@ -20,7 +20,8 @@ from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
 from mjx_nero.learn.runs.folder import CONFIG
 
 # Fields of a run's environment that name files, which may lie outside the run's folder.
-_PATHS = ("identified", "robot.folder", "robot.name", "robot.mjcf")
+_PATHS = ("identified", "object.file", "robot.folder", "robot.name", "robot.mjcf")
+_MESHES = ("file", "bank")  # how the names of further ones end, of objects
 # Fields that a resumed run may change (how long, on what, what it leaves behind), and all that its config stores.
 _FREE = config.marked(RunCfg, "free")
 _OWN = (*_FREE, *config.marked(RunCfg, "kept"))
@@ -160,9 +161,9 @@ def _outside(asked: Asked) -> Iterator[str]:
     """Yields the files that a run names outside its folder."""
     if asked.robot is not None and asked.robot not in registry.list_robots():
         yield asked.robot
-    for name in _PATHS:
-        if asked.env.get(name):
-            yield str(asked.env[name])
+    for name, value in asked.env.items():
+        if value and (name in _PATHS or name.startswith("scene.objects") and name.rpartition(".")[2] in _MESHES):
+            yield str(value)
     if asked.learner.get("teacher"):
         yield str(asked.learner["teacher"])
 

@@ -13,7 +13,7 @@ from mujoco import mjx
 from mjx_nero.sim import touch
 from mjx_nero.sim.physics import Footprint, possible
 from mjx_nero.sim.scene import SimCfg
-from mjx_nero.types import Sim
+from mjx_nero.types import Sim, UserError
 
 # Most steps of MJX's line search. With 50, which MuJoCo's C library needs, a held cube slipped by 2 mm in one of eight places.
 # With 20 it slipped in none (tests/sim/test_grasp.py).
@@ -24,6 +24,8 @@ class JaxPhysics:
     """See ``physics.Physics``."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
+        if "geom_dataid" in fields:
+            raise UserError("MJX-JAX cannot give an object another shape in each episode (bank): use --impl native or warp")
         self.model, self.decimation = model, cfg.decimation
         own = copy.copy(model)
         own.opt.ls_iterations = min(model.opt.ls_iterations, LINE_SEARCH)

@@ -26,6 +26,9 @@ from mjx_nero.types import Sim
 # MuJoCo Warp's OverflowType bits that mean lost contacts or constraint rows; the others report unconverged solver iterations.
 _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 
+# Fields of MuJoCo's C library alone. A mesh that a world lacks has no contact bits there; here its geom has no mesh.
+_OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
+
 # Warp's current device is the process's and not a thread's: whoever changes it keeps others from making anything meanwhile, as
 # kernels that find their arrays on another device than they were loaded for end the process.
 WARP = threading.Lock()
@@ -36,8 +39,7 @@ class WarpPhysics:
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
-        # dof_M0 is of MuJoCo's C library alone.
-        self._fields = {name: np.shape(getattr(model, name)) for name in fields if name != "dof_M0"}
+        self._fields = {name: np.shape(getattr(model, name)) for name in fields if name not in _OF_C}
         self._readers = touch.readers(model)
         self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
@@ -162,12 +164,14 @@ class WarpPhysics:
         with possible("MuJoCo Warp"):
             model = mujoco_warp.put_model(self.model)
         drawn = world_fields(model, self._fields, n)
+        convert = whole_numbers(model, self._fields, drawn)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
         step, strongest = self._stepper(model, data)
 
         def run():
             data.overflow.zero_()
+            convert()
             if strongest is not None:
                 strongest.zero_()
             for _ in range(self.decimation):
@@ -273,7 +277,36 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
         kind, rows = getattr(model, name).dtype, shapes[name][0]
         row = drawn.strides[0]
         item = drawn.strides[1] * size // rows
-        view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=(n, rows), strides=(row, item))
-        setattr(model, name, view)
+        shape, strides = (n, rows), (row, item)
+        if getattr(model, name).ndim == 3:  # two vectors a row
+            shape, strides = (n, rows, 2), (row, item, item // 2)
+        if kind is not wp.int32:  # see ``whole_numbers``
+            view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=shape, strides=strides)
+            setattr(model, name, view)
         at += size
     return drawn
+
+
+def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any) -> Callable[[], None]:
+    """Makes the function that converts those fields of ``world_fields`` that are whole numbers, such as the ids of meshes."""
+    import warp as wp
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def convert(drawn: wp.array2d(dtype=float), at: int, out: wp.array2d(dtype=int)):  # type: ignore
+        i, j = wp.tid()
+        out[i, j] = int(drawn[i, at + j])
+
+    at, jobs = 0, []
+    for name, shape in shapes.items():
+        if getattr(model, name).dtype is wp.int32:
+            # Two rows or more: MuJoCo Warp takes meshes to be everywhere where all worlds share one row.
+            out = wp.zeros((max(2, drawn.shape[0]), shape[0]), dtype=int)
+            setattr(model, name, out)
+            jobs.append((at, out, shape[0]))
+        at += math.prod(shape)
+
+    def run() -> None:
+        for at, out, size in jobs:
+            wp.launch(convert, dim=(drawn.shape[0], size), inputs=[drawn, at, out])
+
+    return run

@@ -22,6 +22,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
     parser.add_argument("--preset", help="preset of the environment (default: the first)")
     parser.add_argument("--robot", help="robot of the environment, or to inspect alone: a name, or an imported one's folder")
+    parser.add_argument("--object", metavar="FILE", help="show a thing of a mesh instead: a file, a folder, or a name")
+    parser.add_argument(
+        "--scale", type=cli.positive_float, default=1.0, help="of the lengths in that file (default: %(default)s)"
+    )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
@@ -30,6 +34,8 @@ def main(argv: Sequence[str]) -> None:
     args, _ = parser.parse(argv)
     for path in filter(None, (args.render, args.cameras, args.json)):
         files.check_writable(path)
+    if args.object is not None:
+        return _thing(args)
     if args.name is None and args.robot is None:
         parser.error("name a robot, an environment or the folder of an imported robot")
     what = (args.name, args.preset, args.robot) if args.name else (args.robot, args.preset, None)
@@ -61,6 +67,24 @@ def main(argv: Sequence[str]) -> None:
         content |= {"self_test": tested.json()} if tested else {}
         with files.whole(args.json) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
+        console.wrote(screen, "json", args.json)
+
+
+def _thing(args) -> None:
+    import imageio.v3 as imageio
+
+    from mjx_nero.tools.inspection import things
+
+    found, screen = things.of(args.object, args.scale), console.screen()
+    for view in things.tables(found):
+        screen.print(view)
+    if args.render:
+        image = things.picture(found)
+        with files.whole(args.render) as part:
+            imageio.imwrite(part, image)
+        console.wrote(screen, "picture", args.render)
+    if args.json:
+        files.write_json(args.json, dataclasses.asdict(found))
         console.wrote(screen, "json", args.json)
 
 

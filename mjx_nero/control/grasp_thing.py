@@ -1,0 +1,148 @@
+"""Picks up a thing of a mesh by one of the grasps that fit the way it lies, and holds it at the goal."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from mjx_nero import math
+from mjx_nero.config.bounds import Positive
+from mjx_nero.control.pick_up import CLOSE, PickUp, PickUpCfg, PickUpMemory
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim import grasp
+from mjx_nero.sim.objects import kept_grasps
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import UserError, View
+
+_COST_COUNTS = 1.5  # [rad] a grasp that is dearer by 1 is worth so much motion of the joints
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspThingCfg(PickUpCfg):
+    """Settings of the grasp and its speed; ``heading`` and ``turns`` are not used.
+
+    Attributes:
+        files: of the object's shapes: its ``file`` and its ``bank``.
+        scale: of the meshes.
+    """
+
+    files: tuple[str, ...] = ()
+    scale: Positive = 1.0
+
+
+@struct.dataclass
+class GraspThingMemory(PickUpMemory):
+    """The state of ``GraspThing`` between two steps."""
+
+    opened: Float[Array, " ng"]  # positions of the open fingers [rad or m]
+    middle: Float[Array, "3"]  # of the pads, in the thing's frame [m]
+
+
+class GraspThing(PickUp):
+    """``PickUp`` for things of any shape: tables of grasps take the place of headings and turns.
+
+    Args:
+        robot: what picks.
+        dt: control step [s].
+        cfg: see ``GraspThingCfg``.
+
+    Raises:
+        UserError: ``files`` is empty, or the hand can grasp none of the things in any way.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: GraspThingCfg = GraspThingCfg()):
+        super().__init__(robot, dt, cfg)
+        if not cfg.files:
+            raise UserError("grasp_thing needs files: of the meshes that it is to pick up (control.files)")
+        table = kept_grasps.table(cfg.files, cfg.scale, grasp.hand(robot))
+        self._ups, self._middles, self._across, self._gaps, self._costs = (np.asarray(x, np.float32) for x in table)
+        formulas = grasp.formulas(robot)
+        self._positions = formulas[1] if formulas else None
+
+    def init(self, view: View) -> GraspThingMemory:
+        """Chooses a grasp and starts the first phase."""
+        q = view.joint_pos[: self._n]
+        middles, angles, gaps, costs = self._ways(view)
+        quats = jax.vmap(self._hand)(angles)
+        picks = jax.vmap(self._over, (None, 0, 0))(view, middles, angles)
+        starts = jnp.broadcast_to(q, (len(angles), self._n))
+        over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
+        low = jax.vmap(self._ik.local)(picks, quats, over.q)
+        way = jnp.linalg.norm(over.q - q, axis=1) + 100.0 * ~(over.success & low.success)
+        best = jnp.argmin(way + _COST_COUNTS * costs)
+        zero, pick = jnp.zeros((), jnp.int32), picks[best]
+        return GraspThingMemory(
+            phase=zero,
+            count=zero,
+            q=q,
+            qd=jnp.zeros_like(q),
+            above=over.q[best],
+            pos=pick + self._up,
+            pick=pick,
+            yaw=angles[best],
+            grip=jnp.zeros(3),
+            tries=zero,
+            opened=self._open(gaps[best]),
+            middle=self._local(view, middles[best]),
+        )
+
+    def step(self, memory: GraspThingMemory, view: View) -> tuple[GraspThingMemory, Float[Array, " nu"]]:
+        """Targets of all drives."""
+        after, targets = super().step(memory, view)
+        ends = jnp.where(memory.phase >= CLOSE, jnp.asarray(self.gripper.closed), memory.opened)
+        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+        return after, jnp.concatenate([targets[: self._n], fingers])
+
+    def _off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
+        assert isinstance(memory, GraspThingMemory)
+        seen = view.objects[self.cfg.object]
+        return jnp.linalg.norm(view.ee_pos_w - seen.pos_w - math.rotate(seen.quat_w, memory.middle))
+
+    def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
+        """Plans again for a lost thing, turning the hand as little as possible, without a search."""
+        assert isinstance(memory, GraspThingMemory)
+        middles, angles, gaps, costs = self._ways(view)
+        off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
+        best = jnp.argmin(jnp.abs(off) + _COST_COUNTS * costs)
+        yaw = memory.yaw + off[best]
+        pick = self._over(view, middles[best], yaw)
+        above = self._ik.local(pick + self._up, self._hand(yaw), memory.above).q
+        new = {"pick": pick, "yaw": yaw, "above": above, "opened": self._open(gaps[best])}
+        new["middle"] = self._local(view, middles[best])
+        return dataclasses.replace(memory, **{name: jnp.where(lost, new[name], getattr(memory, name)) for name in new})
+
+    def _ways(self, view: View) -> tuple[Array, Array, Array, Array]:
+        """Middles of the pads in the world, turns of the hand, gaps and costs of all grasps that fit the way the thing lies."""
+        seen = view.objects[self.cfg.object]
+        index = jnp.zeros((), jnp.int32) if seen.shape is None else seen.shape.index
+        up = math.rotation_matrix(seen.quat_w)[2]
+        rest = jnp.argmax(jnp.asarray(self._ups)[index] @ up)
+        middles, across, gaps, costs = (jnp.asarray(x)[index, rest] for x in (self._middles, self._across, self._gaps, self._costs))
+        places = seen.pos_w + jax.vmap(functools.partial(math.rotate, seen.quat_w))(middles)
+        ways = jax.vmap(functools.partial(math.rotate, seen.quat_w))(across)
+        turn = jnp.arctan2(ways[:, 1], ways[:, 0]) - jnp.pi / 2  # the fingers open along the hand's y
+        return (
+            jnp.concatenate([places, places]),
+            jnp.concatenate([turn, turn + jnp.pi]),
+            jnp.concatenate([gaps, gaps]),
+            jnp.concatenate([costs, costs]),
+        )
+
+    def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
+        """Where the grasp point must be for the pads to have their middle there, but not too near the table."""
+        height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
+        return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
+
+    def _local(self, view: View, place: Float[Array, "3"]) -> Float[Array, "3"]:
+        seen = view.objects[self.cfg.object]
+        return math.rotate(math.quat_conj(seen.quat_w), place - seen.pos_w)
+
+    def _open(self, gap: Float[Array, ""]) -> Float[Array, " ng"]:
+        """Positions of the fingers with this gap between the pads."""
+        if self._positions is None:
+            return jnp.asarray(self.gripper.opened)
+        return self.gripper._clip(self._positions(gap))

@@ -1,0 +1,117 @@
+"""Lift any: pick up one of the package's everyday objects, as it lies, and hold it at a commanded point.
+
+Three of the twelve objects are held out: no policy sees them in training. The preset ``held_out`` has these alone, ``all`` has all.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, arm_state, velocity_actions
+from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.sim import contacts, grasp, objects
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.objects import events as thing_events
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+
+THING = "thing"
+HELD_OUT = ("l_bracket", "bowl", "screwdriver")
+SEEN = tuple(name for name in objects.names() if name not in HELD_OUT)
+LIFTED = 0.01  # [m] height of the lowest point of a lifted thing
+NEAR = 0.03  # [m] greatest distance of the grasp point from the box around a held thing
+CLOSING = 0.4  # [s] least closing time of the script's fingers
+THINNEST = 0.006  # [m] that the script's fingers close on
+GRIP: dict[str, Any] = {"friction": (1.0, 0.01, 0.001), "condim": 4}  # held at two places, a thing would turn about the line
+
+
+def thing(files: tuple[str, ...]) -> ObjectCfg:
+    """An object that has one of these shapes in each episode."""
+    first, *others = files
+    return ObjectCfg(shape="mesh", file=first, bank=tuple(others), **GRIP)
+
+
+def expert(robot: RobotCfg, object: str, item: ObjectCfg) -> dict[str, dict[str, Any]]:
+    """Settings of the script that picks things up by their grasps."""
+    fields = {
+        "object": object,
+        "files": (item.file, *item.bank),
+        "scale": item.scale,
+        "lowest": grasp.lowest(robot.pad),
+        "beyond": grasp.beyond(robot, grasp.cube_for(robot).size[0]),
+        "closing": round(max(CLOSING, grasp.closing_time(robot, THINNEST)), 3),
+    }
+    return {"grasp_thing": {**fields, **regions.ik(robot, "ik.")}}
+
+
+# Long: a task is one list, to read as one.
+def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
+    """Lift's rewards, with heights and distances that count from the thing's own surface."""
+    there, one, item = regions.of(robot), {"object": THING}, thing(files)
+    scene = scenes.around(robot, SceneCfg(objects={THING: item}))
+    held = {"minimal_height": LIFTED, "grasp_radius": NEAR, **one}
+    state = {
+        **arm_state(),
+        "ee_orientation": ObservationTerm(observations.ee_orientation),
+        "ee_to_object": ObservationTerm(observations.ee_to_object, params=one, noise=0.002),
+        "object_orientation": ObservationTerm(observations.object_orientation, params=one, noise=0.01),
+        "object_shape": ObservationTerm(observations.object_shape, params=one),
+        "object_to_goal": ObservationTerm(observations.object_to_goal, params=one, noise=0.002),
+        "target_object_position": ObservationTerm(observations.command),
+        "actions": ObservationTerm(observations.last_action),
+    }
+    return EnvCfg(
+        robot=dataclasses.replace(robot, gravity_compensation=True),  # a robot's own controller does this
+        scene=scene,
+        sim=contacts.crowded(robot, scene, SimCfg(dt=0.005, decimation=4)),
+        episode_length_s=7.0,
+        actions=velocity_actions(hysteresis=0.5),
+        controllers=expert(robot, THING, item),
+        command=CommandTerm(
+            commands.uniform_position, params=dict(zip("xyz", there.hold, strict=True)), resample_s=ONCE
+        ),
+        success=SuccessCfg(
+            condition=Term(success.object_at_goal, params={"threshold": 0.02, **one}),
+            distance=Term(success.object_distance, params=one),
+        ),
+        metrics=metrics.grasping(**held),
+        observations={
+            "state": ObservationGroup(state),
+            "privileged_state": privileged(
+                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}
+            ),
+        },
+        events={
+            "reset_object_position": Term(
+                events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}
+            ),
+            "reset_object_shape": Term(thing_events.at_rest, params={"files": files, **one}),
+        },
+        rewards={
+            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **one}),
+            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
+            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
+            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum=CurriculumCfg(expert_starts=0.5),
+        training=CALM,
+        budget=Budget(steps=250_000_000),
+        terminations={
+            "time_out": DoneTerm(terminations.time_out, time_out=True),
+            "object_off_table": DoneTerm(
+                terminations.object_off_table, params={"center": scene.table_center, "size": scene.table_size, **one}
+            ),
+        },
+    )
+
+
+def presets() -> Presets:
+    """Maps preset -> robot -> config, the default first."""
+    kinds = {"default": SEEN, "held_out": HELD_OUT, "all": (*SEEN, *HELD_OUT)}
+    return {name: functools.partial(lifting, files=files) for name, files in kinds.items()}

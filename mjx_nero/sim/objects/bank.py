@@ -1,0 +1,115 @@
+"""Different shapes in different worlds of one batch: which of them an object has is a number, and this looks up what follows.
+
+All shapes are in the compiled model. A world differs from another in some fields of the model: which mesh each part is, where it
+lies in the body, its bounds, and the mass. A part that a shape lacks has no mesh (MuJoCo Warp) and touches nothing (MuJoCo's C
+library, which does not know of meshes that are not there). What touches is one body's, so nothing is parked or hidden elsewhere.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Int
+
+from mjx_nero.sim.objects import body as bodies
+from mjx_nero.sim.objects.solid import Solid
+
+_GEOMS = ("geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
+_OF_C = ("geom_contype", "geom_conaffinity")  # which MuJoCo Warp keeps once for all worlds
+_BODIES = ("body_mass", "body_inertia", "body_iquat", "body_subtreemass", "body_invweight0")
+_DOFS = ("dof_invweight0", "dof_M0")
+FIELDS = ("geom_dataid", *_GEOMS, *_OF_C, *_BODIES, *_DOFS)
+Fields = dict[str, Array]
+
+
+class Banks:
+    """The banks of a scene's objects.
+
+    Args:
+        model: the compiled scene; its bounds are widened, so that every shape is inside.
+        objects: configs of the scene's objects.
+
+    Attributes:
+        counts: how many shapes each object with a bank may have.
+        names: the model's fields that differ.
+    """
+
+    def __init__(self, model: mujoco.MjModel, objects: Mapping[str, Any]):
+        self._model = model
+        with_bank = {name: item for name, item in objects.items() if item.shape == "mesh" and item.bank}
+        self.counts = {name: 1 + len(item.bank) for name, item in with_bank.items()}
+        self.names = FIELDS if with_bank else ()
+        self._tables = {name: _table(model, name, item.solids, item.masses) for name, item in with_bank.items()}
+        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in self.names}
+        for name in with_bank:
+            _widen(model, name, self._tables[name])
+
+    def __call__(self, shapes: Mapping[str, Int[Array, ""]]) -> Fields:
+        """The fields of a world whose objects have the given shapes."""
+        out: Fields = {name: jnp.asarray(value) for name, value in self._nominal.items()}
+        for thing, table in self._tables.items():
+            for name, (rows, values) in table.items():
+                out[name] = out[name].at[rows].set(jnp.asarray(values)[shapes[thing]])
+        if out:
+            out["body_subtreemass"] = out["body_subtreemass"].at[0].set(jnp.sum(out["body_mass"]))
+        return out
+
+
+def look(model: mujoco.MjModel, counts: Mapping[str, int], shapes: Mapping[str, Int[Array, ""]]) -> Fields:
+    """Colours of a drawn model's geoms when objects have the given shapes: those of the other shapes cannot be seen."""
+    rgba = jnp.asarray(model.geom_rgba, jnp.float32)
+    for name, count in counts.items():
+        rows = np.array([model.geom(bodies.drawn_name(name, k)).id for k in range(count)])
+        rgba = rgba.at[rows, 3].set((jnp.arange(count) == shapes[name]).astype(jnp.float32))
+    return {"geom_rgba": rgba}
+
+
+def _table(model: mujoco.MjModel, name: str, solids: list[Solid], masses: list[float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Field -> rows of the model, and their values for each shape [shapes, rows, ...]."""
+    names = bodies.names(name, solids)
+    geoms = np.array([model.geom(each).id for each in names])
+    thing = np.array([model.body(name).id])
+    dofs = int(model.joint(name).dofadr[0]) + np.arange(6)
+    found: dict[str, list[np.ndarray]] = {field: [] for field in FIELDS}
+    for k, (solid, mass) in enumerate(zip(solids, masses, strict=True)):
+        alone = _alone(model, name, solid, mass)
+        there = [i for i, each in enumerate(names) if i <= len(solid.sizes)]
+        own = [alone.geom(names[i]).id for i in there]
+        for field in ("geom_dataid", *_GEOMS, *_OF_C):
+            values = np.zeros((len(names), *getattr(alone, field).shape[1:]))
+            if field == "geom_dataid":
+                values -= 1
+                values[there] = [model.mesh(each).id for each, _ in bodies.meshes(name, k, solid)]
+            elif field in _OF_C:
+                values[there] = getattr(model, field)[geoms[there]]
+            else:
+                values[there] = getattr(alone, field)[own]
+            found[field].append(values)
+        for field in _BODIES:
+            found[field].append(getattr(alone, field)[1:2])
+        for field in _DOFS:
+            found[field].append(getattr(alone, field))
+    rows = {**dict.fromkeys(("geom_dataid", *_GEOMS, *_OF_C), geoms), **dict.fromkeys(_BODIES, thing), **dict.fromkeys(_DOFS, dofs)}
+    return {field: (rows[field], np.stack(values).astype(np.float32)) for field, values in found.items()}
+
+
+def _alone(model: mujoco.MjModel, name: str, solid: Solid, mass: float) -> mujoco.MjModel:
+    """A model of one shape, as the compiler would have it in the scene."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = model.opt.timestep
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    bodies.add(spec, name, [solid], [mass], body, {}, {}, visuals=False)
+    return spec.compile()
+
+
+def _widen(model: mujoco.MjModel, name: str, table: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Undoes what MuJoCo's compiler decided for the first shape alone."""
+    body, (geoms, _) = model.body(name).id, table["geom_pos"]
+    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.geom_sameframe[geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    far = float((np.linalg.norm(table["geom_pos"][1], axis=-1) + table["geom_rbound"][1]).max())
+    nodes = slice(model.body_bvhadr[body], model.body_bvhadr[body] + model.body_bvhnum[body])
+    model.bvh_aabb[nodes] = [0, 0, 0, far, far, far]

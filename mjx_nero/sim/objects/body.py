@@ -1,0 +1,104 @@
+"""Objects of meshes in a MuJoCo scene: a body whose convex parts touch, and a mesh with its texture that is drawn.
+
+Where an object may have one of several shapes, its body has as many parts as the richest of them, and the fields of the model
+that make the difference are looked up: see ``bank``.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.types import UserError
+
+_MESH = mujoco.mjtGeom.mjGEOM_MESH
+
+
+def add(
+    spec: mujoco.MjSpec,
+    name: str,
+    solids: list[Solid],
+    mass: list[float],
+    body: Any,
+    table: dict[str, Any],
+    others: dict[str, Any],
+    visuals: bool,
+) -> None:
+    """Fills a body with the first of its shapes, and adds the meshes of all.
+
+    The hull meets the table, which is flat and knows no difference; the parts meet everything else.
+
+    Args:
+        body: of the spec, with a joint.
+        mass: of each shape [kg].
+        table, others: fields of the geoms that touch the table, and that touch all others.
+        visuals: add what is drawn.
+    """
+    for k, solid in enumerate(solids):
+        for mesh_name, points in meshes(name, k, solid):
+            mesh = spec.add_mesh(name=mesh_name)
+            mesh.uservert = points.ravel().tolist()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    weigh(body, solids[0], mass[0])
+    for i, geom in enumerate(names(name, solids)):
+        # A part that the first shape lacks is a second copy of one that it has, until ``bank`` takes it away.
+        mesh_name = geom.replace(name, f"{name}/0", 1) if i <= len(solids[0].sizes) else f"{name}/0/0"
+        body.add_geom(name=geom, type=_MESH, meshname=mesh_name, group=3, **(others if i else table))
+    if visuals:
+        for k, solid in enumerate(solids):
+            draw(spec, body, name, k, solid)
+
+
+def meshes(name: str, shape: int, solid: Solid) -> list[tuple[str, np.ndarray]]:
+    """The meshes of a shape that touch, with their corners: the hull, then the parts."""
+    return [(f"{name}/{shape}", solid.hull), *((f"{name}/{shape}/{i}", part) for i, part in enumerate(solid.parts))]
+
+
+def names(name: str, solids: list[Solid]) -> list[str]:
+    """The geoms that touch: the hull, which has the object's name, then as many parts as the richest shape has."""
+    return [name, *(f"{name}/{i}" for i in range(max(len(solid.sizes) for solid in solids)))]
+
+
+def weigh(body: Any, solid: Solid, mass: float) -> None:
+    """Gives a body the mass and the inertia of a solid [kg]."""
+    inertia = solid.inertia * (mass / solid.volume)
+    body.explicitinertial, body.mass, body.ipos = True, mass, [0.0, 0.0, 0.0]
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()
+
+
+def drawn_name(name: str, shape: int) -> str:
+    """The geom that draws a shape."""
+    return f"{name}/drawn/{shape}"
+
+
+def draw(spec: mujoco.MjSpec, body: Any, name: str, shape: int, solid: Solid) -> None:
+    """Adds what is drawn of a shape to a body; of all but the first shape it is transparent at first."""
+    mesh = spec.add_mesh(name=drawn_name(name, shape))
+    mesh.uservert, mesh.userface = solid.vertices.ravel().tolist(), solid.faces.ravel().tolist()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    rgba = [*solid.rgba[:3], solid.rgba[3] if shape == 0 else 0.0]
+    look: dict[str, Any] = {"rgba": rgba}
+    if len(solid.uv) and solid.texture.size:
+        mesh.usertexcoord = np.stack([solid.uv[:, 0], 1 - solid.uv[:, 1]], axis=1).ravel().tolist()
+        mesh.userfacetexcoord = solid.faces.ravel().tolist()
+        texture = spec.add_texture(name=drawn_name(name, shape), type=mujoco.mjtTexture.mjTEXTURE_2D)
+        texture.height, texture.width, texture.nchannel = *solid.texture.shape[:2], 3
+        texture.data = solid.texture.tobytes()
+        material = spec.add_material(name=drawn_name(name, shape))
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
+        look = {"material": material.name, "rgba": [1.0, 1.0, 1.0, rgba[3]]}
+    geom = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2, **look}
+    body.add_geom(name=drawn_name(name, shape), type=_MESH, meshname=mesh.name, **geom)
+
+
+def checked(name: str, solids: list[Solid], scale: float) -> None:
+    """Raises:
+    UserError: a shape is too small or too large to be an object on a table.
+    """
+    for solid in solids:
+        longest = float(np.ptp(solid.points, axis=0).max())
+        if not 0.005 <= longest <= 2.0:
+            raise UserError(
+                f"scene.objects.{name} is {longest:.3g} m long: give scale (now {scale:g}; a file in millimetres takes 0.001)"
+            )

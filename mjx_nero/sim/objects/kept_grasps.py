@@ -1,0 +1,69 @@
+"""Grasps of things by a hand, as padded tables; they take seconds to find, and are kept in the user's cache."""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors import numpy as tensors
+
+from mjx_nero import cache, files
+from mjx_nero.sim.objects import grasps, rests, store
+from mjx_nero.sim.objects.grasps import Hand
+from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.types import UserError
+
+NONE = 1e3  # cost of a grasp that is not there
+_VERSION = 1
+_MAX_KEPT = 1_000_000  # bytes
+Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@functools.lru_cache(maxsize=16)
+def table(names: tuple[str, ...], scale: float, hand: Hand) -> Table:
+    """Directions of up [things, rests, 3], and of each rest ``Grasps``: middle, across [.., grasps, 3], gap and cost [.., grasps].
+
+    Raises:
+        UserError: a thing cannot be grasped in any of the ways in which it rests.
+    """
+    found = []
+    for name in names:
+        solid = store.find(name).scaled(scale)
+        found.append((solid, _kept(solid, hand)))
+        if not any(len(each.cost) for each in found[-1][1]):
+            raise UserError(f"{name} cannot be grasped from above by a hand that opens to {hand.opening:g} m: give another scale")
+    most = max(len(each) for _, each in found)
+    lead = len(found), most, grasps.MOST
+    ups, middle, across = np.zeros((*lead[:2], 3)), np.zeros((*lead, 3)), np.zeros((*lead, 3))
+    gap, cost = np.full(lead, hand.opening), np.full(lead, NONE)
+    across[..., 1] = 1.0
+    for i, (solid, each) in enumerate(found):
+        for j, (quat, one) in enumerate(zip(solid.rest_quat, each, strict=True)):
+            n = len(one.cost)
+            ups[i, j] = rests.up(quat)
+            middle[i, j, :n], across[i, j, :n], gap[i, j, :n], cost[i, j, :n] = one.middle, one.across, one.gap, one.cost
+    return ups, middle, across, gap, cost
+
+
+def _kept(solid: Solid, hand: Hand) -> list[grasps.Grasps]:
+    """The grasps of each way of resting: those that are kept, or new ones."""
+    said = hashlib.sha256(repr((_VERSION, grasps.MOST, dataclasses.astuple(hand))).encode())
+    for array in (solid.points, solid.sizes, solid.rest_quat):
+        said.update(np.ascontiguousarray(array).tobytes())
+    folder = cache.folder()
+    path = folder / "objects" / f"{said.hexdigest()[:32]}.grasps" if folder else None
+    if path and path.is_file():
+        with contextlib.suppress(UserError, SafetensorError, KeyError):
+            read = tensors.load(files.read_bytes(path, _MAX_KEPT))
+            return [
+                grasps.Grasps(*(read[f"{i}.{field.name}"] for field in dataclasses.fields(grasps.Grasps)))
+                for i in range(len(solid.rest_quat))
+            ]
+    found = [grasps.find(solid, quat, hand) for quat in solid.rest_quat]
+    if path:
+        arrays = {f"{i}.{name}": np.ascontiguousarray(x) for i, each in enumerate(found) for name, x in dataclasses.asdict(each).items()}
+        with contextlib.suppress(UserError):
+            files.write(path, tensors.save(arrays))
+    return found

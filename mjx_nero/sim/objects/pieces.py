@@ -1,0 +1,44 @@
+"""Cuts a mesh into convex pieces, in a process of its own: pieces.py < mesh > pieces.
+
+The library is C++ that may take hours over a mesh, or end the process; neither must happen to whoever asked. Imports nothing of
+the package, so that it starts at once.
+"""
+
+import io
+import resource
+import sys
+
+import numpy as np
+
+THRESHOLD = 0.04  # concavity that is left, as a share of the mesh's size
+MAX_MEMORY = 1_500_000_000  # bytes beyond what the libraries take to load
+
+
+def main(most: int, corners: int, seconds: int) -> None:
+    """Reads ``vertices`` and ``faces`` (npz), writes ``points`` and ``sizes`` of the pieces."""
+    import coacd
+
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    with open("/proc/self/statm") as file:
+        now = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (now + MAX_MEMORY, now + MAX_MEMORY))
+    coacd.set_log_level("off")
+    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as mesh:
+        found = coacd.run_coacd(
+            coacd.Mesh(mesh["vertices"], mesh["faces"]),
+            threshold=THRESHOLD,
+            max_convex_hull=most,
+            preprocess_resolution=30,
+            mcts_iterations=20,
+            resolution=800,
+            decimate=True,
+            max_ch_vertex=corners,
+            seed=0,
+        )
+    out = io.BytesIO()
+    np.savez(out, points=np.concatenate([part[0] for part in found]), sizes=np.array([len(part[0]) for part in found]))
+    sys.stdout.buffer.write(out.getvalue())
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
