@@ -1,8 +1,8 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
-docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, and docs/failures/, three failures of
-tasks that fall short. A name makes one.
+docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the package's objects,
+and docs/failures/, three failures of tasks that fall short. A name makes one.
 """
 
 import dataclasses
@@ -19,8 +19,9 @@ from PIL import Image
 from mjx_nero.envs import registry
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import evaluation, rollout
-from mjx_nero.sim import render
+from mjx_nero.sim import objects, render
 from mjx_nero.tools import cli
+from mjx_nero.tools.inspection import things
 
 HERE = pathlib.Path(__file__).parent
 STEPS = 150  # of an episode are shown: the cube is up by then
@@ -75,6 +76,13 @@ def seeing(folder: pathlib.Path) -> None:
         film(folder.with_name("gallery") / f"{name}_rgb.webp", played, np.argmax(played.episodes.success, keepdims=True))
 
 
+def objects_sheet(path: pathlib.Path) -> None:
+    """The package's objects as they rest, and behind each its convex parts."""
+    each = [things.picture(things.of(name), 426, 240) for name in objects.names()]
+    sheet = np.concatenate([np.concatenate(each[i : i + 3], axis=1) for i in range(0, len(each), 3)])
+    Image.fromarray(sheet).save(path, optimize=True)
+
+
 def failures(folder: pathlib.Path) -> None:
     """The first three of 200 episodes that fail, one after another, as ``eval.py --failures`` shows them."""
     for name in FALL_SHORT:
@@ -100,7 +108,7 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
 def main() -> None:
     """All pictures, or those named."""
     cli.setup_jax()
-    folders = {"gallery": gallery, "seeing": seeing, "failures": failures}
+    folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "objects.png": objects_sheet}
     for name in sys.argv[1:] or (*folders, *PICTURES):
         if name in folders:
             folders[name](HERE / name)

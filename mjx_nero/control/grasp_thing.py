@@ -121,7 +121,9 @@ class GraspThing(PickUp):
         index = jnp.zeros((), jnp.int32) if seen.shape is None else seen.shape.index
         up = math.rotation_matrix(seen.quat_w)[2]
         rest = jnp.argmax(jnp.asarray(self._ups)[index] @ up)
-        middles, across, gaps, costs = (jnp.asarray(x)[index, rest] for x in (self._middles, self._across, self._gaps, self._costs))
+        middles, across, gaps, costs = (
+            jnp.asarray(x)[index, rest] for x in (self._middles, self._across, self._gaps, self._costs)
+        )
         places = seen.pos_w + jax.vmap(functools.partial(math.rotate, seen.quat_w))(middles)
         ways = jax.vmap(functools.partial(math.rotate, seen.quat_w))(across)
         turn = jnp.arctan2(ways[:, 1], ways[:, 0]) - jnp.pi / 2  # the fingers open along the hand's y

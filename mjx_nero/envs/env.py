@@ -32,8 +32,23 @@ from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.objects import bank
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
-from mjx_nero.types import LEVEL, LOOK, PHASE, SHAPE, TARGET
-from mjx_nero.types import Appearance, Bank, Carry, Key, Picture, Scenery, Sim, Start, UserError, View
+from mjx_nero.types import (
+    LEVEL,
+    LOOK,
+    PHASE,
+    SHAPE,
+    TARGET,
+    Appearance,
+    Bank,
+    Carry,
+    Key,
+    Picture,
+    Scenery,
+    Sim,
+    Start,
+    UserError,
+    View,
+)
 
 _MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
@@ -191,6 +206,7 @@ class ManipulationEnv(Env):
         names = [f"reward/{name}" for name in self.cfg.rewards]
         names += ["success", "distance", "final_distance", "dropped", "nan", "overflow", *self.cfg.metrics]
         names += [LEVEL] if level is not None else []
+        names += [f"shape/{name}" for name in self._banks.counts]
         zero = jnp.zeros(())
         info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
         return State(sim, obs, zero, zero, dict.fromkeys(names, zero), info)
@@ -470,6 +486,7 @@ class ManipulationEnv(Env):
         metrics = {f"reward/{name}": value for name, value in rewards.items()}
         if LEVEL in carry.memory:
             ends[LEVEL] = carry.memory[LEVEL]
+        ends |= {f"shape/{name}": index.astype(jnp.float32) for name, index in carry.memory.get(SHAPE, {}).items()}
         metrics |= self._metrics(view, recall, ends, done, bad) | {"nan": bad.astype(jnp.float32), "overflow": overflow}
 
         carry = self._resample(carry.replace(step=step, action=jnp.where(bad, carry.action, action), memory=recall.memory))

@@ -48,7 +48,11 @@ def applied(cfg: EnvCfg) -> EnvCfg:
         raise UserError(f"{thing.file} does not stand as its file has it, and what is pushed has to: turn it in the file")
     was = cfg.scene.objects[name]
     scene = dataclasses.replace(cfg.scene, objects={name: dataclasses.replace(item, pos=was.pos)})
-    lies = {} if pushed else {"reset_object_shape": Term(events.at_rest, params={"files": (thing.file,), "scale": thing.scale, "object": name})}
+    lies = (
+        {}
+        if pushed
+        else {"reset_object_shape": Term(events.at_rest, params={"files": (thing.file,), "scale": thing.scale, "object": name})}
+    )
     new = {
         "scene": scene,
         "sim": contacts.crowded(cfg.robot, scene, cfg.sim),

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from mjx_nero.mdp.terms import CommandTerm
 from mjx_nero.sim import kinematics
+from mjx_nero.sim.objects import shapes
 from mjx_nero.sim.obstacles import Obstacles
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.sim.objects import shapes
 from mjx_nero.types import SHAPE, TARGET, Carry, ObjectView, Picture, ShapeView, Sim, View
 
 

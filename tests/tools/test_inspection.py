@@ -40,7 +40,7 @@ def test_list_envs_at_eighty_columns():
     for row in rows:
         assert row.name in words and (row.robot or "any") in words and row.task in words
     assert "privileged_state" in words and words.count("ships") == 22
-    assert sum(row.task == "follow_target" for row in rows) == 3 and words.count("any") == 10
+    assert sum(row.task == "follow_target" for row in rows) == 3 and words.count("any") == 11
 
 
 def test_joints_of_nero(nero):

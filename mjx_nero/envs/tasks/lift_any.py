@@ -1,6 +1,7 @@
 """Lift any: pick up one of the package's everyday objects, as it lies, and hold it at a commanded point.
 
-Three of the twelve objects are held out: no policy sees them in training. The preset ``held_out`` has these alone, ``all`` has all.
+Three of the twelve objects are held out: no policy sees them in training. The preset ``held_out`` has these alone, ``all`` has
+all twelve.
 """
 
 import dataclasses
@@ -69,9 +70,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         episode_length_s=7.0,
         actions=velocity_actions(hysteresis=0.5),
         controllers=expert(robot, THING, item),
-        command=CommandTerm(
-            commands.uniform_position, params=dict(zip("xyz", there.hold, strict=True)), resample_s=ONCE
-        ),
+        command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", there.hold, strict=True)), resample_s=ONCE),
         success=SuccessCfg(
             condition=Term(success.object_at_goal, params={"threshold": 0.02, **one}),
             distance=Term(success.object_distance, params=one),
@@ -79,9 +78,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         metrics=metrics.grasping(**held),
         observations={
             "state": ObservationGroup(state),
-            "privileged_state": privileged(
-                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}
-            ),
+            "privileged_state": privileged(state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}),
         },
         events={
             "reset_object_position": Term(

@@ -13,7 +13,7 @@ import numpy as np
 from mjx_nero import config, control
 from mjx_nero.config import flag
 from mjx_nero.config.bounds import Bounds, OneOf, Seed
-from mjx_nero.envs import registry
+from mjx_nero.envs import registry, things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
@@ -124,7 +124,7 @@ def play(cfg: EvalCfg) -> Played:
         UserError: a name or field is unknown, or a policy does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
-    env_cfg = config.override(env_cfg, cfg.env_fields)
+    env_cfg = things.applied(config.override(env_cfg, cfg.env_fields))
     name = _controller_name(cfg, env_cfg)
     env_cfg = for_controllers(env_cfg) if name else env_cfg
     env_cfg = dataclasses.replace(env_cfg, metrics={**metrics.calmness(len(env_cfg.robot.arm.joints)), **env_cfg.metrics})
@@ -145,6 +145,8 @@ def play(cfg: EvalCfg) -> Played:
         **episodes.summary(),
         "seconds": round(time.perf_counter() - begun, 2),
     }
+    if by_shape := _by_shape(env, episodes):
+        result["success_by_shape"] = by_shape
     if all(term.time_out for term in env_cfg.terminations.values()):
         del result["dropped_rate"]  # nothing can be dropped
     if steering:
@@ -153,6 +155,17 @@ def play(cfg: EvalCfg) -> Played:
             del result["settled_error_mean"], result["settled_error_max"]
         result["warning"] = steering.warning(episodes.memory)
     return Played(env, episodes, result)
+
+
+def _by_shape(env: ManipulationEnv, episodes: rollout.Episodes) -> dict[str, list[float]]:
+    """The success rate of each shape that objects with a bank had, and in how many episodes it was there."""
+    out = {}
+    for name, item in env.cfg.scene.objects.items():
+        which = episodes.metrics.get(f"shape/{name}")
+        for k, file in enumerate((item.file, *item.bank) if which is not None else ()):
+            chosen = np.asarray(episodes.success)[np.round(which) == k]
+            out[file] = [float(chosen.mean()) if len(chosen) else 0.0, len(chosen)]
+    return out
 
 
 def _impl(backend: str, impl: str) -> str:

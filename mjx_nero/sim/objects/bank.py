@@ -66,7 +66,9 @@ def look(model: mujoco.MjModel, counts: Mapping[str, int], shapes: Mapping[str, 
     return {"geom_rgba": rgba}
 
 
-def _table(model: mujoco.MjModel, name: str, solids: list[Solid], masses: list[float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _table(
+    model: mujoco.MjModel, name: str, solids: list[Solid], masses: list[float]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Field -> rows of the model, and their values for each shape [shapes, rows, ...]."""
     names = bodies.names(name, solids)
     geoms = np.array([model.geom(each).id for each in names])
@@ -91,7 +93,11 @@ def _table(model: mujoco.MjModel, name: str, solids: list[Solid], masses: list[f
             found[field].append(getattr(alone, field)[1:2])
         for field in _DOFS:
             found[field].append(getattr(alone, field))
-    rows = {**dict.fromkeys(("geom_dataid", *_GEOMS, *_OF_C), geoms), **dict.fromkeys(_BODIES, thing), **dict.fromkeys(_DOFS, dofs)}
+    rows = {
+        **dict.fromkeys(("geom_dataid", *_GEOMS, *_OF_C), geoms),
+        **dict.fromkeys(_BODIES, thing),
+        **dict.fromkeys(_DOFS, dofs),
+    }
     return {field: (rows[field], np.stack(values).astype(np.float32)) for field, values in found.items()}
 
 

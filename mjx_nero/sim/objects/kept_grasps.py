@@ -23,7 +23,7 @@ Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 @functools.lru_cache(maxsize=16)
 def table(names: tuple[str, ...], scale: float, hand: Hand) -> Table:
-    """Directions of up [things, rests, 3], and of each rest ``Grasps``: middle, across [.., grasps, 3], gap and cost [.., grasps].
+    """Directions of up [things, rests, 3]; of each rest the ``Grasps``: middle, across [.., grasps, 3], gap, cost [.., grasps].
 
     Raises:
         UserError: a thing cannot be grasped in any of the ways in which it rests.
@@ -63,7 +63,9 @@ def _kept(solid: Solid, hand: Hand) -> list[grasps.Grasps]:
             ]
     found = [grasps.find(solid, quat, hand) for quat in solid.rest_quat]
     if path:
-        arrays = {f"{i}.{name}": np.ascontiguousarray(x) for i, each in enumerate(found) for name, x in dataclasses.asdict(each).items()}
+        arrays = {
+            f"{i}.{name}": np.ascontiguousarray(x) for i, each in enumerate(found) for name, x in dataclasses.asdict(each).items()
+        }
         with contextlib.suppress(UserError):
             files.write(path, tensors.save(arrays))
     return found

@@ -14,7 +14,7 @@ import mjx_nero
 from mjx_nero import config, files
 from mjx_nero.data import Feature, Schema, units
 from mjx_nero.data import episode as names
-from mjx_nero.envs import registry
+from mjx_nero.envs import registry, things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
@@ -50,7 +50,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         UserError: unknown names or fields, a policy that does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
-    env_cfg = config.override(env_cfg, cfg.env_fields)
+    env_cfg = things.applied(config.override(env_cfg, cfg.env_fields))
     acts = cfg.agent == "policy"
     size = min(cfg.side_by_side, cfg.episodes)
     name = next(iter(env_cfg.controllers), evaluation.EXPERT) if cfg.agent == evaluation.EXPERT else cfg.agent

@@ -120,7 +120,7 @@ def picture(thing: Thing, width: int = 1280, height: int = 480) -> np.ndarray:
         for k in range(len(solid.sizes)):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part {k}", rgba=[*_COLOURS[k % len(_COLOURS)], 1])
     camera = mujoco.MjvCamera()
-    camera.lookat, camera.distance = [0, 0.4 * far, 0], (0.5 * columns + 0.7) * far
+    camera.lookat, camera.distance = [0, 0.35 * far, 0], (0.4 + max(1.2, 1.25 * columns * height / width)) * far
     camera.azimuth, camera.elevation = 90, -35
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -1,0 +1,215 @@
+"""Lift any: which shapes come, how they lie, what their worlds weigh, what counts as held, and the expert that lifts them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_nero import UserError, control, env_cfg, make
+from mjx_nero.envs import registry
+from mjx_nero.envs.tasks import lift_any
+from mjx_nero.envs.tasks.lift_any import HELD_OUT, SEEN, THING
+from mjx_nero.learn.play import evaluation
+from mjx_nero.mdp import observations, rewards
+from mjx_nero.sim import grasp, objects, scene
+from mjx_nero.sim.objects import events, grasps, rests, shapes
+from mjx_nero.sim.physics.mjx import JaxPhysics
+from mjx_nero.types import ObjectView, ShapeView, Start
+
+WORLDS = 64
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("nero_lift_any", impl="native", num_envs=WORLDS)
+
+
+@pytest.fixture(scope="module")
+def starts(env):
+    return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
+
+
+def test_a_quarter_is_held_out():
+    assert len(HELD_OUT) == 3 and len(SEEN) == 9 and {*HELD_OUT, *SEEN} == set(objects.names())
+    for preset, files in (("default", SEEN), ("held_out", HELD_OUT), ("all", (*SEEN, *HELD_OUT))):
+        item = env_cfg("nero_lift_any", preset).scene.objects[THING]
+        assert (item.file, *item.bank) == files
+
+
+def test_every_world_has_the_masses_of_its_shape(env, starts):
+    """What MuJoCo's compiler computes of a scene with that one shape."""
+    fields, index = starts.pipeline_state.fields, np.asarray(starts.pipeline_state.fields["geom_dataid"])
+    which = np.asarray(jax.vmap(env.view)(starts).objects[THING].shape.index)
+    assert set(which) == set(range(len(SEEN)))
+    for k, name in enumerate(SEEN):
+        (world, *_) = np.flatnonzero(which == k)
+        alone = scene.build(env.cfg.robot, one(env, name), env.cfg.sim, visuals=False, fuse=True)
+        body, dof = alone.body(THING).id, alone.joint(THING).dofadr[0]
+        for field in ("body_mass", "body_inertia", "body_iquat", "body_invweight0", "body_subtreemass"):
+            assert np.asarray(fields[field])[world, body] == pytest.approx(getattr(alone, field)[body], rel=1e-4, abs=1e-9), field
+        for field in ("dof_invweight0", "dof_M0"):
+            assert np.asarray(fields[field])[world, dof:][:6] == pytest.approx(getattr(alone, field)[dof:][:6], rel=1e-4)
+        assert np.asarray(fields["body_subtreemass"])[world, 0] == pytest.approx(alone.body_subtreemass[0], rel=1e-5)
+        ids = index[world][[env.physics_model.geom(g).id for g in objects.body.names(THING, env.cfg.scene.objects[THING].solids)]]
+        assert (ids >= 0).sum() == 1 + len(objects.find(name).sizes)
+
+
+def one(env, name):
+    return dataclasses.replace(env.cfg.scene, objects={THING: lift_any.thing((name,))})
+
+
+def test_a_world_steps_as_a_scene_of_its_shape_alone(env, starts):
+    """Ten control steps of each shape, the thing 2 cm above the table and turned, against MuJoCo itself."""
+    which = np.asarray(jax.vmap(env.view)(starts).objects[THING].shape.index)
+    at = env._viewer.objects[THING][0]
+    state = starts.pipeline_state
+    lifted = dataclasses.replace(state, qpos=state.qpos.at[:, at + 2].add(0.02).at[:, at + 1].add(1.0))
+    step, after = jax.jit(jax.vmap(env.physics.step)), lifted
+    for _ in range(10):
+        after, _ = step(after, state.ctrl)
+    for k, name in enumerate(SEEN):
+        (world, *_) = np.flatnonzero(which == k)
+        alone = scene.build(env.cfg.robot, one(env, name), env.cfg.sim, visuals=False, fuse=True)
+        data = mujoco.MjData(alone)
+        data.qpos[:], data.ctrl[:] = np.asarray(lifted.qpos)[world], np.asarray(state.ctrl)[world]
+        for _ in range(10 * env.cfg.sim.decimation):
+            mujoco.mj_step(alone, data)
+        assert np.asarray(after.qpos)[world, at:][:3] == pytest.approx(data.qpos[at:][:3], abs=2e-4), name
+
+
+def test_things_lie_as_they_rest(env, starts):
+    """After a second with the arm at home no thing has moved by more than 2 mm, or turned."""
+    step, state = jax.jit(jax.vmap(env.step)), starts
+    for _ in range(25):
+        state = step(state, jnp.tile(env.home_action, (WORLDS, 1)))
+    before, after = (jax.vmap(env.view)(s).objects[THING] for s in (starts, state))
+    assert np.linalg.norm(after.pos_w - before.pos_w, axis=1).max() < 2e-3
+    for a, b in zip(np.asarray(before.quat_w), np.asarray(after.quat_w), strict=True):
+        assert rests.up(a) @ rests.up(b) > np.cos(0.03)
+    assert not np.asarray(state.metrics["nan"]).any()
+
+
+def test_rests_are_drawn_as_often_as_they_come():
+    """Of a mug alone, 4,000 times; and a full turn about the vertical."""
+    pos = {"cube": jnp.array([0.1, 0.2, 0.0])}
+    blank = Start(joint_pos=jnp.zeros(1), object_pos_w=pos, object_quat_w={"cube": jnp.array([1.0, 0, 0, 0])})
+    drawn = jax.vmap(lambda key: events.at_rest(key, blank, files=("mug",)))(jax.random.split(jax.random.PRNGKey(1), 4000))
+    mug = objects.find("mug")
+    ups = np.array([rests.up(quat) for quat in np.asarray(drawn.object_quat_w["cube"])])
+    own = np.array([rests.up(quat) for quat in mug.rest_quat])
+    which = (ups @ own.T).argmax(1)
+    assert (ups @ own.T).max(1).min() > 0.9999
+    assert np.bincount(which, minlength=len(own)) / 4000 == pytest.approx(mug.rest_share, abs=0.03)
+    heights = np.array([mug.height(quat) for quat in mug.rest_quat])[which]
+    assert np.asarray(drawn.object_pos_w["cube"]) == pytest.approx(
+        np.column_stack([np.full((4000, 2), (0.1, 0.2)), heights]), abs=1e-5
+    )
+
+
+def mesh_view(view, name: str, pos, quat=(1.0, 0.0, 0.0, 0.0)):
+    solid = objects.find(name)
+    middle, edges = shapes.box(solid)
+    shape = ShapeView(
+        jnp.zeros((), jnp.int32),
+        *(jnp.asarray(x, jnp.float32) for x in (shapes.points(solid), middle, edges, shapes.code(solid))),
+    )
+    still = {"linvel_w": jnp.zeros(3), "angvel_local": jnp.zeros(3)}
+    thing = ObjectView(pos_w=jnp.asarray(pos, jnp.float32), quat_w=jnp.asarray(quat, jnp.float32), shape=shape, **still)
+    return dataclasses.replace(view, objects={"cube": thing})
+
+
+def test_held_counts_from_the_surface(finish):
+    """A hammer on end, 20 cm tall: its lowest point counts, and the box around it."""
+    view = finish.env.view(finish.reset(jax.random.PRNGKey(0)))
+    solid, up = objects.find("hammer"), (0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # its x axis, the handle, points up
+    low = solid.height(np.array(up))
+    ee = np.asarray(view.ee_pos_w)
+    for pos, held in (
+        ([ee[0], ee[1], low + 0.011], True),  # 11 mm above the table, the handle through the grasp point
+        ([ee[0], ee[1], low + 0.009], False),
+        ([ee[0] + 0.2, ee[1], low + 0.011], False),
+    ):
+        seen = mesh_view(view, "hammer", pos, up)
+        seen = dataclasses.replace(seen, ee_pos_w=jnp.array([ee[0], ee[1], low + 0.05]))
+        assert bool(rewards.held(seen, minimal_height=0.01, grasp_radius=0.03)) == held
+    code = observations.object_shape(mesh_view(view, "hammer", ee))
+    assert code.shape == (17,) and (np.asarray(code) > 0).all()
+    assert np.asarray(code)[:14].max() == pytest.approx((solid.hull @ shapes.DIRECTIONS[shapes.CODED].T).max(), abs=1e-6)
+    with pytest.raises(UserError, match="object_shape reads the shape of a mesh, and 'cube' is none"):
+        observations.object_shape(view)
+
+
+def test_grasps_of_a_bar(tmp_path):
+    """A bar of 20 cm, 3 cm wide: from above, across its width and near its middle; a hand too small finds none."""
+    import trimesh
+
+    trimesh.creation.box((0.2, 0.03, 0.04)).export(tmp_path / "bar.stl")
+    solid = objects.find(str(tmp_path / "bar.stl"))
+    hand = grasps.Hand(opening=0.08, closed=0.0, pad=(0.01, 0.02, 0.006), lowest=0.01)
+    flat = next(quat for quat in solid.rest_quat if abs(rests.up(quat)[2]) > 0.99)
+    found = grasps.find(solid, flat, hand)
+    assert len(found.cost) and (np.diff(found.cost) >= 0).all()
+    best = found.middle[0], found.across[0], found.gap[0]
+    assert abs(best[0][0]) < 0.02 and abs(best[1][1]) > 0.99 and 0.03 < best[2] < 0.06
+    assert (np.abs(found.middle[:, 0]) <= 0.1).all()
+    assert not len(grasps.find(solid, flat, dataclasses.replace(hand, opening=0.03)).cost)
+
+
+@pytest.mark.parametrize("robot", ["nero", "cobotta_pro_900"])
+def test_hands_can_grasp_every_object(robot):
+    """In nearly every way in which it rests: the lines of the best grasps meet its parts on both sides."""
+    hand = grasp.hand(registry.robot(robot))
+    for name in ("mug", "wrench"):
+        solid = objects.find(name)
+        for quat in solid.rest_quat[:2]:
+            found = grasps.find(solid, quat, hand)
+            assert len(found.cost), name
+            assert (found.gap <= hand.opening).all() and np.abs(np.linalg.norm(found.across, axis=1) - 1).max() < 1e-6
+            assert np.abs(found.across @ rests.up(quat)).max() < 1e-6  # level
+
+
+def test_jax_says_what_it_cannot(env):
+    with pytest.raises(UserError, match="MJX-JAX cannot give an object another shape in each episode"):
+        JaxPhysics(env.physics_model, env.cfg.sim, env._banks.names)
+
+
+def test_object_in_the_place_of_the_cube():
+    """``--object``: its rests, its grasps, its size; tasks that have no such object say so."""
+    cfg = env_cfg("nero_lift", **{"object.file": "hammer", "object.scale": 0.8})
+    item = cfg.scene.objects["cube"]
+    assert (item.shape, item.file, item.scale) == ("mesh", "hammer", 0.8)
+    assert cfg.controllers["grasp_thing"]["files"] == ("hammer",) and list(cfg.events)[-1] == "reset_object_shape"
+    assert cfg.rewards["holding_object"].params["minimal_height"] == 0.01
+    pushed = env_cfg("nero_push", **{"object.file": "mug"})
+    assert pushed.success.condition.params["fold"] == 1 and not pushed.controllers
+    for env_name, thing, says in (
+        ("nero_clutter", "mug", "the one object that a task lifts or pushes, and this task has none"),
+        ("nero_reach", "mug", "and this task has none"),
+        ("nero_push", "screwdriver", "does not stand as its file has it"),
+        ("nero_lift", "mugg", "did you mean 'mug'"),
+    ):
+        with pytest.raises(UserError, match=says):
+            env_cfg(env_name, **{"object.file": thing})
+
+
+def test_grasp_thing_takes_files():
+    with pytest.raises(UserError, match="grasp_thing needs files"):
+        control.make("grasp_thing", registry.robot("nero"), 0.02)
+
+
+@pytest.mark.slow
+def test_expert_lifts_things():
+    """Sixteen episodes; ``docs/guides/objects.md`` has more."""
+    played = evaluation.play(evaluation.EvalCfg("nero_lift_any", impl="native", controller="expert", episodes=16, seed=3))
+    assert played.result["success_rate"] >= 0.6, played.result
+
+
+@pytest.mark.slow
+def test_training_runs(call):
+    """A few updates on a CPU."""
+    flags = ("--num-envs", 8, "--num-timesteps", 400, "--impl", "native", "--no-video", "--out", "run")
+    code, out, err = call("train", "--env", "nero_lift_any", "--env.curriculum.expert_starts", 0, *flags)
+    assert code == 0, (out, err)
