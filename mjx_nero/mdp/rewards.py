@@ -23,8 +23,9 @@ def _ee_distance(view: View, object: str) -> Float[Array, ""]:
 def _height(view: View, object: str) -> Float[Array, ""]:
     """Height of the object's centre above the table, or of the lowest point of a mesh [m]."""
     seen = view.objects[object]
-    low = 0.0 if seen.shape is None else jnp.min(seen.shape.points @ math.rotation_matrix(seen.quat_w)[2])
-    return seen.pos_w[2] + low
+    if seen.shape is None:
+        return seen.pos_w[2]
+    return seen.pos_w[2] + jnp.min(seen.shape.points @ math.rotation_matrix(seen.quat_w)[2])
 
 
 def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:

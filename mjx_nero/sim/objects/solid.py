@@ -119,9 +119,11 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
         drawn = _coarser(merged, MAX_DRAWN)
         note = f"{len(raw.faces):,} triangles are drawn as {len(drawn.faces):,}" + (", without texture" if len(raw.uv) else "")
     drawn.metadata["uv"] = bool(len(raw.uv)) and not note
-    mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=True)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
+    if not mesh.is_watertight:  # merging those that are all but the same opens what is closed
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    a, b, c = mesh.faces.T
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # but thin ones stay: without them a closed surface has slits
     mesh.update_faces(mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) < 4:

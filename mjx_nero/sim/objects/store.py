@@ -28,7 +28,7 @@ HOME = ASSETS / "objects"
 ABOUT = "object.yaml"
 MAX_KEPT = 30_000_000  # bytes
 ENDING = ".solid"
-_VERSION = 5  # of what is kept
+_VERSION = 7  # of what is kept
 _ARRAYS = {field.name for field in dataclasses.fields(Solid) if field.name not in ("volume", "rgba", "density", "note")}
 
 

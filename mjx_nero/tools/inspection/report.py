@@ -23,7 +23,7 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim import grasp, linkage, render, scene
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
 from mjx_nero.sim.robot import Box, RobotCfg
-from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.types import UserError
 
 
@@ -294,8 +294,14 @@ def _task(name: str, preset: str | None, cfg: EnvCfg) -> Task:
         rewards={term: reward.weight for term, reward in cfg.rewards.items()},
         terminations={term: _call(done) + (", a time-out" if done.time_out else "") for term, done in cfg.terminations.items()},
         events={term: _call(event) for term, event in cfg.events.items()},
-        objects={n: f"{o.shape}, {' x '.join(f'{x:g}' for x in o.size)} m, {o.mass:g} kg" for n, o in cfg.scene.objects.items()},
+        objects={name: _object(item) for name, item in cfg.scene.objects.items()},
     )
+
+
+def _object(item: ObjectCfg) -> str:
+    if item.shape == "mesh":
+        return f"mesh, {' or '.join((item.file, *item.bank))}, {' or '.join(f'{mass:.3g}' for mass in item.masses)} kg"
+    return f"{item.shape}, {' x '.join(f'{x:g}' for x in item.size)} m, {item.mass:g} kg"
 
 
 def _summary(term: Term) -> str:
