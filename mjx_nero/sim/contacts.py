@@ -19,6 +19,7 @@ _MOST = {
     "hfield": dict.fromkeys(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), 50),
 }
 _CONVEX = 4
+_PARTS = 3  # of a mesh, that one geom touches at once
 _EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
 
 
@@ -81,9 +82,9 @@ def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
 def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
     """Sizes MJX-Warp's buffers for a scene of several objects, which cannot all touch one another at once.
 
-    The count assumes that every object lies on the table, every geom of the robot touches the table and one object, and every
-    second object touches one more; each time the pair with the most contacts. Contacts beyond that are lost and counted (see
-    ``Physics``).
+    The count assumes that every object lies on the table, every geom of the robot touches the table and one object (of a mesh up
+    to ``_PARTS`` of its parts), and every second object touches one more; each time the pair with the most contacts. Contacts
+    beyond that are lost and counted (see ``Physics``).
     """
     model = scene.build(robot, objects, sim, visuals=False)
     of_object = {geom: _body(model, geom) for geom in range(model.ngeom) if _body(model, geom) in objects.objects}
@@ -95,7 +96,14 @@ def crowded(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
     hand = {name for pair in rest for name in (pair.first, pair.second) if name not in names}
 
     def most(count: str) -> int:
-        each = [max(getattr(pair, count) for pair in rest if geom in (pair.first, pair.second)) for geom in hand]
+        each = []
+        for geom in hand:
+            of_body: dict[str, list[int]] = {}
+            for pair in rest:
+                if geom in (pair.first, pair.second):
+                    other = pair.second if geom == pair.first else pair.first
+                    of_body.setdefault(names.get(other, other), []).append(getattr(pair, count))
+            each.append(max(sum(sorted(found, reverse=True)[:_PARTS]) for found in of_body.values()))
         others = sorted((getattr(pair, count) for pair in between), reverse=True)[: len(objects.objects) // 2]
         return sum(getattr(pair, count) for pair in at_table) + sum(each) + sum(others)
 

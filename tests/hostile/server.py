@@ -72,7 +72,8 @@ def run(call: Callable[[], None], folder: pathlib.Path, seconds: float = SECONDS
 
     The time in which a busy machine gives the child no core is none of the child's, so it is taken off the clock's.
     """
-    started, memory, waited, why = time.monotonic(), 0.0, 0.0, ""
+    started, memory, why = time.monotonic(), 0.0, ""
+    queued: dict[int, float] = {}  # by process: the child, and those that it starts and waits for
     pid = os.fork()
     if not pid:
         code = 70
@@ -92,17 +93,26 @@ def run(call: Callable[[], None], folder: pathlib.Path, seconds: float = SECONDS
         done, status, used = os.wait4(pid, os.WNOHANG)
         if done:
             break
-        memory, waited = max(memory, _resident(pid)), max(waited, _queued(pid))
+        memory = max(memory, sum(map(_resident, _family(pid))))
+        queued |= {each: max(queued.get(each, 0.0), _queued(each)) for each in _family(pid)}
+        waited = sum(queued.values())
         if time.monotonic() - started - waited > seconds or memory > MEMORY:
             why = "time" if memory <= MEMORY else "memory"
             os.killpg(pid, signal.SIGKILL) if os.getpgid(pid) == pid else os.kill(pid, signal.SIGKILL)
             _, status, used = os.wait4(pid, 0)
             break
         time.sleep(0.02)
-    memory = max(memory, 1024.0 * used.ru_maxrss)
+    memory, waited = max(memory, 1024.0 * used.ru_maxrss), sum(queued.values())
     code, took = os.waitstatus_to_exitcode(status), max(used.ru_utime + used.ru_stime, time.monotonic() - started - waited)
     why = "time" if code in (-signal.SIGXCPU, -signal.SIGKILL) and not why else why
     return {"code": code, "killed": why, "seconds": took, "memory": memory}
+
+
+def _family(pid: int) -> list[int]:
+    """A process and those that it has started."""
+    with contextlib.suppress(OSError, ValueError):
+        return [pid, *map(int, pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+    return [pid]
 
 
 def _resident(pid: int) -> float:

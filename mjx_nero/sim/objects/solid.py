@@ -18,7 +18,7 @@ from mjx_nero.types import UserError
 MAX_PARTS, MAX_CORNERS = 16, 48  # of an object; of a part
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of what is cut into pieces
-SECONDS = 20  # of CPU, for the cutting
+SECONDS = 12  # of CPU, for the cutting
 DENSITY = 500.0  # [kg/m3] of a thing of which nobody knows it
 FLAT = 1e-4  # least thickness, as a share of the length
 
@@ -164,7 +164,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     np.savez(given, vertices=np.asarray(coarse.vertices, float), faces=np.asarray(coarse.faces))
     command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(SECONDS)]
     try:
-        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=6 * SECONDS)
+        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=20 * SECONDS)
     except subprocess.TimeoutExpired:
         done = None
     if done is None or done.returncode or not done.stdout:

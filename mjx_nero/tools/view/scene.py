@@ -14,6 +14,7 @@ from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import Frame, Session, free_joints
 
 HIDDEN = 3  # geom groups from here on: what collides
+SHAPE = "/drawn/"  # in the names of geoms that draw one shape of an object that may have several (``sim.objects.body``)
 APART = 1.5  # between environments [m]
 
 
@@ -53,23 +54,31 @@ class Scene:
                 name,
                 mesh.vertices.astype(np.float32),
                 mesh.faces,
-                batched_positions=positions[body],
+                batched_positions=self._shown(positions[body], model.geom(name[1:]).id if SHAPE in name else -1, session.frame),
                 batched_wxyzs=quats[body],
                 batched_colors=tuple(int(255 * c) for c in rgba[:3]),
                 opacity=float(rgba[3]) if rgba[3] < 1 else None,
                 lod="off",
             )
-            self._bodies.append((body, handle))
+            self._bodies.append((body, handle, model.geom(name[1:]).id if SHAPE in name else -1))
             self._draggable(handle, model.body(body).name)
 
     def show(self, frame: Frame) -> None:
         """Moves the bodies."""
         positions, quats = self._poses(frame)
         with self._server.atomic():
-            for body, handle in self._bodies:
+            for body, handle, geom in self._bodies:
                 if body:  # the world stands
-                    handle.batched_positions, handle.batched_wxyzs = positions[body], quats[body]
+                    handle.batched_positions, handle.batched_wxyzs = self._shown(positions[body], geom, frame), quats[body]
             self._place(frame)
+
+    @staticmethod
+    def _shown(positions: np.ndarray, geom: int, frame: Frame) -> np.ndarray:
+        """Where a body's mesh is [n, 3]; far below where an environment has another shape of the object."""
+        if geom < 0 or "geom_rgba" not in frame.scenery.look:
+            return positions
+        there = np.asarray(frame.scenery.look["geom_rgba"])[:, geom, 3] > 0
+        return np.where(there[:, None], positions, positions - [0.0, 0.0, 100.0]).astype(np.float32)
 
     def _place(self, frame: Frame) -> None:
         """Draws obstacles anew where an episode has others (see ``ManipulationEnv.scenery``)."""
@@ -130,22 +139,29 @@ def _above(model: mujoco.MjModel, body: int) -> list[int]:
 def meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:
     """(body, name, mesh in the body's frame, colour): the visible geoms of a body, those of one colour in one mesh."""
     for body in range(model.nbody):
-        found: dict[tuple[float, ...], list[trimesh.Trimesh]] = {}
+        found: dict[tuple[str, tuple[float, ...]], list[trimesh.Trimesh]] = {}
         for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < HIDDEN)):
             if model.geom_contype[geom] & OBSTACLE:  # differ from one environment to the other
                 continue
             material = model.geom_matid[geom]
             rgba = tuple(float(x) for x in (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]))
             make = _SHAPES.get(int(model.geom_type[geom]))
-            if make is None or rgba[3] == 0:
+            shape = model.geom(geom).name if SHAPE in model.geom(geom).name else ""
+            if make is None or rgba[3] == 0 and not shape:
                 continue
+            rgba = (*rgba[:3], 1.0) if shape else rgba
             pose = np.eye(4)
             rotation = np.empty(9)
             mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
             pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
-            found.setdefault(rgba, []).append(make(model, int(geom)).apply_transform(pose))
-        for i, (rgba, meshes) in enumerate(found.items()):
-            yield body, f"/{model.body(body).name or 'body'}/{i}", cast(trimesh.Trimesh, trimesh.util.concatenate(meshes)), rgba
+            found.setdefault((shape, rgba), []).append(make(model, int(geom)).apply_transform(pose))
+        for i, ((shape, rgba), meshes) in enumerate(found.items()):
+            yield (
+                body,
+                f"/{shape or '/'.join((model.body(body).name or 'body', str(i)))}",
+                cast(trimesh.Trimesh, trimesh.util.concatenate(meshes)),
+                rgba,
+            )
 
 
 def _flat(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
