@@ -35,6 +35,7 @@ RUN = {
     "deploy_onnx.md": "tests/interop/test_onnx.py",
     "adding_an_arm.md": "tests/test_docs.py",
     "cameras.md": "tests/sim/test_cameras.py",
+    "objects.md": "tests/sim/test_objects.py",
 }
 
 NO_BEGINNING = set(

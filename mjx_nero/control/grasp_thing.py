@@ -135,7 +135,7 @@ class GraspThing(PickUp):
         )
 
     def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
-        """Where the grasp point must be for the pads to have their middle there, but not too near the table."""
+        """Computes the place of the grasp point with the pads' middle there, but not too near the table."""
         height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
 

@@ -246,14 +246,8 @@ def mesh(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], N
     (folder / "mine" / "m.mtl").write_text("secret")
     kind = draw.choice(("glb", "glb", "stl", "obj", "obj", "folder", "name"))
     if kind == "name":
-        return kind, functools.partial(
-            server.command,
-            [
-                "inspect",
-                "--object",
-                draw.choice(("/dev/zero", "/dev/stdin", "/", "..", "x" * 5000 + ".stl", "m.3mf", "\n.obj", "%s.glb", ".")),
-            ],
-        )
+        name = draw.choice(("/dev/zero", "/dev/stdin", "/", "..", "x" * 5000 + ".stl", "m.3mf", "\n.obj", "%s.glb", "."))
+        return f"name {name[:20]!r}", functools.partial(server.command, ["inspect", "--object", name])
     makers = {
         "glb": of_glb,
         "stl": of_stl,
@@ -269,6 +263,6 @@ def mesh(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], N
         )
     scale = draw.choice(("1", "1", "0.1", "1e-9", "1e9", "0.001"))
     given = here if kind == "folder" and draw.random() < 0.5 else path
-    return f"{kind} {content[:60]!r} scale {scale}", functools.partial(
+    return f"{kind} {path.name}, {len(content)} bytes, scale {scale}", functools.partial(
         server.command, ["inspect", "--object", given, "--scale", scale]
     )

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pathlib
+import re
 import runpy
 
 import imageio.v3 as imageio
@@ -13,7 +14,7 @@ import trimesh
 from mjx_nero import UserError
 from mjx_nero.envs import registry
 from mjx_nero.sim import objects, scene
-from mjx_nero.sim.objects import rests, solid, store
+from mjx_nero.sim.objects import making, rests, solid, store
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 
 EDGES = (0.04, 0.06, 0.1)
@@ -105,21 +106,24 @@ def test_own_objects_are_what_their_script_makes(tmp_path):
             assert part.volume <= found.volume * 1.001
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_own_objects_rest_where_they_are_put(name):
-    """In the task's scene, in every one of their rests, for half a second."""
-    item = ObjectCfg(shape="mesh", file=name)
-    (found,) = item.solids
-    model = scene.build(registry.robot("nero"), SceneCfg(objects={"cube": item}), SimCfg(), visuals=False, fuse=True)
-    data, at = mujoco.MjData(model), model.joint("cube").qposadr[0]
-    assert model.body("cube").mass == pytest.approx(item.masses[0]) and model.ngeom < 25
-    for quat in found.rest_quat:
+def test_own_objects_rest_where_they_are_put():
+    """All of them beside one another in a task's scene, in one rest after the other, for half a second each."""
+    items = {name: ObjectCfg(shape="mesh", file=name) for name in NAMES}
+    model = scene.build(registry.robot("nero"), SceneCfg(objects=items), SimCfg(), visuals=False, fuse=True)
+    data, solids = mujoco.MjData(model), {name: item.solids[0] for name, item in items.items()}
+    for k in range(max(len(found.rest_quat) for found in solids.values())):
         mujoco.mj_resetData(model, data)
-        data.qpos[at : at + 7] = [0.35, 0.3, found.height(quat), *quat]
+        put = {}
+        for i, (name, found) in enumerate(solids.items()):
+            quat, at = found.rest_quat[k % len(found.rest_quat)], model.joint(name).qposadr[0]
+            put[name] = at, [0.5, 0.5 + 0.4 * i, found.height(quat), *quat]
+            data.qpos[at : at + 7] = put[name][1]
         for _ in range(50):
             mujoco.mj_step(model, data)
-        away = np.linalg.norm(data.qpos[at : at + 3] - [0.35, 0.3, found.height(quat)])
-        assert away < 2e-3 and rests.up(quat) @ rests.up(data.qpos[at + 3 : at + 7]) > np.cos(0.03)
+        for name, (at, pose) in put.items():
+            assert model.body(name).mass == pytest.approx(items[name].masses[0])
+            assert np.linalg.norm(data.qpos[at : at + 3] - pose[:3]) < 2e-3, (name, k)
+            assert rests.up(np.array(pose[3:])) @ rests.up(data.qpos[at + 3 : at + 7]) > np.cos(0.03), (name, k)
 
 
 def test_cut_once_and_kept_beside_the_file(tmp_path, monkeypatch):
@@ -137,7 +141,7 @@ def test_cut_once_and_kept_beside_the_file(tmp_path, monkeypatch):
     def refuse(*_):
         raise AssertionError("cut again")
 
-    monkeypatch.setattr(solid, "make", refuse)
+    monkeypatch.setattr(making, "make", refuse)
     store._found.cache_clear()
     again = objects.find(str(path))
     assert (again.points == found.points).all() and again.rgba == found.rgba
@@ -213,3 +217,12 @@ def test_inspection(call, block):
     assert code == 0 and not err and "20.0 x 30.0 x 50.0 mm" in out and "0.015 kg, at 500 kg/m³" in out and "10.0 mm" in out
     code, _, err = call("mjx_nero", "inspect", "--object", "none.stl")
     assert code == 2 and err.startswith("error: cannot read none.stl")
+
+
+def test_the_guides_bank():
+    """The Python of docs/guides/objects.md."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / "guides" / "objects.md"
+    (snippet,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    names: dict = {}
+    exec(snippet, names)
+    assert names["env"]._banks.counts == {"thing": 3}

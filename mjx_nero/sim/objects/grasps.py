@@ -1,4 +1,4 @@
-"""Where a hand of two pads can grasp a thing that lies on a table, from straight above.
+"""Finds grasps: places at which a hand of two pads can hold a thing that lies on a table, from straight above.
 
 A grasp is a level line through the thing: the pads close along it from both sides. Lines in many directions, at many places and
 heights are tried. One is good if the surface stands across it at both ends, if there is room for the open fingers beside the
@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from mjx_nero.sim.objects import rests
 from mjx_nero.sim.objects.solid import Solid
@@ -67,6 +66,8 @@ class Grasps:
 @functools.lru_cache(maxsize=1024)
 def _sides(points: bytes) -> Float[np.ndarray, "m 4"]:
     """The planes of a convex part: normals and offsets, n x + b <= 0 inside."""
+    from scipy.spatial import ConvexHull
+
     return ConvexHull(np.frombuffer(points).reshape(-1, 3)).equations
 
 
@@ -112,7 +113,7 @@ class _Heights:
 
 
 def _cut(sides: np.ndarray, starts: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where lines enter and leave a convex part, and how much of the normal lies along the line there, all [n]."""
+    """Cuts lines with a convex part: where they enter and leave, and how much of the normal lies along each there, all [n]."""
     slope, off = sides[:, :3] @ way, starts @ sides[:, :3].T + sides[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = -off / slope

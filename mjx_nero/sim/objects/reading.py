@@ -13,10 +13,9 @@ from PIL import Image
 
 from mjx_nero import files
 from mjx_nero.sim.objects import glb
+from mjx_nero.sim.objects.store import GREY, KINDS
 from mjx_nero.types import UserError
 
-KINDS = (".obj", ".stl", ".glb")
-MAX_BYTES = 300_000_000  # of a mesh
 MAX_TRIANGLES = 4_000_000
 MAX_NUMBERS = 30_000_000  # in a text file
 MAX_MTL = 1_000_000  # bytes of a file of materials
@@ -28,7 +27,7 @@ _FAR = 1e6  # a coordinate is less
 
 @dataclasses.dataclass(frozen=True)
 class Raw:
-    """What a mesh file holds.
+    """The content of a mesh file.
 
     Attributes:
         vertices: [n, 3], in the file's unit.
@@ -43,9 +42,6 @@ class Raw:
     uv: np.ndarray
     texture: np.ndarray
     rgba: tuple[float, float, float, float]
-
-
-GREY = (0.7, 0.7, 0.72, 1.0)
 
 
 def read(path: pathlib.Path, content: bytes) -> Raw:

@@ -1,8 +1,9 @@
-"""How a thing comes to rest on a table: by geometry, and then by the physics, which alone decides."""
+"""Finds the ways in which a thing rests on a table: by geometry, and then by the physics, which alone decides."""
+
+from typing import Any
 
 import mujoco
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 LEAST_SHARE = 0.02  # of the ways in which an object comes to rest
@@ -22,6 +23,8 @@ def find(hull: Points, inertia: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndar
         hull: corners about the centre of mass [m].
         inertia: for each kilogramme [m2].
     """
+    import trimesh
+
     poses, shares = trimesh.poses.compute_stable_poses(
         _simple(hull), center_mass=np.zeros(3), sigma=0.0, n_samples=1, threshold=0.0
     )
@@ -84,7 +87,9 @@ def _firm(points: Points, up: np.ndarray) -> bool:
     return bool((_height(points, tilted) >= _height(points, up[None])).all())
 
 
-def _simple(hull: Points) -> trimesh.Trimesh:
+def _simple(hull: Points) -> Any:
     """The hull of rounded corners: parts meet in corners that are the same but for the last digits."""
+    import trimesh
+
     digits = max(0, 4 - int(np.floor(np.log10(float(np.ptp(hull, axis=0).max())))))
     return trimesh.PointCloud(np.unique(np.round(hull, digits), axis=0)).convex_hull

@@ -1,4 +1,4 @@
-"""What terms and policies may know of the shape of a thing: how far it reaches in evenly spread directions, and its moments."""
+"""Describes the shape of a thing to terms and policies: by how far it reaches in evenly spread directions, and its moments."""
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,6 @@ def box(solid: Solid) -> Float[np.ndarray, "2 3"]:
 
 
 def code(solid: Solid) -> Float[np.ndarray, "17"]:
-    """How far it reaches in 14 directions, and its three radii of gyration, the least first [m]."""
+    """Returns how far it reaches in 14 directions, and its three radii of gyration, the least first [m]."""
     reach = (solid.hull @ DIRECTIONS[CODED].T).max(0)
     return np.concatenate([reach, np.sqrt(np.linalg.eigvalsh(solid.inertia) / solid.volume)])

@@ -19,7 +19,7 @@ from safetensors import numpy as tensors
 
 from mjx_nero import cache, files
 from mjx_nero.config import bounds, values
-from mjx_nero.sim.objects import reading, solid
+from mjx_nero.sim.objects import solid
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.types import UserError
@@ -28,13 +28,16 @@ HOME = ASSETS / "objects"
 ABOUT = "object.yaml"
 MAX_KEPT = 30_000_000  # bytes
 ENDING = ".solid"
+KINDS = (".obj", ".stl", ".glb")
+MAX_BYTES = 300_000_000  # of a mesh
+GREY = (0.7, 0.7, 0.72, 1.0)
 _VERSION = 7  # of what is kept
 _ARRAYS = {field.name for field in dataclasses.fields(Solid) if field.name not in ("volume", "rgba", "density", "note")}
 
 
 @dataclasses.dataclass(frozen=True)
 class AboutCfg:
-    """What ``object.yaml`` says.
+    """The fields of ``object.yaml``.
 
     Attributes:
         mesh: file of what is drawn and weighed, in the same folder.
@@ -46,7 +49,7 @@ class AboutCfg:
     mesh: str
     parts: str = ""
     density: bounds.Positive = solid.DENSITY
-    rgba: tuple[float, float, float, float] = reading.GREY
+    rgba: tuple[float, float, float, float] = GREY
 
 
 @functools.lru_cache(maxsize=1)
@@ -76,10 +79,10 @@ def _path(file: str) -> pathlib.Path:
     with contextlib.suppress(OSError, ValueError):
         if path.is_dir():
             return path / ABOUT
-    if path.suffix.lower() not in (*reading.KINDS, ".yaml"):
+    if path.suffix.lower() not in (*KINDS, ".yaml"):
         near = values.hint(file, names())
         raise UserError(
-            f"no object {values.short(file)}{near}: give a file ({', '.join(reading.KINDS)}), a folder with {ABOUT}, "
+            f"no object {values.short(file)}{near}: give a file ({', '.join(KINDS)}), a folder with {ABOUT}, "
             f"or one of {', '.join(names())}"
         )
     return path
@@ -89,8 +92,8 @@ def _path(file: str) -> pathlib.Path:
 def _found(path: pathlib.Path, *_changed: int) -> Solid:
     about = _about(path)
     whole = files.inside(path.parent, about.mesh) if path.suffix == ".yaml" else path
-    content = files.read_bytes(whole, reading.MAX_BYTES)
-    more = files.read_bytes(files.inside(path.parent, about.parts), reading.MAX_BYTES) if about.parts else b""
+    content = files.read_bytes(whole, MAX_BYTES)
+    more = files.read_bytes(files.inside(path.parent, about.parts), MAX_BYTES) if about.parts else b""
     key = hashlib.sha256(repr((_VERSION, solid.MAX_PARTS, solid.MAX_CORNERS, dataclasses.astuple(about))).encode())
     for part in (content, more):
         key.update(hashlib.sha256(part).digest())
@@ -98,12 +101,14 @@ def _found(path: pathlib.Path, *_changed: int) -> Solid:
     for place in places:
         if (kept := _kept(place, key.hexdigest())) is not None:
             return kept
+    from mjx_nero.sim.objects import making, reading  # with what configs and help do without
+
     try:
         raw = reading.read(whole, content)
-        parts = solid.cut(whole, reading.read(files.inside(path.parent, about.parts), more)) if more else None
+        parts = making.cut(whole, reading.read(files.inside(path.parent, about.parts), more)) if more else None
         if path.suffix == ".yaml" and not raw.texture.size:
             raw = dataclasses.replace(raw, rgba=about.rgba)
-        made = solid.make(raw, parts, about.density)
+        made = making.make(raw, parts, about.density)
     except UserError as error:
         text = str(error)
         raise error if str(whole) in text else UserError(f"{whole} {text}") from None
@@ -116,13 +121,13 @@ def _about(path: pathlib.Path) -> AboutCfg:
         return AboutCfg(mesh=path.name)
     about = values.read(AboutCfg, files.read_yaml(path), f"{path}")
     for name in filter(None, (about.mesh, about.parts)):
-        if pathlib.PurePath(name).name != name or pathlib.PurePath(name).suffix.lower() not in reading.KINDS:
-            raise UserError(f"{path}: {values.short(name)} is no {', '.join(reading.KINDS)} file in its own folder: change it")
+        if pathlib.PurePath(name).name != name or pathlib.PurePath(name).suffix.lower() not in KINDS:
+            raise UserError(f"{path}: {values.short(name)} is no {', '.join(KINDS)} file in its own folder: change it")
     return about
 
 
 def _places(path: pathlib.Path, key: str) -> list[pathlib.Path]:
-    """Where the solid may be kept: beside its file, else in the user's cache."""
+    """Lists the places where the solid may be kept: beside its file, else in the user's cache."""
     found = [path.with_name(path.name + ENDING)] if not path.is_relative_to(HOME) else []
     if kept := cache.folder():
         found.append(kept / "objects" / (key[:32] + ENDING))

@@ -16,7 +16,7 @@ _COLOURS = ((0.86, 0.37, 0.34), (0.36, 0.6, 0.85), (0.45, 0.7, 0.42), (0.93, 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Thing:
-    """What a file holds.
+    """The thing that a file holds.
 
     Attributes:
         edges: of the box around it, along the file's axes [m].

@@ -74,7 +74,7 @@ class Scene:
 
     @staticmethod
     def _shown(positions: np.ndarray, geom: int, frame: Frame) -> np.ndarray:
-        """Where a body's mesh is [n, 3]; far below where an environment has another shape of the object."""
+        """Places of a body's mesh [n, 3]: far below if an environment has another shape of the object."""
         if geom < 0 or "geom_rgba" not in frame.scenery.look:
             return positions
         there = np.asarray(frame.scenery.look["geom_rgba"])[:, geom, 3] > 0

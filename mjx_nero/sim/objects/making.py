@@ -1,0 +1,179 @@
+"""Makes solids of meshes: cleans, weighs and cuts them."""
+
+import importlib.util
+import io
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import trimesh
+
+from mjx_nero.sim.objects import pieces, rests
+from mjx_nero.sim.objects.reading import Raw
+from mjx_nero.sim.objects.solid import DENSITY, MAX_CORNERS, MAX_PARTS, Solid
+from mjx_nero.types import UserError
+
+MAX_DRAWN = 40_000  # triangles
+COARSE = 2_500  # triangles of what is cut into pieces
+SECONDS = 12  # of CPU, for the cutting
+FLAT = 1e-4  # least thickness, as a share of the length
+
+
+def make(raw: Raw, parts: list[np.ndarray] | None, density: float = DENSITY) -> Solid:
+    """Makes a solid of a mesh.
+
+    Args:
+        parts: its convex parts, if somebody has cut it already.
+
+    Raises:
+        UserError: it encloses nothing, is too flat, cannot be cut, or the library that cuts is not installed.
+    """
+    mesh, drawn, note = _cleaned(raw)
+    hulls = [_hull(part) for part in (parts if parts is not None else _parts(mesh))]
+    if len(hulls) > MAX_PARTS:
+        raise UserError(f"has {len(hulls)} convex parts: at most {MAX_PARTS}")
+    volume, center, inertia = _weighed(mesh if mesh.is_volume else None, hulls)
+    points = np.concatenate([part.vertices for part in hulls]) - center
+    hull = np.asarray(_hull(points).vertices)
+    quats, shares = rests.find(hull, inertia / volume)
+    return Solid(
+        points=points,
+        sizes=np.array([len(part.vertices) for part in hulls]),
+        hull=hull,
+        volume=volume,
+        inertia=inertia,
+        center=center,
+        rest_quat=quats,
+        rest_share=shares,
+        vertices=drawn.vertices - center,
+        faces=np.asarray(drawn.faces),
+        uv=raw.uv if drawn.metadata.get("uv") else np.zeros((0, 2), np.float32),
+        texture=raw.texture if drawn.metadata.get("uv") else np.zeros((0, 0, 3), np.uint8),
+        rgba=_colour(raw) if not drawn.metadata.get("uv") else raw.rgba,
+        density=density,
+        note=note,
+    )
+
+
+def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
+    """Returns what is weighed and cut, what is drawn, and what was lost."""
+    size = float(np.ptp(raw.vertices[np.unique(raw.faces)], axis=0).max())
+    if not size > 0:
+        raise UserError("has no size")
+    note, drawn = "", trimesh.Trimesh(raw.vertices, raw.faces, process=False)
+    if len(raw.faces) > MAX_DRAWN:
+        merged = trimesh.Trimesh(raw.vertices, raw.faces, process=True)
+        drawn = _coarser(merged, MAX_DRAWN)
+        note = f"{len(raw.faces):,} triangles are drawn as {len(drawn.faces):,}" + (", without texture" if len(raw.uv) else "")
+    drawn.metadata["uv"] = bool(len(raw.uv)) and not note
+    mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
+    if not mesh.is_watertight:  # merging those that are all but the same opens what is closed
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    a, b, c = mesh.faces.T
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # but thin ones stay: without them a closed surface has slits
+    mesh.update_faces(mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) < 4:
+        raise UserError("encloses nothing: it has fewer than four triangles that are not points or lines")
+    if mesh.is_watertight and not mesh.is_volume:
+        mesh.fix_normals()
+    return mesh, drawn, note
+
+
+def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+    """Removes triangles where the surface is flattest until ``most`` are left."""
+    if len(mesh.faces) <= most:
+        return mesh
+    if importlib.util.find_spec("fast_simplification") is None:
+        raise UserError(f"has more than {most:,} triangles: make it coarser, or install the extra (pip install -e '.[meshes]')")
+    import fast_simplification
+
+    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most)
+    return trimesh.Trimesh(vertices, faces, process=True)
+
+
+def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
+    """Cuts a mesh into convex parts; one that is convex already is its own.
+
+    Raises:
+        UserError: the library is not installed, or fails.
+    """
+    hull = _hull(np.asarray(mesh.vertices))
+    if mesh.is_volume and mesh.volume > 0.97 * hull.volume:
+        return [np.asarray(hull.vertices)]
+    if importlib.util.find_spec("coacd") is None:
+        raise UserError(
+            "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install -e '.[meshes]')"
+        )
+    coarse = _coarser(mesh, COARSE)
+    given = io.BytesIO()
+    np.savez(given, vertices=np.asarray(coarse.vertices, float), faces=np.asarray(coarse.faces))
+    command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(SECONDS)]
+    try:
+        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=20 * SECONDS)
+    except subprocess.TimeoutExpired:
+        done = None
+    if done is None or done.returncode or not done.stdout:
+        raise UserError("cannot be cut into convex parts in time and memory: repair it, or give it fewer triangles")
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
+        return np.split(found["points"], np.cumsum(found["sizes"])[:-1])
+
+
+def _hull(points: np.ndarray) -> trimesh.Trimesh:
+    """The convex hull, of ``MAX_CORNERS`` corners at most.
+
+    Raises:
+        UserError: the points lie in a plane.
+    """
+    size = float(np.ptp(points, axis=0).max()) or 1.0
+    try:
+        hull = trimesh.PointCloud(points).convex_hull
+        if len(hull.vertices) > MAX_CORNERS:  # those that stick out farthest in evenly spread directions
+            directions = trimesh.creation.icosphere(2).vertices
+            chosen = np.unique(np.argmax(hull.vertices @ directions.T, axis=0))
+            if len(chosen) > MAX_CORNERS:
+                chosen = np.unique(np.argmax(hull.vertices @ trimesh.creation.icosphere(1).vertices.T, axis=0))
+            hull = trimesh.PointCloud(hull.vertices[chosen]).convex_hull
+    except Exception:  # Qhull's own, many lines long
+        raise UserError("has a part that is flat: it needs a thickness") from None
+    if hull.volume < (FLAT * size) * (0.01 * size) ** 2 or not np.isfinite(hull.volume):
+        raise UserError("has a part that is flat: it needs a thickness")
+    return hull
+
+
+def _weighed(mesh: trimesh.Trimesh | None, hulls: list[trimesh.Trimesh]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume, centre of mass and inertia about it at density 1: the closed mesh's, or that of the parts together."""
+    each = [mesh] if mesh is not None and mesh.volume > 0 else hulls
+    volumes = np.array([part.volume for part in each])
+    centers = np.array([part.center_mass for part in each])
+    center = volumes @ centers / volumes.sum()
+    inertia = np.zeros((3, 3))
+    for part, volume, at in zip(each, volumes, centers - center, strict=True):
+        inertia += part.moment_inertia + volume * (at @ at * np.eye(3) - np.outer(at, at))
+    if not np.isfinite(inertia).all() or not (np.linalg.eigvalsh(inertia) > 0).all():
+        raise UserError("has no inertia: it encloses nothing")
+    return float(volumes.sum()), center, inertia
+
+
+def _colour(raw: Raw) -> tuple[float, float, float, float]:
+    """The mean colour of a texture that is not drawn, or the mesh's own."""
+    if not raw.texture.size:
+        return raw.rgba
+    red, green, blue = (float(c) / 255 for c in raw.texture.mean((0, 1)))
+    return red, green, blue, 1.0
+
+
+def cut(path: pathlib.Path, raw: Raw) -> list[np.ndarray]:
+    """The convex parts that a file of them holds: its pieces that hang together.
+
+    Raises:
+        UserError: there are none, or more than ``MAX_PARTS``.
+    """
+    mesh = trimesh.Trimesh(raw.vertices, raw.faces, process=False)
+    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
+    count = int(labels.max()) + 1
+    if count > MAX_PARTS:
+        raise UserError(f"{path} has {count} convex parts: at most {MAX_PARTS}")
+    return [np.asarray(mesh.vertices[labels == k]) for k in range(count)]
