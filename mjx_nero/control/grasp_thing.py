@@ -90,8 +90,9 @@ class GraspThing(PickUp):
             middle=self._local(view, middles[best]),
         )
 
-    def step(self, memory: GraspThingMemory, view: View) -> tuple[GraspThingMemory, Float[Array, " nu"]]:
+    def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
         """Targets of all drives."""
+        assert isinstance(memory, GraspThingMemory)
         after, targets = super().step(memory, view)
         ends = jnp.where(memory.phase >= CLOSE, jnp.asarray(self.gripper.closed), memory.opened)
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))

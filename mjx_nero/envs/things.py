@@ -53,7 +53,7 @@ def applied(cfg: EnvCfg) -> EnvCfg:
         if pushed
         else {"reset_object_shape": Term(events.at_rest, params={"files": (thing.file,), "scale": thing.scale, "object": name})}
     )
-    new = {
+    new: dict[str, Any] = {
         "scene": scene,
         "sim": contacts.crowded(cfg.robot, scene, cfg.sim),
         "object": thing,

@@ -161,8 +161,9 @@ def _by_shape(env: ManipulationEnv, episodes: rollout.Episodes) -> dict[str, lis
     """The success rate of each shape that objects with a bank had, and in how many episodes it was there."""
     out = {}
     for name, item in env.cfg.scene.objects.items():
-        which = episodes.metrics.get(f"shape/{name}")
-        for k, file in enumerate((item.file, *item.bank) if which is not None else ()):
+        if (which := episodes.metrics.get(f"shape/{name}")) is None:
+            continue
+        for k, file in enumerate((item.file, *item.bank)):
             chosen = np.asarray(episodes.success)[np.round(which) == k]
             out[file] = [float(chosen.mean()) if len(chosen) else 0.0, len(chosen)]
     return out

@@ -110,7 +110,8 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     coarse = _coarser(mesh, COARSE)
     given = io.BytesIO()
     np.savez(given, vertices=np.asarray(coarse.vertices, float), faces=np.asarray(coarse.faces))
-    command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(SECONDS)]
+    closed = "closed" if coarse.is_volume else "open"
+    command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(SECONDS), closed]
     try:
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=20 * SECONDS)
     except subprocess.TimeoutExpired:

@@ -14,8 +14,14 @@ THRESHOLD = 0.04  # concavity that is left, as a share of the mesh's size
 MAX_MEMORY = 1_500_000_000  # bytes beyond what the libraries take to load
 
 
-def main(most: int, corners: int, seconds: int) -> None:
-    """Reads ``vertices`` and ``faces`` (npz), writes ``points`` and ``sizes`` of the pieces."""
+def main(most: int, corners: int, seconds: int, closed: bool) -> None:
+    """Reads ``vertices`` and ``faces`` (npz), writes ``points`` and ``sizes`` of the pieces.
+
+    Args:
+        most, corners: how many pieces, and corners of each, there may be.
+        seconds: of the processor's time.
+        closed: the surface has no holes.
+    """
     import coacd
 
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
@@ -28,9 +34,10 @@ def main(most: int, corners: int, seconds: int) -> None:
             coacd.Mesh(mesh["vertices"], mesh["faces"]),
             threshold=THRESHOLD,
             max_convex_hull=most,
+            preprocess_mode="off" if closed else "on",  # a surface with holes becomes a thicker one without
             preprocess_resolution=30,
-            mcts_iterations=20,
-            resolution=800,
+            mcts_iterations=20 if closed else 10,
+            resolution=800 if closed else 500,
             decimate=True,
             max_ch_vertex=corners,
             seed=0,
@@ -41,4 +48,4 @@ def main(most: int, corners: int, seconds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "closed")

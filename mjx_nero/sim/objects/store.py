@@ -31,7 +31,7 @@ ENDING = ".solid"
 KINDS = (".obj", ".stl", ".glb")
 MAX_BYTES = 300_000_000  # of a mesh
 GREY = (0.7, 0.7, 0.72, 1.0)
-_VERSION = 7  # of what is kept
+_VERSION = 8  # of what is kept
 _ARRAYS = {field.name for field in dataclasses.fields(Solid) if field.name not in ("volume", "rgba", "density", "note")}
 
 

@@ -277,7 +277,8 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
         kind, rows = getattr(model, name).dtype, shapes[name][0]
         row = drawn.strides[0]
         item = drawn.strides[1] * size // rows
-        shape, strides = (n, rows), (row, item)
+        shape: tuple[int, ...] = (n, rows)
+        strides: tuple[int, ...] = (row, item)
         if getattr(model, name).ndim == 3:  # two vectors a row
             shape, strides = (n, rows, 2), (row, item, item // 2)
         if kind is not wp.int32:  # see ``whole_numbers``
@@ -292,8 +293,12 @@ def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any)
     import warp as wp
 
     @wp.kernel(module="unique", enable_backward=False)
-    def convert(drawn: wp.array2d(dtype=float), at: int, out: wp.array2d(dtype=int)):  # type: ignore
-        i, j = wp.tid()
+    def convert(
+        drawn: wp.array2d(dtype=float),  # type: ignore
+        at: int,
+        out: wp.array2d(dtype=int),  # type: ignore
+    ):
+        i, j = wp.tid()  # type: ignore
         out[i, j] = int(drawn[i, at + j])
 
     at, jobs = 0, []
