@@ -215,3 +215,12 @@ def test_training_runs(call):
     flags = ("--num-envs", 8, "--num-timesteps", 400, "--impl", "native", "--no-video", "--out", "run")
     code, out, err = call("train", "--env", "nero_lift_any", *flags)
     assert code == 0, (out, err)
+
+
+def test_the_flag(call):
+    """``--object`` is the field ``env.object.file``, whose faults are one line."""
+    for command in ("eval", "train"):
+        code, _, err = call(command, "--env", "nero_clutter", "--object", "mug")
+        assert code == 2 and err.startswith("error: object takes the place of the one object that a task lifts or pushes"), err
+    code, _, err = call("eval", "--env", "nero_lift", "--object", "none.stl")
+    assert code == 2 and err.startswith("error: cannot read none.stl")

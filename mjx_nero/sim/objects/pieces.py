@@ -36,8 +36,8 @@ def main(most: int, corners: int, seconds: int, closed: bool) -> None:
             max_convex_hull=most,
             preprocess_mode="off" if closed else "on",  # a surface with holes becomes a thicker one without
             preprocess_resolution=30,
-            mcts_iterations=20 if closed else 10,
-            resolution=800 if closed else 500,
+            mcts_iterations=60 if closed else 10,
+            resolution=1000 if closed else 500,
             decimate=True,
             max_ch_vertex=corners,
             seed=0,
