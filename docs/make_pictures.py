@@ -1,8 +1,8 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
-docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the package's objects,
-and docs/failures/, three failures of tasks that fall short. A name makes one.
+docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the objects of the
+package, and docs/failures/, three failures of tasks that fall short. A name makes one.
 """
 
 import dataclasses

@@ -9,7 +9,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors import numpy as tensors
 
-from mjx_nero import cache, files
+from mjx_nero import files
+from mjx_nero.files import cache
 from mjx_nero.sim.objects import grasps, rests, store
 from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.objects.solid import Solid

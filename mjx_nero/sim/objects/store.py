@@ -17,8 +17,9 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors import numpy as tensors
 
-from mjx_nero import cache, files
+from mjx_nero import files
 from mjx_nero.config import bounds, values
+from mjx_nero.files import cache
 from mjx_nero.sim.objects import solid
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.robot import ASSETS
