@@ -57,8 +57,17 @@ class DelayMemory:
 
 
 @struct.dataclass
+class FixtureStart:
+    """A fixture's place and its joints' positions at the start of an episode."""
+
+    pos_w: Float[Array, "3"]  # of its origin [m]
+    quat_w: Float[Array, "4"]  # wxyz
+    joint_pos: dict[str, Float[Array, ""]]  # by the names in its file [rad or m]
+
+
+@struct.dataclass
 class Start:
-    """The start of an episode, as the reset events make it. Objects by name."""
+    """The start of an episode, as the reset events make it. Objects and fixtures by name."""
 
     joint_pos: Float[Array, " nj"]  # arm joints, then gripper joints [rad, m]
     object_pos_w: dict[str, Float[Array, "3"]]  # [m]
@@ -68,6 +77,7 @@ class Start:
     target: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # which of ``CommandTerm.targets``
     pull: Float[Array, " nj"] | float = 0.0  # how far the drives' targets are from the joints: what fingers press with [rad, m]
     phase: Int[Array, ""] = struct.field(default_factory=lambda: jnp.zeros((), jnp.int32))  # of the expert's; 0: not its
+    fixtures: dict[str, FixtureStart] = struct.field(default_factory=dict)
     shape: dict[str, Int[Array, ""]] = struct.field(default_factory=dict)  # which of its shapes each object with a bank has
 
 
@@ -130,6 +140,19 @@ class ObstacleView:
 
 
 @struct.dataclass
+class FixtureView:
+    """A fixture of the scene, as terms may read it. Joints and sites by the names in its file."""
+
+    pos_w: Float[Array, "3"]  # of its origin [m]
+    quat_w: Float[Array, "4"]  # wxyz
+    joint_pos: dict[str, Float[Array, ""]]  # [rad or m]
+    joint_vel: dict[str, Float[Array, ""]]  # [rad/s or m/s]
+    joint_range: dict[str, Float[Array, "2"]]  # least and greatest position; infinite without limits [rad or m]
+    site_pos_w: dict[str, Float[Array, "3"]]  # [m]
+    site_quat_w: dict[str, Float[Array, "4"]]  # wxyz
+
+
+@struct.dataclass
 class Appearance:
     """Size and colour of a drawn object that differ from the model's."""
 
@@ -188,6 +211,7 @@ class View:
     # What the encoders read beside ``joint_pos`` [rad, m]; None: nothing.
     encoder_bias: Float[Array, " nj"] | None = None
     obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
+    fixtures: dict[str, FixtureView] = struct.field(default_factory=dict)  # by name
     # What the scene's sensors measured in this step, by name. ``touch``: the strongest contact with an obstacle, or of the robot
     # with itself [N].
     readings: dict[str, Array] = struct.field(default_factory=dict)

@@ -27,7 +27,7 @@ from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
-from mjx_nero.sim import cameras, linkage, obstacles, scene, touch
+from mjx_nero.sim import cameras, fixtures, forces, linkage, obstacles, scene, touch
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.objects import bank
@@ -104,10 +104,19 @@ class ManipulationEnv(Env):
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
+        self._fixtures = fixtures.Fixtures(model, cfg.scene.fixtures)
         self._banks = bank.Banks(model, cfg.scene.objects)
         sees = self._pictures if cfg.scene.cameras else None
         self._viewer = Viewer(
-            model, cfg.robot, cfg.scene.objects, self.episode_length, self.dt, cfg.command, self._obstacles, sees
+            model,
+            cfg.robot,
+            cfg.scene.objects,
+            self.episode_length,
+            self.dt,
+            cfg.command,
+            self._obstacles,
+            self._fixtures,
+            sees,
         )
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
@@ -137,6 +146,7 @@ class ManipulationEnv(Env):
         """The physics backend, created at the first step."""
         with jax.ensure_compile_time_eval():  # the first step may run under a trace
             drawn = self._randomization.names + self._banks.names + (obstacles.FIELDS if self.cfg.obstacles else ())
+            drawn += fixtures.FIELDS if self.cfg.scene.fixtures else ()
             return make_physics(self.physics_model, self.cfg.sim, self.impl, tuple(dict.fromkeys(drawn)))
 
     @functools.cached_property
@@ -150,8 +160,9 @@ class ManipulationEnv(Env):
         with jax.ensure_compile_time_eval():
             where, differ = self.cfg.scene, tuple(self._differing())
             kind = cameras.renderer(where.renderer, self.impl)
-            seen = tuple(dict.fromkeys((*self._look.names, *(("geom_rgba",) if self._banks.counts else ()))))
-            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), seen)
+            seen = (*self._look.names, *(("geom_rgba",) if self._banks.counts else ()))
+            seen += fixtures.FIELDS if where.fixtures else ()
+            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), tuple(dict.fromkeys(seen)))
 
     @functools.cached_property
     def _look(self) -> Look:
@@ -225,6 +236,7 @@ class ManipulationEnv(Env):
             start = events.visited(k_visited, start, bank=starts[0], chances=starts[1])
             command = jnp.where(start.phase > 0, start.goal_pos_w - base, command)
         fields = self._randomization(k_fields, level, self._banks(start.shape))
+        fields = self._fixtures.fields(fields, start.fixtures)
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
         sim = Sim(
             qpos=qpos,
@@ -233,7 +245,10 @@ class ManipulationEnv(Env):
             warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
             fields=fields,
-            readings=dict.fromkeys(touch.readers(self.physics_model), jnp.zeros(())),
+            readings={
+                **dict.fromkeys(touch.readers(self.physics_model), jnp.zeros(())),
+                **{name: jnp.zeros(gauge.size) for name, gauge in forces.gauges(self.physics_model).items()},
+            },
         )
         carry = Carry(
             rng=rng,
@@ -267,6 +282,7 @@ class ManipulationEnv(Env):
             object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
             object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
             pull=jnp.zeros(len(self.cfg.robot.home)),
+            fixtures=self._fixtures.blank(),
             shape=dict.fromkeys(self._banks.counts, jnp.zeros((), jnp.int32)),
         )
         return Bank(start, jnp.zeros((), bool))
@@ -275,6 +291,7 @@ class ManipulationEnv(Env):
         """Builds qpos: joints within their ranges, linkages closed, objects in place, rescaled ones on the table."""
         joints = jnp.clip(start.joint_pos, *self._range)
         qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints)
+        qpos = self._fixtures.qpos(qpos, start.fixtures, fields)
         for coupling in self._coupled:
             qpos = qpos.at[coupling.follower].set(coupling.position(qpos))
         for name, (at, _) in self._viewer.objects.items():
@@ -328,6 +345,8 @@ class ManipulationEnv(Env):
         boxes, look = self._obstacles.views(sim.fields), dict(carry.memory.get(LOOK, {}))
         if SHAPE in carry.memory:
             look |= bank.look(self.mj_model, self._banks.counts, carry.memory[SHAPE])
+        if self.cfg.scene.fixtures:
+            look |= self._fixtures.drawn(self.mj_model, sim.fields)
         return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
 
     def _pictures(self, sim: Sim, carry: Carry, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:

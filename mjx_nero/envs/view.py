@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero.mdp.terms import CommandTerm
 from mjx_nero.sim import kinematics
+from mjx_nero.sim.fixtures import Fixtures
 from mjx_nero.sim.objects import shapes
 from mjx_nero.sim.obstacles import Obstacles
 from mjx_nero.sim.robot import RobotCfg
@@ -29,6 +30,7 @@ class Viewer:
         dt: duration of a control step [s].
         command: how the goal moves, and which objects may be commanded.
         obstacles: the scene's obstacles.
+        fixtures: the scene's fixtures.
         pictures: what the scene's cameras see; None: the scene has none.
 
     Attributes:
@@ -44,6 +46,7 @@ class Viewer:
         dt: float,
         command: CommandTerm,
         obstacles: Obstacles,
+        fixtures: Fixtures,
         pictures: Callable[[Sim, Carry], dict[str, Picture]] | None = None,
     ):
         self.qpos_ids = np.array([model.joint(j).qposadr[0] for j in robot.joints])
@@ -55,7 +58,7 @@ class Viewer:
         self._default = np.asarray(robot.home, np.float32)
         self._root = np.asarray(robot.base_pos, np.float32)
         self._max_steps, self._dt, self._motion = max_steps, dt, command.motion
-        self._obstacles, self._targets, self._pictures = obstacles, command.targets, pictures
+        self._obstacles, self._fixtures, self._targets, self._pictures = obstacles, fixtures, command.targets, pictures
 
     def __call__(self, sim: Sim, carry: Carry, action: Float[Array, " na"]) -> View:
         """Returns the view after the step that ``action`` caused; ``carry.action`` is the action before it."""
@@ -89,6 +92,7 @@ class Viewer:
             time=carry.step * self._dt,
             encoder_bias=self._encoder_bias(sim),
             obstacles=self._obstacles.views(sim.fields),
+            fixtures=self._fixtures.views(sim.qpos, sim.qvel, sim.fields),
             readings=sim.readings,
             cameras=self._pictures(sim, carry) if self._pictures else {},
             target=target,

@@ -22,6 +22,13 @@ def nothing(key: Key) -> Float[Array, "3"]:
     return jnp.zeros(3)
 
 
+def either_side(key: Key, *, size: Range) -> Float[Array, "3"]:
+    """Draws a joint's position, the first of three numbers: its size uniform, its sign either [rad or m]."""
+    k_size, k_sign = jax.random.split(key)
+    drawn = jax.random.uniform(k_size, minval=size[0], maxval=size[1])
+    return jnp.array([1.0, 0.0, 0.0]) * jnp.where(jax.random.bernoulli(k_sign), drawn, -drawn)
+
+
 def pose(key: Key, *, x: Range, y: Range, z: Range, quat: tuple[float, float, float, float]) -> Pose:
     """Draws a point uniformly from a box in the robot's root frame [m], with a fixed orientation (wxyz)."""
     return uniform_position(key, x=x, y=y, z=z), jnp.array(quat, jnp.float32)

@@ -24,6 +24,18 @@ def joint_vel_rel(view: View) -> Float[Array, " nj"]:
     return view.joint_vel
 
 
+def reading(view: View, *, name: str) -> Float[Array, " n"]:
+    """A measurement of the scene's sensors, such as ``wrist``: force [N] and torque [N m], or ``fingers`` [N].
+
+    Raises:
+        UserError: the scene does not measure it.
+    """
+    if name not in view.readings:
+        there = ", ".join(view.readings) or "none"
+        raise UserError(f"the scene measures no {name!r}: its readings are {there} (scene.wrist, scene.fingers, scene.hand)")
+    return jnp.atleast_1d(view.readings[name])
+
+
 def object_position(view: View, *, object: str = "cube") -> Float[Array, "3"]:
     """Position of the object in the robot's root frame [m]."""
     return view.objects[object].pos_w - view.root_pos_w

@@ -24,7 +24,7 @@ class Model:
 
     Attributes:
         fields: arrays by MuJoCo's names. Rows are bodies, geoms, degrees of freedom or actuators.
-        index: row numbers by name, for each kind: ``body``, ``geom``, ``dof`` (by its joint) and ``actuator``.
+        index: row numbers by name, for each kind: ``body``, ``geom``, ``dof`` (by its joint), ``joint`` and ``actuator``.
     """
 
     fields: Mapping[str, Array]
@@ -115,6 +115,35 @@ def joints(
     if friction != (0.0, 0.0):
         effort = model.fields["actuator_forcerange"][model.rows("actuator", joints), 1]
         drawn["dof_frictionloss"] = (rows, effort * dry)
+    return drawn
+
+
+def passive_joints(
+    key: Key,
+    model: Model,
+    *,
+    joints: tuple[str, ...],
+    armature: PositiveRange = (1.0, 1.0),
+    damping: PositiveRange = (1.0, 1.0),
+    friction: PositiveRange = (1.0, 1.0),
+    upper: PositiveRange = (1.0, 1.0),
+) -> Drawn:
+    """Scales properties of hinges and slides without drives, such as a drawer's, by uniform factors per joint.
+
+    Args:
+        joints: names; a fixture's joint is called ``fixture/joint``.
+        armature, damping, friction, upper: ranges of the factors; of dry friction (``frictionloss``), and of the upper limit.
+    """
+    dofs, rows = model.rows("dof", joints), model.rows("joint", joints)
+    *factors, farther = _uniform(key, len(dofs), armature, damping, friction, upper)
+    names = ("dof_armature", "dof_damping", "dof_frictionloss")
+    drawn = {
+        name: (dofs, model.fields[name][dofs] * factor)
+        for name, factor, bounds in zip(names, factors, (armature, damping, friction), strict=True)
+        if bounds != (1.0, 1.0)
+    }
+    if upper != (1.0, 1.0):
+        drawn["jnt_range"] = (rows, model.fields["jnt_range"][rows].at[:, 1].multiply(farther))
     return drawn
 
 

@@ -70,8 +70,48 @@ class ObjectPosition:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Gauge:
+    """A force sensor: off by a constant and a factor per episode, noisy, and late.
+
+    Attributes:
+        reading: name in ``View.readings``, such as ``wrist``.
+        offset: greatest constant offset of each number [N, N m]; one for all, or one for each.
+        scale: greatest share by which each number is off.
+        noise: greatest noise of each number, drawn at every step; one for all, or one for each.
+        delay: least and greatest delay [control steps].
+        hold: probability that a step keeps the previous step's delay.
+    """
+
+    reading: str = "wrist"
+    offset: tuple[NonNegative, ...] = (0.0,)
+    scale: NonNegative = 0.0
+    noise: tuple[NonNegative, ...] = (0.0,)
+    delay: Steps = (0, 0)
+    hold: Share = 1.0
+
+    def init(self, key: Key, view: View) -> tuple:
+        """Draws the episode's errors, and fills the delay with the first reading."""
+        key, k_offset, k_scale, k_delay = jax.random.split(key, 4)
+        value = view.readings[self.reading]
+        offset = jnp.array(self.offset) * jax.random.uniform(k_offset, value.shape, minval=-1.0, maxval=1.0)
+        factor = 1.0 + self.scale * jax.random.uniform(k_scale, value.shape, minval=-1.0, maxval=1.0)
+        return key, offset, factor, Delay(self.delay, self.hold).init(k_delay, value) if self.delay != (0, 0) else ()
+
+    def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
+        """Replaces the reading by what the sensor tells."""
+        key, offset, factor, line = memory
+        key, k_noise = jax.random.split(key)
+        value = view.readings[self.reading]
+        if self.delay != (0, 0):
+            line, value = Delay(self.delay, self.hold).step(line, value)
+        value = factor * value + offset
+        value = value + jnp.array(self.noise) * jax.random.uniform(k_noise, value.shape, minval=-1.0, maxval=1.0)
+        return (key, offset, factor, line), dataclasses.replace(view, readings={**view.readings, self.reading: value})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class BasePose:
-    """A wrongly calibrated base: all objects are seen moved by one rigid motion about it.
+    """A wrongly calibrated base: all objects and fixtures are seen moved by one rigid motion about it.
 
     For an arm that knows the world through cameras alone, this equals a displaced base, as long as the base stands upright. The
     commanded point stays, as it is given in the robot's own frame.
@@ -95,8 +135,17 @@ class BasePose:
         offset, turn = memory
         quat = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
 
-        def moved(seen):
-            pos = math.rotate(quat, seen.pos_w - view.root_pos_w) + view.root_pos_w + offset
-            return dataclasses.replace(seen, pos_w=pos, quat_w=math.quat_mul(quat, seen.quat_w))
+        def moved(pos):
+            return math.rotate(quat, pos - view.root_pos_w) + view.root_pos_w + offset
 
-        return memory, dataclasses.replace(view, objects={name: moved(seen) for name, seen in view.objects.items()})
+        def placed(seen):
+            return dataclasses.replace(seen, pos_w=moved(seen.pos_w), quat_w=math.quat_mul(quat, seen.quat_w))
+
+        def stands(seen):
+            pos = {name: moved(at) for name, at in seen.site_pos_w.items()}
+            turn = {name: math.quat_mul(quat, at) for name, at in seen.site_quat_w.items()}
+            return dataclasses.replace(placed(seen), site_pos_w=pos, site_quat_w=turn)
+
+        objects = {name: placed(seen) for name, seen in view.objects.items()}
+        fixtures = {name: stands(seen) for name, seen in view.fixtures.items()}
+        return memory, dataclasses.replace(view, objects=objects, fixtures=fixtures)

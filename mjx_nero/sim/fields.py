@@ -26,6 +26,7 @@ DRAWABLE = (
     "dof_armature",
     "dof_damping",
     "dof_frictionloss",
+    "jnt_range",
     "actuator_gainprm",
     "actuator_biasprm",
     "actuator_forcerange",
@@ -55,6 +56,7 @@ class Randomization:
             "body": {model.body(i).name: i for i in range(1, model.nbody)},
             "geom": {model.geom(i).name: i for i in range(model.ngeom)},
             "dof": hinges,
+            "joint": {name: model.joint(name).id for name in hinges},
             "actuator": {model.actuator(i).name: i for i in range(model.nu)},
         }
         rows: dict[str, set[int]] = {}

@@ -10,10 +10,11 @@ import numpy as np
 
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive
-from mjx_nero.sim import objects, robot_file, touch
+from mjx_nero.sim import fixtures, forces, objects, robot_file, touch
 from mjx_nero.sim.cameras import cfg as cameras
 from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
+from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.objects import body as mesh_body
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
@@ -126,12 +127,15 @@ class SceneCfg:
         table: False draws the table but lets nothing touch it; without contacts the physics is several times faster.
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
+        fixtures: things with joints of their own by name, such as a cabinet (``sim.fixtures``).
         self_collision: the robot's links collide with one another; ``sim.touch`` measures those forces, too.
         hand: ``sim.touch`` measures what the robot presses objects with.
+        wrist, fingers: ``sim.forces`` measures force and torque between arm and hand, and the forces at the pads.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
         look_at, view_distance: point that people's cameras look at, and their distance from it.
+        view_from: direction from there to the camera ``front``.
         distractors: how many things that touch nothing cameras may see (``mdp.looks.places`` puts them somewhere).
         backdrop: a wall stands behind the robot, for cameras alone.
         photographs: folder with pictures of the user's (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.
@@ -146,12 +150,16 @@ class SceneCfg:
     table: bool = True
     objects: Mapping[str, ObjectCfg] = dataclasses.field(default_factory=lambda: {"cube": ObjectCfg()})
     obstacles: Mapping[str, ObstacleCfg] = dataclasses.field(default_factory=dict)
+    fixtures: Mapping[str, FixtureCfg] = dataclasses.field(default_factory=dict)
     self_collision: bool = False
     hand: bool = False
+    wrist: bool = False
+    fingers: bool = False
     goal: str = "sphere"
     goal_edge: Positive = 0.03
     look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
     view_distance: Positive = 1.1
+    view_from: tuple[float, float, float] = (0.71, -0.65, 0.28)
     distractors: Annotated[int, Bounds(0, 100)] = 0
     backdrop: bool = False
     photographs: str = ""
@@ -220,17 +228,20 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     for name, item in scene.objects.items():
         _add_object(spec, name, item, visuals)
     goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
+    fixtures.add(spec, scene.fixtures, visuals)
     if whole:
         pairs = touch.self_pairs(robot) if scene.self_collision else ()
         touch.add(spec, robot.base_link, scene.obstacles, tuple(scene.objects), pairs)
     if scene.hand:
         touch.add_hand(spec, robot.base_link, tuple(scene.objects))
+    forces.add(spec, robot, scene.wrist, scene.fingers)
     if visuals:
         _add_visuals(spec, scene, goal, robot)
         cameras.add(spec, scene.cameras)
         _add_props(spec, scene, robot)
         textures.add(spec, scene.photographs, scene.patterns)
-    spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None
+    # Fixtures stand elsewhere in each world, so what carries them has to stay a body.
+    spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None and not scene.fixtures
     return touch.unbounded(spec.compile())
 
 
@@ -416,7 +427,7 @@ def _add_visuals(spec: mujoco.MjSpec, scene: SceneCfg, goal, robot: RobotCfg) ->
     target, far = np.array(scene.look_at), scene.view_distance
     for direction, color, shadow in (((-0.4, 0.6, -1.2), 0.7, True), ((0.0, -0.7, -1.0), 0.3, False)):
         world.add_light(pos=target - 1.1 * far * np.array(direction), dir=direction, diffuse=[color] * 3, castshadow=shadow)
-    for name, direction in (("front", (0.71, -0.65, 0.28)), ("side", (0.07, -0.98, 0.17))):
+    for name, direction in (("front", scene.view_from), ("side", (0.07, -0.98, 0.17))):
         pos = target + far * np.array(direction)
         world.add_camera(name=name, pos=pos, quat=cameras.look_at(pos, target), fovy=42)
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]

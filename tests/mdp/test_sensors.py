@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_nero.mdp import actions, pushes, sensors
-from mjx_nero.types import ObjectView, View
+from mjx_nero.types import FixtureView, ObjectView, View
 
 ZERO, UP = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
 KEYS = jax.random.split(jax.random.PRNGKey(0), 500)
@@ -57,6 +57,40 @@ def test_a_base_elsewhere_moves_all_objects_about_it():
     moved = seen(sensors.BasePose(offset=0.02), [view(), view()]) - [0.4, 0.0, 0.1]
     assert 0.019 < np.abs(moved).max() <= 0.02 + 1e-6
     np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
+
+
+def test_a_base_elsewhere_moves_fixtures_with_their_handles():
+    one = {"door": jnp.zeros(())}
+    fixture = FixtureView(jnp.array([1.1, 0.0, 0.0]), UP, one, one, {}, {"bar": jnp.array([1.1, 0.2, 0.3])}, {"bar": UP})
+    moved = view().replace(fixtures={"door": fixture})
+    sensor = sensors.BasePose(offset=0.0, turn=0.5)
+    memory = jnp.array([0.0, 0.0, 0.1]), jnp.array(np.pi / 2)  # a quarter about the base at (0.1, 0), and 10 cm up
+    there = sensor.step(memory, moved)[1].fixtures["door"]
+    np.testing.assert_allclose(there.pos_w, [0.1, 1.0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(there.site_pos_w["bar"], [-0.1, 1.0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(there.site_quat_w["bar"], [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-6)
+
+
+def test_a_force_sensor_is_off_noisy_and_late():
+    """10 N for two steps, then 20: off by at most 2 N and a tenth, the same all episode long; noise changes; one step late."""
+
+    def told(sensor, key):
+        memory, out = sensor.init(key, felt[0]), []
+        for one in felt:
+            memory, there = sensor.step(memory, one)
+            out.append(there.readings["wrist"])
+        return jnp.stack(out)
+
+    felt = [view().replace(readings={"wrist": jnp.full(6, force)}) for force in (10.0, 10.0, 20.0)]
+    off = np.array(jax.vmap(lambda key: told(sensors.Gauge(offset=(2.0,)), key))(KEYS)) - [[10.0], [10.0], [20.0]]
+    np.testing.assert_allclose(off[:, 0], off[:, 2], atol=1e-5)
+    assert 1.95 < np.abs(off).max() <= 2.0 + 1e-5 and np.ptp(off[0, 0]) > 0.1
+    scaled = np.array(jax.vmap(lambda key: told(sensors.Gauge(scale=0.1), key))(KEYS))
+    np.testing.assert_allclose(scaled[:, 2], 2 * scaled[:, 0], rtol=1e-5)
+    assert 8.99 < scaled[:, 0].min() < 9.05 and 10.95 < scaled[:, 0].max() < 11.01
+    np.testing.assert_allclose(told(sensors.Gauge(delay=(1, 1)), KEYS[0])[:, 0], [10, 10, 10])
+    noise = np.array(told(sensors.Gauge(noise=(0.0, 0.0, 0.5, 0.0, 0.0, 0.0)), KEYS[0])) - [[10.0], [10.0], [20.0]]
+    assert not noise[:, [0, 1, 3, 4, 5]].any() and len(set(noise[:, 2].tolist())) == 3 and np.abs(noise).max() <= 0.5
 
 
 def test_encoders_read_beside_the_joints():

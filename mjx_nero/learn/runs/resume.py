@@ -18,6 +18,7 @@ from mjx_nero.learn.runs import checkpoints, compiled, starts
 from mjx_nero.learn.runs import trust as trust_of
 from mjx_nero.learn.runs.cfg import Asked, RunCfg, resolve
 from mjx_nero.learn.runs.folder import CONFIG
+from mjx_nero.sim import fixtures
 
 # Fields of a run's environment that name files, which may lie outside the run's folder.
 _PATHS = ("identified", "object.file", "robot.folder", "robot.name", "robot.mjcf")
@@ -162,17 +163,25 @@ def _outside(asked: Asked) -> Iterator[str]:
     if asked.robot is not None and asked.robot not in registry.list_robots():
         yield asked.robot
     for name, value in asked.env.items():
-        if value and (name in _PATHS or name.startswith("scene.objects") and name.rpartition(".")[2] in _MESHES):
+        if _names_file(name) and value and value not in fixtures.own():
             yield str(value)
     if asked.learner.get("teacher"):
         yield str(asked.learner["teacher"])
+
+
+def _names_file(field: str) -> bool:
+    """True if a field of an environment's config, given by its dotted name, is the path of a file or folder."""
+    last = field.rpartition(".")[2]
+    if field.startswith("scene.objects.") and last in _MESHES:
+        return True
+    return field in _PATHS or field.startswith(("scene.fixtures.", "controllers.")) and last == "file"
 
 
 def _as_stored(cfg: Any, stored: Any) -> Any:
     """Restores the numbers that the run began with where this version has others, except the files that it reads."""
     was = config.current(cfg, config.flatten(stored))
     now = config.flatten(config.to_dict(cfg))
-    own = [name for name in config.flatten(cfg) if name in was and name not in _PATHS]
+    own = [name for name in config.flatten(cfg) if name in was and not _names_file(name)]
     return config.override(cfg, {name: was[name] for name in own if was[name] != now.get(name)})
 
 

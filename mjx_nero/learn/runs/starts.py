@@ -26,7 +26,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg, EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import ROWS, Learner
-from mjx_nero.types import SHAPE, Bank, Shown, Start
+from mjx_nero.types import SHAPE, Bank, FixtureStart, Shown, Start
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
@@ -192,6 +192,7 @@ def _at_rest(env: ManipulationEnv, state: State) -> Start:
         target=jnp.zeros((), jnp.int32) if view.target is None else view.target,
         shape=state.info["carry"].memory.get(SHAPE, {}),
         pull=(view.ctrl - view.joint_pos).at[: len(env.cfg.robot.arm.joints)].set(0.0),
+        fixtures={name: FixtureStart(seen.pos_w, seen.quat_w, seen.joint_pos) for name, seen in view.fixtures.items()},
     )
 
 

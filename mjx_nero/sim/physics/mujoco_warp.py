@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_nero.sim import touch
+from mjx_nero.sim import forces, touch
 from mjx_nero.sim.physics import Footprint, dynamics, fusion, kernels, newton, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
@@ -40,7 +40,8 @@ class WarpPhysics:
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name not in _OF_C}
-        self._readers = touch.readers(model)
+        self._readers, self._gauges = touch.readers(model), forces.gauges(model)
+        self._numbers = len(self._readers) + sum(gauge.size for gauge in self._gauges.values())  # of all readings
         self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
 
@@ -53,8 +54,11 @@ class WarpPhysics:
         qpos, qvel, warmstart, overflow, force = self._batched(sim.qpos, sim.qvel, given, sim.warmstart)
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
-        if self._readers:
-            after = dataclasses.replace(after, readings={name: force[..., i] for i, name in enumerate(self._readers)})
+        if self._numbers:
+            readings, end = {name: force[..., i] for i, name in enumerate(self._readers)}, len(self._readers)
+            for name, gauge in self._gauges.items():
+                readings[name], end = force[..., end : end + gauge.size], end + gauge.size
+            after = dataclasses.replace(after, readings=readings)
         return after, ((overflow & _LOST) != 0).astype(jnp.float32)
 
     def _as_jax(self) -> Callable:
@@ -94,7 +98,7 @@ class WarpPhysics:
             inputs = tuple(x.reshape(-1, x.shape[-1]) for x in inputs)
             n = inputs[0].shape[0]
             sizes = {"qpos_out": (n, nq), "qvel_out": (n, nv), "warmstart_out": (n, nv), "overflow_out": (n,)}
-            sizes["force_out"] = n, max(1, len(self._readers))
+            sizes["force_out"] = n, max(1, self._numbers)
             return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
 
         @batched.def_vmap
@@ -154,8 +158,8 @@ class WarpPhysics:
         """Makes what ``n`` environments need on the current device.
 
         Returns:
-            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the strongest contacts of each reading
-            (None if there are none), and objects that must stay alive.
+            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the readings (None if there are none), and
+            objects that must stay alive.
         """
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
@@ -174,8 +178,8 @@ class WarpPhysics:
             convert()
             if strongest is not None:
                 strongest.zero_()
-            for _ in range(self.decimation):
-                step()
+            for i in range(self.decimation):
+                step(i == self.decimation - 1)
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, drawn, run, strongest, run
@@ -185,48 +189,58 @@ class WarpPhysics:
             run()
         return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
 
-    def _stepper(self, model: Any, data: Any) -> tuple[Callable[[], None], Any]:
-        """Makes the function of one physics step, and the array of the strongest unwanted contacts."""
+    def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
+        """Makes the function of one physics step, which is told if it is the last one, and the array of readings."""
         from mujoco.mjx.third_party import mujoco_warp
 
-        strongest, sense = self._sense(model, data)
+        strongest, sense, measure = self._sense(model, data)
         own = self._cfg.solver == "newton"
         solve = newton.make(model, data) if own else functools.partial(mujoco_warp.solve, model, data)
 
-        def engines():
+        def engines(last: bool):
             mujoco_warp.fwd_position(model, data, factorize=False)
             mujoco_warp.fwd_velocity(model, data)
             mujoco_warp.fwd_actuation(model, data)
             mujoco_warp.fwd_acceleration(model, data, factorize=True)
             solve()
             sense()
+            if last:
+                measure()
             mujoco_warp.implicit(model, data)
 
         if not own or dynamics.missing(self.model) or not newton.fits(model, data):
             return engines, strongest
         before, after = dynamics.make(self.model, model, data)
 
-        def ours():
+        def ours(last: bool):
             before()
             mujoco_warp.collision(model, data)
             mujoco_warp.make_constraint(model, data)
             solve()
             sense()
+            if last:
+                measure()
             after()
 
         return ours, strongest
 
-    def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None]]:
-        """Makes the array of each world's strongest contacts [N], one a reading, and the function that updates it.
+    def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None], Callable[[], None]]:
+        """Makes the array of each world's readings, the function that updates the strongest contacts [N], which come first, and
+        the one that measures the rest (``sim.forces``).
 
         After the solver it equals MuJoCo's contact sensors, for each of which MuJoCo Warp would search all contacts once more.
         """
         import warp as wp
         from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
 
+        if not self._numbers:
+            return None, lambda: None, lambda: None
+        readings: Any = wp.zeros((data.nworld, self._numbers), dtype=float)
+        count = len(self._readers)
+        measure = forces.on_warp(self.model, model, data, readings[:, count:]) if self._gauges else lambda: None
         if not self._readers:
-            return None, lambda: None
-        strongest: Any = wp.zeros((data.nworld, len(self._readers)), dtype=float)
+            return readings, lambda: None, measure
+        strongest: Any = readings[:, :count]
         pairs = np.stack([reader.pairs for reader in self._readers.values()])
         found, inputs = data.contact, [model.opt.cone, wp.array(pairs, dtype=bool)]
         inputs += [found.frame, found.friction, found.dim, found.efc_address, found.adhesion, found.geom, found.worldid]
@@ -257,7 +271,7 @@ class WarpPhysics:
                     force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, False)
                     wp.atomic_max(strongest, world, k, wp.length(wp.spatial_top(force)))
 
-        return strongest, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs)
+        return readings, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs), measure
 
 
 def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from mujoco import rollout
 
-from mjx_nero.sim import touch
+from mjx_nero.sim import forces, touch
 from mjx_nero.sim.physics import Footprint, fusion, host
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
@@ -46,7 +46,8 @@ class NativePhysics:
         self._period = cfg.decimation * cfg.dt
         self._fields = {name: getattr(model, name).shape for name in fields}
         self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu])
-        self._readers = touch.readers(model)
+        self._readers, self._gauges = touch.readers(model), forces.gauges(model)
+        self._ends = np.cumsum([self._sizes[2] + len(self._readers), *(gauge.size for gauge in self._gauges.values())])
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
@@ -55,13 +56,15 @@ class NativePhysics:
         """Computes one control step; leading axes are environments. The state becomes NaN where MuJoCo gives up."""
         drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
         packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
-        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._sizes[2] + len(self._readers)), jnp.float32)
+        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], int(self._ends[-1])), jnp.float32)
         if jax.default_backend() == "cpu":
             found = host.call(self._key, self._step, shape, packed)
         else:  # an accelerator's program, which JAX does not keep between runs
             found = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
         qpos, qvel, warmstart, read = jnp.split(found, self._sizes[:3], axis=-1)
         readings = {name: read[..., i] for i, name in enumerate(self._readers)}
+        for name, end, gauge in zip(self._gauges, self._ends[1:], self._gauges.values(), strict=True):
+            readings[name] = found[..., end - gauge.size : end]
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=readings)
         return dataclasses.replace(after, time=sim.time + self._period), jnp.zeros(packed.shape[:-1])
 
@@ -74,7 +77,7 @@ class NativePhysics:
         return int.from_bytes(told[:8], "little", signed=True)
 
     def _called_back(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
-        after = np.empty((*packed.shape[:-1], self._sizes[2] + len(self._readers)), np.float32)
+        after = np.empty((*packed.shape[:-1], int(self._ends[-1])), np.float32)
         self._step(np.asarray(packed), after)
         return after
 
@@ -106,6 +109,8 @@ class NativePhysics:
             after[:, nqv:nqvv] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
             for i, read in enumerate(self._readers.values()):
                 after[:, nqvv + i] = read(sensors).max(axis=1)
+            for end, gauge in zip(self._ends[1:], self._gauges.values(), strict=True):
+                after[:, end - gauge.size : end] = gauge(sensors[:, -1])
             # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time tells.
             after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
 

@@ -166,7 +166,8 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
     for joint, position in zip(robot.joints, robot.home, strict=True):
         data.joint(joint).qpos[0] = position
     mujoco.mj_forward(model, data)
-    bodies = [model.body(b) for b in range(1, model.nbody) if model.body(b).name not in (*where.objects, "goal", "obstacles")]
+    others = {*where.objects, *where.fixtures, "goal", "obstacles", "fixtures"}
+    bodies = [body for body in map(model.body, range(1, model.nbody)) if body.name.partition("/")[0] not in others]
     formulas, gaps = grasp.formulas(robot), None
     if formulas:
         gaps = (float(formulas[0](jnp.array(gripper.open))), float(formulas[0](jnp.array(gripper.close))))
