@@ -233,6 +233,7 @@ def test_unknown_names(call, message):
 def test_registry_lists():
     everywhere = {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in ("lift", "reach")}
     more = ("follow_target", "pick_place", "place", "stack", "clutter", "lift_any", "push", "reach_obstacles", "lift_obstacles")
+    more += ("open_drawer", "open_door", "turn_knob")
     controlled = {f"{robot}_{task}" for robot in ("nero", "cobotta") for task in more[:2]}
     everywhere |= {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in more[2:]}
     assert set(list_envs()) == everywhere | controlled | {"reach", "lift", *more}

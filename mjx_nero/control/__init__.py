@@ -7,6 +7,7 @@ from mjx_nero import config
 from mjx_nero.config.registry import Registry
 from mjx_nero.control.controller import Controller
 from mjx_nero.control.detour import CarryPast, CarryPastCfg, Detour, DetourCfg
+from mjx_nero.control.follow_joint import FollowJoint, FollowJointCfg
 from mjx_nero.control.follow_target import IkFollower, RmpCfg, RmpFollower
 from mjx_nero.control.grasp_thing import GraspThing, GraspThingCfg
 from mjx_nero.control.ik import IkCfg
@@ -24,6 +25,7 @@ CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
         "detour": (Detour, DetourCfg()),
         "carry": (CarryPast, CarryPastCfg()),
         "pick_up": (PickUp, PickUpCfg()),
+        "follow_joint": (FollowJoint, FollowJointCfg()),
         "grasp_thing": (GraspThing, GraspThingCfg()),
     },
 )

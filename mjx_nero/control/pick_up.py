@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
+from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.mdp.actions import rate_limit
@@ -18,10 +19,6 @@ from mjx_nero.types import UserError, View
 
 ABOVE, DOWN, CLOSE, UP, CARRY = range(5)
 _CHOICES = 8  # ways to turn the hand that are looked at
-_SMOOTH = 0.15  # [s] the arm's set-point comes to rest in about this time
-# [rad/s2] What it is accelerated by at most. Targets lead by the drives' lag, so that they jump with the speed; strong damping is
-# integrated after contacts are solved for, and such a jump kicks what the hand holds (at 10 rad/s2 by 0.1 m/s a control step).
-_FASTEST = 1.5
 _UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
@@ -136,7 +133,7 @@ class PickUp:
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
         found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
-        q, qd = self._follow(memory, jnp.where(phase == ABOVE, memory.above, found))
+        q, qd = setpoint.follow(memory.q, memory.qd, jnp.where(phase == ABOVE, memory.above, found), self._speed, self.dt)
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
@@ -177,14 +174,6 @@ class PickUp:
             ],
             False,
         )
-
-    def _follow(self, memory: PickUpMemory, wanted: Float[Array, " nj"]) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-        """The set-point and its speed a step later: on the way to ``wanted``, all joints in step, without jumps."""
-        way = wanted - memory.q
-        speed = jnp.sign(way) * jnp.minimum(jnp.abs(way) / _SMOOTH, jnp.sqrt(_FASTEST * jnp.abs(way)))
-        speed /= jnp.maximum(1.0, jnp.max(jnp.abs(speed) / self._speed))
-        qd = rate_limit(speed, memory.qd, step=jnp.full(self._n, _FASTEST * self.dt))
-        return memory.q + qd * self.dt, qd
 
     def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
         """Plans again for a lost object, turning the hand as little as possible, without a search."""

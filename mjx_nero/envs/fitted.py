@@ -16,12 +16,15 @@ from mjx_nero.envs.tasks import (
     lift,
     lift_any,
     lift_obstacles,
+    open_door,
+    open_drawer,
     pick_place,
     place,
     push,
     reach,
     reach_obstacles,
     stack,
+    turn_knob,
 )
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
@@ -130,6 +133,9 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
 # tasks an arm may bring its own numbers, as ``nero_lift`` brings those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
+    "open_drawer": open_drawer.presets(),
+    "open_door": open_door.presets(),
+    "turn_knob": turn_knob.presets(),
     "lift_any": lift_any.presets(),
     "push": push.presets(),
     "place": _presets(_tower, **place.presets()),

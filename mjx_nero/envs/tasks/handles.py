@@ -1,0 +1,201 @@
+"""The parts that ``open_drawer``, ``open_door`` and ``turn_knob`` share: where the fixture stands, rewards and the controller."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_nero.config.bounds import PositiveRange, Range
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, velocity_actions
+from mjx_nero.mdp import commands, fixtures, observations, randomization, rewards, terminations
+from mjx_nero.mdp.fixtures import Handle
+from mjx_nero.mdp.terms import (
+    ONCE,
+    CommandTerm,
+    DoneTerm,
+    MetricTerm,
+    ObservationGroup,
+    ObservationTerm,
+    RewardTerm,
+    Term,
+    privileged,
+)
+from mjx_nero.sim import contacts, grasp
+from mjx_nero.sim import fixtures as models
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.fixtures import FixtureCfg
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg, SimCfg
+
+OPEN = 0.06  # [m] the hand opens no further: what it grips is less than 2 cm wide
+NEAR = 0.04  # [m] the handle is in the hand
+CLOSING = 0.4  # [s] least closing time of the script's fingers
+SPEED = 0.02  # [m/s] a handle that moves so fast is moved
+OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] of the fixture
+HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
+LIMIT: PositiveRange = (0.9, 1.1)  # factor of the upper limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """A place where a robot can take hold of a handle in front of it and pull it by 16 cm.
+
+    Attributes:
+        at: the handle, ``x``, ``y`` and ``z`` in the robot's root frame [m].
+        pitch: tilt of the hand from level, fingertips down [rad].
+    """
+
+    at: tuple[float, float, float]
+    pitch: float = 0.0
+
+
+def place(robot: RobotCfg) -> Place:
+    """Derives the place from the robot's ``workspace``: beyond its middle, in its upper half."""
+    box = np.array(regions.box(robot, "workspace", "where it can work"))
+    (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
+    return Place((round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)), math.radians(15))
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A handle of a fixture, and the robot that moves it.
+
+    Attributes:
+        file: the fixture's, and its name in the scene.
+        handle: what to take hold of, without ``grip``, which ``held`` adds.
+        middle: where the handle is to be beside ``place`` at the start, so that its path lies in front of the robot [m].
+        follow, beyond: see ``FollowJointCfg``.
+        level: the hand stays level, whatever ``place`` says.
+    """
+
+    robot: RobotCfg
+    place: Place
+    file: str
+    handle: Handle
+    middle: float = 0.0
+    follow: float = 1.0
+    beyond: float = 0.0
+    level: bool = False
+
+    @functools.cached_property
+    def builder(self) -> RobotCfg:
+        """The robot as its own controller runs it: drives that carry its weight, and a hand that opens as far as needed."""
+        return dataclasses.replace(grasp.opened(self.robot, OPEN), gravity_compensation=True)
+
+    @functools.cached_property
+    def held(self) -> Handle:
+        """The handle with the grip of the robot's hand."""
+        tilt = 0.0 if self.level else self.place.pitch
+        # From pointing down with the fingers opening along y: forward, then down by the tilt.
+        forward = _turn((0.0, 1.0, 0.0), tilt - math.pi / 2)
+        _, site = models.at_rest(self.file, self.handle.site)
+        # The bar is the site's z axis; where it lies across, the hand turns by a quarter about the way in.
+        lies = abs(1 - 2 * (site[1] ** 2 + site[2] ** 2)) < 0.5
+        hand = _product(forward, _product(_turn((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0), self.robot.down))
+        grip = _product(site * [1, -1, -1, -1], hand)
+        return dataclasses.replace(self.handle, grip=tuple(round(float(x), 6) + 0.0 for x in grip))
+
+    @functools.cached_property
+    def scene(self) -> SceneCfg:
+        """The fixture, so that its handle is where the robot can move it."""
+        at, _ = models.at_rest(self.file, self.handle.site)
+        wanted = np.array(self.robot.base_pos) + self.place.at + [0.0, self.middle, 0.0]
+        x, y, z = (round(float(v), 4) + 0.0 for v in wanted - at)
+        scene = scenes.around(
+            self.robot, SceneCfg(objects={}, fixtures={self.file: FixtureCfg(self.file, (x, y, z))}, goal="none")
+        )
+        # From behind the robot's shoulder: it stands in front of the fixture.
+        return dataclasses.replace(scene, view_from=(-0.6, -0.72, 0.35), look_at=tuple(round(float(v), 4) for v in wanted))
+
+    def controllers(self) -> dict[str, dict[str, Any]]:
+        """Settings of the script that moves the handle."""
+        fields = {
+            "file": self.file,
+            **{f"handle.{name}": value for name, value in dataclasses.asdict(self.held).items()},
+            "beyond": self.beyond,
+            "follow": self.follow,
+            "closing": round(max(CLOSING, grasp.closing_time(self.builder, 0.0)), 3),
+        }
+        return {"follow_joint": {**fields, **regions.ik(self.robot, "ik.")}}
+
+    def rewards(self, moving: Mapping[str, RewardTerm]) -> dict[str, RewardTerm]:
+        """Rewards reaching, turning and closing the hand, ``moving`` the joint, and calm."""
+        fingers, held = self.builder.gripper, {"handle": self.held}
+        closes = {"near": NEAR, "open": fingers.open, "close": fingers.close}
+        return {
+            "reaching_handle": RewardTerm(fixtures.handle_distance, weight=1.0, params={"std": 0.1, **held}),
+            "reaching_handle_fine": RewardTerm(fixtures.handle_distance, weight=1.0, params={"std": 0.02, **held}),
+            "turning_hand": RewardTerm(fixtures.handle_turn, weight=1.0, params={"std": 0.5, **held}),
+            "gripping": RewardTerm(fixtures.gripping, weight=2.0, params={**closes, **held}),
+            **moving,
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        }
+
+    def observations(self) -> dict[str, ObservationGroup]:
+        """The arm, the handle and the joint; the critic sees speeds besides."""
+        held = {"handle": self.held}
+        state = {
+            **arm_state(),
+            "ee_to_handle": ObservationTerm(fixtures.ee_to_handle, params=held, noise=0.002),
+            "turn_to_handle": ObservationTerm(fixtures.turn_to_handle, params=held, noise=0.02),
+            "joint": ObservationTerm(fixtures.joint, params=held, noise=0.002),
+            "actions": ObservationTerm(observations.last_action),
+        }
+        return {
+            "state": ObservationGroup(state),
+            "privileged_state": privileged(state, {"joint_velocity": ObservationTerm(fixtures.joint_velocity, params=held)}),
+        }
+
+    def cfg(
+        self, success: SuccessCfg, moving: Mapping[str, RewardTerm], command: Term | None = None, limit: bool = True
+    ) -> EnvCfg:
+        """Builds the task: what counts as done, and what pays for getting there.
+
+        Args:
+            command: draws the command; None: there is none.
+            limit: the joint's upper limit differs from episode to episode.
+        """
+        command, joint = command or Term(commands.nothing), f"{self.file}/{self.handle.joint}"
+        near = {"handle": self.held, "speed": round(SPEED / self.handle.lever, 4), "near": NEAR}
+        return EnvCfg(
+            robot=self.builder,
+            scene=self.scene,
+            sim=contacts.sized(self.builder, self.scene, SimCfg()),
+            episode_length_s=8.0,
+            actions=velocity_actions(hysteresis=0.5),
+            command=CommandTerm(command.func, params=command.params, resample_s=ONCE),
+            success=success,
+            metrics={"grasped": MetricTerm(fixtures.Moved, params=near, over="rate", figure="moved")},
+            observations=self.observations(),
+            events={"stand": Term(fixtures.stand_uniform, params={"fixture": self.file, **OFF})},
+            randomization={
+                "joints": Term(
+                    randomization.passive_joints,
+                    params={"joints": (joint,), "damping": HALF, "friction": HALF, **({"upper": LIMIT} if limit else {})},
+                )
+            },
+            rewards=self.rewards(moving),
+            terminations={"time_out": DoneTerm(terminations.time_out, time_out=True)},
+            curriculum=CurriculumCfg(expert_starts=0.5),
+            controllers=self.controllers(),
+            training=CALM,
+            budget=Budget(steps=60_000_000, steps_on_cpu=5_000_000),
+        )
+
+
+def _turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+    quat = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quat, np.array(axis), angle)
+    return quat
+
+
+def _product(a: Any, b: Any) -> np.ndarray:
+    quat = np.zeros(4)
+    mujoco.mju_mulQuat(quat, np.asarray(a, float), np.asarray(b, float))
+    return quat
