@@ -1,5 +1,6 @@
 """The command ``import-urdf``."""
 
+import argparse
 import pathlib
 import shlex
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.sim import robot_file
 from mjx_nero.tools import cli
 from mjx_nero.urdf import files, folder
+from mjx_nero.urdf.fixture import import_fixture
 from mjx_nero.urdf.importer import import_urdf
 from mjx_nero.urdf.report import Report
 from mjx_nero.urdf.units import Units
@@ -37,6 +39,8 @@ def main(argv: Sequence[str]) -> None:
     args, rest = parser.parse_known_args(argv)
     if rest:
         parser.error(f"unknown argument {rest[0]!r}")
+    if args.fixture:
+        return _fixture(args)
     gripper = None if args.gripper is None else [] if args.gripper == "none" else args.gripper.split(",")
     report = import_urdf(
         args.file,
@@ -95,9 +99,22 @@ def _parser() -> cli.Parser:
     parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="factor of meshes, on top of their own")
     parser.add_argument("--tries", type=cli.at_most(1000), metavar="N", help="tries of the self-test (default: 8)")
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test in simulation")
+    parser.add_argument("--fixture", action="store_true", help="a thing with joints for scene.fixtures, not a robot")
     parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
     return parser
+
+
+def _fixture(args: argparse.Namespace) -> None:
+    """Imports a fixture and says what terms may read of it."""
+    units = Units(args.degrees, args.scale, args.mesh_scale)
+    pairs = _pairs(args.arg, "--arg takes NAME:=VALUE", ":=")
+    made = import_fixture(args.file, args.out, _packages(args.package), args=pairs, units=units, force=args.force)
+    screen = console.screen()
+    console.line(screen, f"{args.file.name} -> {made.folder}", style="bold")
+    console.line(screen, f"joints: {', '.join(made.joints)}; sites: {', '.join(made.sites)}")
+    for warning in made.warnings[:MOST_LINES]:
+        console.line(screen, f"warning {warning}", "yellow")
 
 
 def _test(report: Report, tries: int | None) -> None:

@@ -30,7 +30,7 @@ def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, clo
         done: list[tuple[primitives.Primitive, Pose]] = []
         balls: list[Vec4] = []  # bounding balls in the body: centre and radius
         fitted = {
-            link: _shapes(look.surfaces, look.exact)
+            link: shapes_of(look.surfaces, look.exact)
             for link, look in ((link, looks.of[link]) for link in body.links)
             if look.surfaces and link not in hand.pads and body.joint is not None and body.name not in hand.inside
         }
@@ -63,7 +63,7 @@ def collisions(tree: Tree, parts: dict[str, Body], looks: Looks, hand: Hand, clo
     return out
 
 
-def _shapes(surfaces: list[tuple[Points, float]], exact: list[primitives.Primitive | None]) -> list[primitives.Primitive]:
+def shapes_of(surfaces: list[tuple[Points, float]], exact: list[primitives.Primitive | None]) -> list[primitives.Primitive]:
     """Fits one shape to all collisions of a link, or one to each if they are few and that is much tighter."""
     few = len(surfaces) <= FEW
     each = [e or primitives.best(points, volume) for e, (points, volume) in zip(exact, surfaces, strict=True) if few]

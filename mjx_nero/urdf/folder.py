@@ -75,24 +75,44 @@ def _hash(content: bytes) -> str:
 
 
 def write(out: pathlib.Path, text: str, stl: Mapping[str, bytes], robot: RobotCfg, report: Report, force: bool) -> None:
-    """Makes the folder under a hidden name beside its place, and moves it there once MuJoCo has accepted the model.
+    """Makes the folder of a robot, if MuJoCo accepts the model.
 
     Raises:
         UserError: the folder cannot be written, or MuJoCo refuses the model.
+    """
+    with making(out, force) as made:
+        write_model(made, text, stl)
+        robot_file.write(made, dataclasses.replace(robot, folder=str(made)))
+        (made / _REPORT).write_text(report.json(hashes(made)), encoding="utf-8")
+        robot_file.read(made)
+
+
+def write_model(made: pathlib.Path, text: str, stl: Mapping[str, bytes]) -> None:
+    """Writes ``model.xml`` and its meshes."""
+    (made / "model.xml").write_text(text, encoding="utf-8")
+    if stl:
+        (made / "meshes").mkdir()
+    for name, content in stl.items():
+        (made / "meshes" / f"{name}.stl").write_bytes(content)
+
+
+def hashes(made: pathlib.Path) -> dict[str, str]:
+    """Returns file -> hash of all that has been written, for the report."""
+    return {name: _hash((made / name).read_bytes()) for name in sorted(_entries(made))}
+
+
+@contextlib.contextmanager
+def making(out: pathlib.Path, force: bool) -> Iterator[pathlib.Path]:
+    """Gives a folder under a hidden name beside ``out``, and moves it there at the end, or leaves nothing.
+
+    Raises:
+        UserError: the folder cannot be written.
     """
     made = out.parent / f".{out.name[:200]}.{uuid.uuid4().hex[:8]}"
     absent = [folder for folder in (out.parent, *out.parent.parents) if not os.path.exists(folder)]
     try:
         made.mkdir(parents=True)
-        (made / "model.xml").write_text(text, encoding="utf-8")
-        if stl:
-            (made / "meshes").mkdir()
-        for name, content in stl.items():
-            (made / "meshes" / f"{name}.stl").write_bytes(content)
-        robot_file.write(made, dataclasses.replace(robot, folder=str(made)))
-        listed = {name: _hash((made / name).read_bytes()) for name in sorted(_entries(made))}
-        (made / _REPORT).write_text(report.json(listed), encoding="utf-8")
-        robot_file.read(made)
+        yield made
         _move(made, out, force)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         if isinstance(error, UserError):

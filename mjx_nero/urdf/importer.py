@@ -78,7 +78,7 @@ def import_urdf(
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
     check_lengths(tree, looks.spans, units)
-    whole = _filled(tree, looks, notes)
+    whole = filled(tree, looks, notes)
     tree, grips, fork = fingers.choose(whole, looks.of, gripper, notes)
     couplings.warn_of_frozen(whole, tree, grips, notes)
     parts = bodies(tree)
@@ -117,7 +117,7 @@ def import_urdf(
     return report
 
 
-def _filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
+def filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
     """Fills in what shapes tell: missing tensors, and masses where no link, or no link of a moving body, has one."""
     seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
     masses = {n: link.mass for n, link in tree.links.items()}
@@ -152,7 +152,7 @@ class _Model:
         self.tree, self.parts, self.hand, self.collisions, self.at_home = tree, parts, hand, collisions, at_home
         self.masses = {n: inertia.body_mass(b, notes) if b.joint else b.mass for n, b in parts.items()}
         self.joints = {b.joint.name: b.joint for b in parts.values() if b.joint}
-        self.site = _free("ee", [link for b in parts.values() for link in b.links])
+        self.site = free("ee", [link for b in parts.values() for link in b.links])
 
     def xml(self, drawn: Mapping[str, list[Visual]], rotors: Mapping[str, float]) -> str:
         at_home = positions(self.parts, {n: np.array([v]) for n, v in self.at_home.items()}, 1)
@@ -286,8 +286,8 @@ def _joint_rows(
     return out
 
 
-def _free(name: str, taken: Sequence[str]) -> str:
-    return name if name not in taken else _free(f"{name}_site", taken)
+def free(name: str, taken: Sequence[str]) -> str:
+    return name if name not in taken else free(f"{name}_site", taken)
 
 
 def _quat(pose: Pose) -> Float[np.ndarray, "4"]:
