@@ -1,8 +1,9 @@
 """The pictures that are not a command's own: python docs/make_pictures.py
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
-docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the objects of the
-package, and docs/failures/, three failures of tasks that fall short. A name makes one.
+docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the package's
+objects, docs/failures/, three failures of tasks that fall short, and docs/fixtures/, what scripts do with drawers, doors and
+knobs. A name makes one.
 """
 
 import dataclasses
@@ -31,6 +32,7 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
 }
 
 SEEING = ("nero_lift", "piper_lift")  # have bundled policies of the preset rgb
+SCRIPTED = ("nero_open_drawer", "nero_open_door", "cobotta_turn_knob")  # nobody has trained these
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
@@ -90,6 +92,13 @@ def failures(folder: pathlib.Path) -> None:
         film(folder / f"{name}.webp", played, np.flatnonzero(~played.episodes.success)[:3])
 
 
+def scripted(folder: pathlib.Path) -> None:
+    """The first episode that succeeds, by the task's expert."""
+    for name in SCRIPTED:
+        played = evaluation.play(evaluation.EvalCfg(name, controller="expert", episodes=8, record=8, backend="mujoco"))
+        film(folder / f"{name}.webp", played, np.argmax(played.episodes.success, keepdims=True))
+
+
 def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> None:
     """A small moving picture of the recorded episodes named, 40 frames each."""
     path.parent.mkdir(exist_ok=True)
@@ -108,7 +117,7 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
 def main() -> None:
     """All pictures, or those named."""
     cli.setup_jax()
-    folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "objects.png": objects_sheet}
+    folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "fixtures": scripted, "objects.png": objects_sheet}
     for name in sys.argv[1:] or (*folders, *PICTURES):
         if name in folders:
             folders[name](HERE / name)
