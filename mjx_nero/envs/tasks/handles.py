@@ -152,6 +152,17 @@ class Task:
             "privileged_state": privileged(state, {"joint_velocity": ObservationTerm(fixtures.joint_velocity, params=held)}),
         }
 
+    def opening(self) -> EnvCfg:
+        """Builds a task that is done once the joint is as far as its target, or farther."""
+        held = {"handle": self.held}
+        return self.cfg(
+            SuccessCfg(condition=Term(fixtures.opened, params=held), distance=Term(fixtures.opening_way, params=held)),
+            {
+                "opening": RewardTerm(fixtures.opening, weight=10.0, params=held),
+                "opened": RewardTerm(fixtures.is_opened, weight=10.0, params=held),
+            },
+        )
+
     def cfg(
         self, success: SuccessCfg, moving: Mapping[str, RewardTerm], command: Term | None = None, limit: bool = True
     ) -> EnvCfg:

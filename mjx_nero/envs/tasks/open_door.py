@@ -3,12 +3,10 @@
 import functools
 import math
 
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg
+from mjx_nero.envs.task import EnvCfg, Presets
 from mjx_nero.envs.tasks import handles
 from mjx_nero.envs.tasks.handles import Place, Task
-from mjx_nero.mdp import fixtures
 from mjx_nero.mdp.fixtures import Handle
-from mjx_nero.mdp.terms import RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 
 ANGLE = math.radians(60)
@@ -19,17 +17,7 @@ def default(robot: RobotCfg, place: Place | None = None) -> EnvCfg:
     """Success: the door is open by 60 degrees."""
     # The handle's arc runs to the right by 14 cm. The round bar turns in the hand, which goes half of the turn.
     task = Task(robot, place or handles.place(robot), "cabinet", HANDLE, middle=0.07, follow=0.5, beyond=0.1)
-    held = {"handle": task.held}
-    return task.cfg(
-        success=SuccessCfg(
-            condition=Term(fixtures.opened, params=held),
-            distance=Term(fixtures.opening_way, params=held),
-        ),
-        moving={
-            "opening": RewardTerm(fixtures.opening, weight=10.0, params=held),
-            "opened": RewardTerm(fixtures.is_opened, weight=10.0, params=held),
-        },
-    )
+    return task.opening()
 
 
 def presets(place: Place | None = None) -> Presets:

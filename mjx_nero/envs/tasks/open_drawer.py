@@ -2,12 +2,10 @@
 
 import functools
 
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg
+from mjx_nero.envs.task import EnvCfg, Presets
 from mjx_nero.envs.tasks import handles
 from mjx_nero.envs.tasks.handles import Place, Task
-from mjx_nero.mdp import fixtures
 from mjx_nero.mdp.fixtures import Handle
-from mjx_nero.mdp.terms import RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 
 MOST = 0.8  # share of the drawer's travel
@@ -17,17 +15,7 @@ HANDLE = Handle("cabinet", "drawer", "drawer_handle", target=MOST, share=True)
 def default(robot: RobotCfg, place: Place | None = None) -> EnvCfg:
     """Success: the drawer is open by four fifths of its travel."""
     task = Task(robot, place or handles.place(robot), "cabinet", HANDLE, beyond=0.1)
-    held = {"handle": task.held}
-    return task.cfg(
-        success=SuccessCfg(
-            condition=Term(fixtures.opened, params=held),
-            distance=Term(fixtures.opening_way, params=held),
-        ),
-        moving={
-            "opening": RewardTerm(fixtures.opening, weight=10.0, params=held),
-            "opened": RewardTerm(fixtures.is_opened, weight=10.0, params=held),
-        },
-    )
+    return task.opening()
 
 
 def presets(place: Place | None = None) -> Presets:
