@@ -189,6 +189,11 @@ def test_without_the_library(tmp_path, monkeypatch):
         ("a.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "v lines are not all 3 numbers"),
         ("a.obj", "mtllib ../m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not below its own folder"),
         ("a.obj", "mtllib /etc/passwd\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not below its own folder"),
+        (
+            "a.obj",
+            "".join(f"v {i} 0 0\nv {i} 1 0\nv {i} 0 {1 + i % 7}\nf {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(400)),
+            "400 pieces that do not hang together",
+        ),
         ("a.stl", "solid x\nendsolid x\n", "holds no triangles"),
         ("a.stl", "x" * 200, "neither a binary file"),
         ("a.glb", "glTF", "no glTF 2 file"),

@@ -17,6 +17,7 @@ from mjx_nero.types import UserError
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of what is cut into pieces
 SECONDS = 12  # of CPU, for the cutting
+MAX_LOOSE = 300  # pieces that do not hang together
 FLAT = 1e-4  # least thickness, as a share of the length
 
 
@@ -103,6 +104,9 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     hull = _hull(np.asarray(mesh.vertices))
     if mesh.is_volume and mesh.volume > 0.97 * hull.volume:
         return [np.asarray(hull.vertices)]
+    pieces_of_it = int(trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices)).max()) + 1
+    if pieces_of_it > MAX_LOOSE:
+        raise UserError(f"is {pieces_of_it:,} pieces that do not hang together: no solid; more than {MAX_LOOSE} are not cut")
     if importlib.util.find_spec("coacd") is None:
         raise UserError(
             "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install -e '.[meshes]')"
