@@ -126,10 +126,11 @@ def test_override(name, value, expected):
 
 def test_every_field_that_help_lists_can_be_set():
     """Those of ``training``, too, whose names are the learner's dotted ones."""
-    for name, value in config.flatten(env_cfg("nero_lift")).items():
-        changed = config.override(env_cfg("nero_lift"), {name: value})
-        assert config.flatten(changed) == config.flatten(env_cfg("nero_lift")), name
-    assert config.override(env_cfg("nero_lift"), {"training.network.init_std": "0.3"}).training["network.init_std"] == 0.3
+    cfg = env_cfg("nero_lift")
+    before = config.flatten(cfg)
+    for name, value in before.items():
+        assert config.flatten(config.override(cfg, {name: value})) == before, name
+    assert config.override(cfg, {"training.network.init_std": "0.3"}).training["network.init_std"] == 0.3
 
 
 def test_several_overrides_at_once():

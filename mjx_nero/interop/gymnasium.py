@@ -83,8 +83,7 @@ class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Fresh episodes everywhere: observations and an empty info. A seed makes all that follows reproducible."""
-        _check_open(self.closed, "reset")
-        seed = _checked(seed, options)
+        seed = _checked(self.closed, seed, options)
         super().reset(seed=seed)
         self._state, self._key = self._reset(_key(self.np_random, seed))
         return jax.tree.map(self._out, _group(self._state.obs, self._group)), {}
@@ -155,8 +154,7 @@ class Env(gymnasium.Env, gymnasium.utils.EzPickle):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """A fresh episode: observation and an empty info."""
-        _check_open(self._closed, "reset")
-        seed = _checked(seed, options)
+        seed = _checked(self._closed, seed, options)
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random, seed))
         return jax.tree.map(np.asarray, _group(self._state.obs, self._group)), {}
@@ -245,12 +243,13 @@ def _results(env: ManipulationEnv) -> list[str]:
     return ["success", "final_distance", *own, "dropped", "nan"]
 
 
-def _checked(seed: Any, options: Any) -> int | None:
+def _checked(closed: bool, seed: Any, options: Any) -> int | None:
     """The seed of a reset.
 
     Raises:
-        gymnasium.error.Error: as ``checked_seed``, or options ask for what is not done.
+        gymnasium.error.Error: as ``checked_seed``; the environment is closed; or options ask for what is not done.
     """
+    _check_open(closed, "reset")
     if options is not None and not (isinstance(options, dict) and not options):
         named = ", ".join(map(str, options)) if isinstance(options, dict) else values.short(options)
         raise gymnasium.error.Error(f"reset takes no options here, got {named}: all episodes start anew")

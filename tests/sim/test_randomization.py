@@ -230,7 +230,8 @@ def test_mjx_gives_the_same_physics_to_drawn_worlds(env, gripped):
     test_physics holds plain worlds to."""
     plain, sim, ctrl = gripped
     sim, model = sim.replace(fields=drawn(env, 8)), copy.copy(env.physics_model)
-    ours, _ = jax.jit(jax.vmap(JaxPhysics(env.physics_model, env.cfg.sim, env._randomization.names).step))(sim, ctrl)
+    step = jax.jit(jax.vmap(JaxPhysics(env.physics_model, env.cfg.sim, env._randomization.names).step))  # compiled once
+    ours, _ = step(sim, ctrl)
     reference = env.physics.step(sim, ctrl)[0]
     for rows, atol in ((slice(0, 7), 1e-4), (slice(7, 9), 5e-3), (slice(9, 12), 1e-3)):
         np.testing.assert_allclose(ours.qpos[:, rows], reference.qpos[:, rows], rtol=0, atol=atol)
@@ -241,8 +242,9 @@ def test_mjx_gives_the_same_physics_to_drawn_worlds(env, gripped):
         getattr(model, name)[:] = sim.fields[name][heaviest]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     same = jax.tree.map(lambda x: jnp.stack([x[heaviest]] * 8), (sim.replace(fields={}), ctrl))  # as many, computed alike
-    steps = (jax.jit(jax.vmap(JaxPhysics(m, env.cfg.sim).step)) for m in (model, env.physics_model))
-    compiled, undrawn = (jax.tree.map(lambda x: x[heaviest], step(*same)[0]) for step in steps)
+    nominal = {name: jnp.stack([jnp.asarray(getattr(env.physics_model, name), jnp.float32)] * 8) for name in sim.fields}
+    found = jax.jit(jax.vmap(JaxPhysics(model, env.cfg.sim).step))(*same)[0], step(sim.replace(fields=nominal), ctrl)[0]
+    compiled, undrawn = (jax.tree.map(lambda x: x[heaviest], each) for each in found)
     np.testing.assert_allclose(ours.qpos[heaviest], compiled.qpos, rtol=0, atol=2e-6)
     np.testing.assert_allclose(ours.qvel[heaviest], compiled.qvel, rtol=0, atol=1e-3)
     assert np.abs(undrawn.qvel - compiled.qvel).max() > 0.01

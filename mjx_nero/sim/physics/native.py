@@ -39,6 +39,9 @@ class NativePhysics:
 
     The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
     physics step: a fair first guess, and a function of the state.
+
+    Of equal ones the first does the work of all, and lives as long as the process, as a compiled program may call it at any time
+    (``host.call``). It keeps its model, and MuJoCo's data for each thread: 15 MB of addresses, of which little is touched.
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
