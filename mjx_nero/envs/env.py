@@ -349,8 +349,8 @@ class ManipulationEnv(Env):
             look |= self._fixtures.drawn(self.mj_model, sim.fields)
         return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
 
-    def _pictures(self, sim: Sim, carry: Carry, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:
-        return self.cameras(sim, self._scenery(sim, carry), due)
+    def _pictures(self, sim: Sim, carry: Carry, *due: Mapping[str, Bool[Array, ""]]) -> dict[str, Picture]:
+        return self.cameras(sim, self._scenery(sim, carry), *due)
 
     def _due(self, carry: Carry) -> dict[str, Bool[Array, ""]]:
         """Says which cameras' pictures the sensors look at now; empty where all are, always."""

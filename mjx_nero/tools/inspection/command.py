@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero import console, files
+from mjx_nero import config, console, files
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tools import cli, self_test
@@ -29,9 +29,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
-    parser.add_argument("--cameras", type=cli.path(".png"), metavar="FILE", help="PNG of what an environment's cameras see")
+    parser.add_argument(
+        "--cameras", type=cli.path(".png"), metavar="FILE", help="PNG of what its cameras see, with fields of --env.*"
+    )
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
-    args, _ = parser.parse(argv)
+    args, dotted = parser.parse(argv, ("env",))
+    if dotted["env"] and not args.cameras:
+        parser.error("fields of the environment are for its cameras: pass --cameras FILE, too")
     for path in filter(None, (args.render, args.cameras, args.json)):
         files.check_writable(path)
     if args.object is not None:
@@ -61,7 +65,7 @@ def main(argv: Sequence[str]) -> None:
     if args.cameras:
         if cfg is None:
             parser.error("--cameras needs an environment: its states are what they see")
-        _see(cfg, args.cameras)
+        _see(config.override(cfg, dotted["env"]), args.cameras)
     if args.json:
         content: dict[str, Any] = {**dataclasses.asdict(report), "moves": [dataclasses.asdict(m) for m in moved]}
         content |= {"self_test": tested.json()} if tested else {}

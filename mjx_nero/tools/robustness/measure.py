@@ -36,11 +36,11 @@ class Bench:
     def __init__(self, env_name: str, preset: str, cfg: EnvCfg, path: pathlib.Path | None, episodes: int, impl: str, seed: int):
         self._played: list[tuple[Point, dict[str, Any]]] = []
         self._episodes, self._seed, self._sees = episodes, seed, bool(cfg.scene.cameras)
-        self._objects = [] if self._sees else list(cfg.scene.objects)
+        self._told = [] if self._sees else list(cfg.scene.objects)  # objects of which somebody says where they are
         cfg = seen.prepared(cfg) if self._sees else cfg
         own = {name: term for name, term in cfg.actions.items() if name != "delay"}  # the task's own delay gives way
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
-        told = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._objects}
+        told = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._told}
         wanted = varied(cfg).randomization
         cfg = dataclasses.replace(cfg.uncorrupted(), actions={**late, **own}, sensors={**cfg.sensors, **told})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
@@ -82,21 +82,34 @@ class Bench:
         sim, carry, fields = state.pipeline_state, state.info["carry"], given["fields"]
         memory, qpos = dict(carry.memory), sim.qpos
         memory["actions.delay"] = memory["actions.delay"].replace(lag=given["lag"])
-        if self._sees:
-            memory[LOOK] = given["look"]
-            for name in seen.lenses(self.env.cfg):
-                *rest, late = memory[f"sensors.{name}"]
-                memory[f"sensors.{name}"] = *rest, {kind: line.replace(lag=given["late"]) for kind, line in late.items()}
-        for name in self._objects:
-            key, _, line = memory[f"sensors.{name}"]
-            memory[f"sensors.{name}"] = key, given["offset"], line
+        for name, item in self.env.cfg.scene.objects.items():
+            if name in self._told:
+                key, _, line = memory[f"sensors.{name}"]
+                memory[f"sensors.{name}"] = key, given["offset"], line
             if "geom_size" in fields:
                 geom, at = self.env.physics_model.geom(name).id, self.env.physics_model.joint(name).qposadr[0]
                 factor = fields["geom_size"][:, geom, 0] / self._nominal["geom_size"][geom, 0]
-                qpos = qpos.at[:, at + 2].add((factor - 1) * self.env.cfg.scene.objects[name].rest_height)
+                qpos = qpos.at[:, at + 2].add((factor - 1) * item.rest_height)
         sim = dataclasses.replace(sim, qpos=qpos, fields=dict(fields))
+        state = state.replace(pipeline_state=sim, info={**state.info, "carry": carry.replace(memory=memory)})
+        return self._looking(given, state) if self._sees else state
+
+    def _looking(self, given: Mapping[str, Any], state: State) -> State:
+        """The states with the look and the pictures' delay that are given, in the first pictures, too."""
+        carry = state.info["carry"]
+        memory = {**carry.memory, LOOK: given["look"]}
+        state = state.replace(info={**state.info, "carry": carry.replace(memory=memory)})
+        first = jax.vmap(lambda each: self.env.view(each).cameras)(state)
+        for name, term in seen.lenses(self.env.cfg).items():
+            *rest, lines = memory[f"sensors.{name}"]
+            shown = {kind: getattr(first[term.params["camera"]], kind)[:, None] for kind in lines}
+            late = {
+                kind: line.replace(lag=given["late"], past=jnp.broadcast_to(shown[kind], line.past.shape))
+                for kind, line in lines.items()
+            }
+            memory[f"sensors.{name}"] = *rest, late
         carry = carry.replace(memory=memory)
-        if self._sees:  # the first pictures, too, have the given look
-            obs, carry = jax.vmap(self.env.observe)(sim, carry, jax.vmap(jax.random.fold_in, (0, None))(carry.rng, 1))
-            state = state.replace(obs=obs)
-        return state.replace(pipeline_state=sim, info={**state.info, "carry": carry})
+        obs, carry = jax.vmap(self.env.observe)(
+            state.pipeline_state, carry, jax.vmap(jax.random.fold_in, (0, None))(carry.rng, 1)
+        )
+        return state.replace(obs=obs, info={**state.info, "carry": carry})
