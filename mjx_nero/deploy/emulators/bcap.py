@@ -25,6 +25,7 @@ from mjx_nero.deploy.emulators.plant import Plant
 _BUFFER, _LATE = 3, 4  # cycles: targets that wait; how late the next one may be
 _FAIL, _TOO_LATE = 0x80004005 - (1 << 32), 0x84201482 - (1 << 32)
 _ARM = 6
+_GRIPS = 0.1  # [m/s]: the RG6 opens and closes at 51 to 160 mm/s, by its data sheet
 _FASTEST = 3.0  # times the model's speed, from one target to the next
 
 
@@ -58,7 +59,8 @@ class Controller:
     def __init__(self, plant: Plant, speed: np.ndarray, wait: bool = True):
         self.plant, self.faults, self.torque_cuts, self.slave = plant, BusFaults(), 0, False
         self._speed, self._wait, self._goal = speed, wait, plant.position()
-        self._turn = self._grip_to = 0.0
+        self._turn = self._before = 0.0
+        self._width = self._grip_to = rg6.width(float(self._goal[_ARM]))
         plant.powered[:_ARM] = False
         plant.gears = 1e5  # brakes
         plant.model.opt.timestep = cobotta.CYCLE / 2  # answers that come so often must not show the steps of physics
@@ -82,8 +84,20 @@ class Controller:
             return self._execute(values[1], values[2])
         return (0, None) if function in (bcap.SERVICE_START, bcap.SERVICE_STOP, bcap.DISCONNECT, bcap.RELEASE) else (_FAIL, None)
 
-    def _execute(self, command: str, argument: Any) -> tuple[int, Any]:
+    def _advance(self) -> None:
+        """Catches up with the clock; the gripper goes to its width at its own speed."""
+        now, left = self.plant.time, self._grip_to - self._width
+        if left:
+            most = _GRIPS * max(now - self._before, 0.0)
+            self._width += min(max(left, -most), most)
+            angle = rg6.angle(self._width)
+            self._goal[_ARM:] = angle, -angle
+            self.plant.target(self._goal)
+        self._before = now
         self.plant.advance()
+
+    def _execute(self, command: str, argument: Any) -> tuple[int, Any]:
+        self._advance()
         if command == "HighCurJntEx":
             return 0, [0.0, *self._degrees()]
         if command == "Motor":
@@ -118,24 +132,21 @@ class Controller:
         self.plant.target(self._goal, self._turn - now)
         if self._wait and (early := self._turn - now - _BUFFER * cycle) > 0:
             time.sleep(early)
-        self.plant.advance()
+        self._advance()
         return 0, self._degrees()
 
     def grip(self, request: bytes) -> bytes:
         """The gripper's answer to a Modbus request; of functions 3 and 16."""
-        self.plant.advance()
+        self._advance()
         head, (unit, function, first, count) = request[:4], struct.unpack(">BBHH", request[6:12])
         here = rg6.width(float(self.plant.position()[_ARM]))
         if function == 16 and first == rg6.FORCE and count == 3:
             _, width, control = struct.unpack(">HHH", request[13:19])
             if control == rg6.GRIP:
                 self._grip_to = width * 1e-4
-                angle = rg6.angle(self._grip_to)
-                self._goal[_ARM:] = angle, -angle
-                self.plant.target(self._goal)
             body = struct.pack(">BBHH", unit, function, first, count)
         elif function == 3 and first == rg6.WIDTH and count <= 2:
-            busy = bool(abs(self.plant.velocity()[_ARM]) > 0.02)
+            busy = self._width != self._grip_to or bool(abs(self.plant.velocity()[_ARM]) > 0.02)
             status = busy * rg6.BUSY | self.faults.tripped * 8
             body = struct.pack(">BBB", unit, function, 2 * count)
             body += struct.pack(">HH", max(0, round(here * 1e4)), status)[: 2 * count]

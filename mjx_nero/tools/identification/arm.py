@@ -64,7 +64,7 @@ def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
         remote.start(anywhere=True)
         fault = go_home(remote, limits, clock, stop)
         if not fault:
-            urgent()
+            stack.enter_context(urgent())
             print(f"the arm is where the movement begins: it takes {args.seconds:g} s")
             fault, limited = play(remote, targets, clock, stop)
             print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in limited.items()) or "never"))
