@@ -101,8 +101,8 @@ class Fault:
     """The reason why an arm holds.
 
     Attributes:
-        kind: ``nan``, ``stale``, ``bus``, ``range``, ``jump``, ``stall``, ``load``, ``temperature``, ``object``, ``deadline``,
-            ``silence`` or ``stop``.
+        kind: ``nan``, ``stale``, ``bus``, ``range``, ``jump``, ``stall``, ``load``, ``temperature``, ``object``, ``picture``,
+            ``deadline``, ``silence`` or ``stop``.
     """
 
     kind: str

@@ -105,6 +105,7 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
         "command": {"term": env.cfg.command.name, **_plain(env.cfg.command.params)},
         "objects": {name: list(item.size) for name, item in env.cfg.scene.objects.items()},
         "observations": _observations(env),
+        "cameras": student.cameras(policy.meta, env.cfg),
         "actions": env.actions.describe(),
         "action_clip": env.cfg.action_clip or None,
         "versions": versions(),
