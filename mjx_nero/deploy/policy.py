@@ -99,7 +99,8 @@ def _cameras(metadata: Mapping[str, Any], inputs: Mapping[str, tuple[Any, ...]])
     Raises:
         ValueError: the network takes others than the metadata say, or depths, which no camera here gives.
     """
-    told, out = metadata.get("cameras") or {}, {}
+    told: Any = metadata.get("cameras") or {}
+    out: dict[str, tuple[int, ...]] = {}
     if not isinstance(told, Mapping) or {f"picture_{name}" for name in told} != set(inputs):
         raise ValueError("the metadata do not say what the policy's cameras are: export the policy again")
     for name, camera in told.items():

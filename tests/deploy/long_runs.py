@@ -32,7 +32,7 @@ def test_drives_that_are_off_and_late_and_identified(tmp_path):
     assert share(tmp_path, "so101_lift", faults=OFF, delay=0.04) >= 0.93
 
 
-@pytest.mark.parametrize(("name", "least"), [("so101_lift", 0.95), ("piper_lift", 0.97), ("nero_lift", 0.97)])
+@pytest.mark.parametrize(("name", "least"), [("so101_lift", 0.957), ("piper_lift", 0.97), ("nero_lift", 0.97)])
 def test_a_hundred_episodes_succeed_as_in_eval(tmp_path, name, least):
     """Within 3 points of what ``eval.py`` measures (docs/guides/sim2real.md), over the arm's own protocol."""
     assert share(tmp_path, name) >= least

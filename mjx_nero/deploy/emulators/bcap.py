@@ -1,4 +1,4 @@
-"""A Cobotta Pro's controller and its RG6 in software: b-CAP and Modbus over TCP.
+"""A Cobotta Pro's controller and its RG6 in software: b-CAP over TCP and UDP, and Modbus over TCP.
 
     python -m mjx_nero.deploy.emulators.bcap '{"model": "scene.mjb", ...}'
 
@@ -37,6 +37,7 @@ class BusFaults:
         cut: nobody answers.
         corrupt: answers lose their last byte.
         closed: connections are closed at the next request.
+        lost: every so many a datagram's answer is lost; 0: none.
         error: result of every slvMove; 0: none.
         tripped: a safety switch of the gripper is.
     """
@@ -44,6 +45,7 @@ class BusFaults:
     cut: bool = False
     corrupt: bool = False
     closed: bool = False
+    lost: int = 0
     error: int = 0
     tripped: bool = False
 
@@ -167,11 +169,14 @@ class Port:
         self._arm, self._hand = (socket.create_server(("127.0.0.1", 0)) for _ in range(2))
         self.name, self.gripper = (f"127.0.0.1:{door.getsockname()[1]}" for door in (self._arm, self._hand))
         self._guests: dict[socket.socket, bool] = {}
+        self._post = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._post.bind(self._arm.getsockname())
+        self._before, self._count = (0, b""), 0
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Answers until somebody says so, or until a file descriptor ends."""
         while not until():
-            watched: list[Any] = [self._arm, self._hand, *self._guests, *([] if other is None else [other])]
+            watched: list[Any] = [self._arm, self._hand, self._post, *self._guests, *([] if other is None else [other])]
             ready, _, _ = select.select(watched, [], [], 0.02)
             if other in ready and not os.read(other or 0, 1000):
                 return
@@ -180,8 +185,22 @@ class Port:
                 guest.settimeout(0.5)
                 guest.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._guests[guest] = door is self._arm
+            if self._post in ready:
+                self._reply()
             for guest in set(self._guests) & set(ready):
                 self._serve(guest)
+
+    def _reply(self) -> None:
+        """Answers a datagram; one that is repeated as it was answered before."""
+        with contextlib.suppress(OSError, struct.error):
+            data, sender = self._post.recvfrom(bcap.LONGEST)
+            faults, (serial, first) = self.controller.faults, struct.unpack_from("<HH", data, 5)
+            if first != self._before[0]:
+                self._before = first, self.controller.answer(data)
+            self._count += 1
+            if not faults.cut and not (faults.lost and self._count % faults.lost == 0):
+                answer = self._before[1]
+                self._post.sendto(answer[:5] + struct.pack("<H", serial) + answer[7:], sender)
 
     def _serve(self, guest: socket.socket) -> None:
         faults, arm = self.controller.faults, self._guests[guest]
@@ -196,7 +215,7 @@ class Port:
 
     def close(self) -> None:
         """Closes all."""
-        for each in (self._arm, self._hand, *self._guests):
+        for each in (self._arm, self._hand, self._post, *self._guests):
             each.close()
 
 

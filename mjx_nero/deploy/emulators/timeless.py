@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.arm import Arm
-from mjx_nero.deploy.drivers import agilex, feetech, so_arm
+from mjx_nero.deploy.drivers import agilex, feetech, sim, so_arm
 from mjx_nero.deploy.emulators import agilex as can
 from mjx_nero.deploy.emulators import feetech as serial
 from mjx_nero.deploy.emulators.plant import Plant
+from mjx_nero.deploy.executor import Lag
 from mjx_nero.deploy.places import Known, Place
 
 
@@ -92,7 +93,11 @@ def _frames(kind: str) -> Callable[[Mapping[str, Any], Plant, Clock], tuple[Arm,
     return made
 
 
-LINES = {"so101": _servos, "piper": _frames("piper"), "nero": _frames("nero")}
+def _drives(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
+    return sim.SimArm(plant, tuple(told["joints"]["names"]), Lag.of(told).lead, clock), lambda: None
+
+
+LINES = {"sim": _drives, "so101": _servos, "piper": _frames("piper"), "nero": _frames("nero")}
 
 
 def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:

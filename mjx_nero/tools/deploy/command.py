@@ -126,13 +126,13 @@ def _run(args: argparse.Namespace) -> bool:
         brain.warm()
         remote.ready()
         stop = stack.enter_context(operator(args.alive))
+        stack.enter_context(urgent())
         remote.start(anywhere=args.go_home, actions=brain.actions)
         if args.go_home:
             if fault := go_home(remote, limits, clock, stop):
                 print(f"the arm holds: {fault.text}")
                 return fault.kind != "stop"
             print("the arm is at home")
-        stack.enter_context(urgent())
         if args.check:
             from mjx_nero.tools.deploy.checking import checked
 
@@ -149,8 +149,8 @@ def _tell(args: argparse.Namespace, report: Any, late: float, ages: Sequence[flo
     print(f"the arm holds: {report.fault.text}")
     print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
     print("timing: " + json.dumps(report.timing.summary()))
-    for cycle, late in report.timing.missed[:20]:
-        print(f"  cycle {cycle} was {1e3 * late:.1f} ms late")
+    if report.timing.missed:
+        print("missed: " + ", ".join(f"cycle {cycle} by {1e3 * over:.1f} ms" for cycle, over in report.timing.missed))
     print(f"delay: the joints went where they were told {1e3 * late:.0f} ms later")
     if len(ages):
         print(f"pictures: {summary(ages)}")

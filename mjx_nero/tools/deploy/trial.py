@@ -38,7 +38,7 @@ def lifts(
 
     Args:
         cfg: of the environment.
-        kind: of the arm: ``so101``, ``piper`` or ``nero``.
+        kind: of the arm: ``sim``, ``so101``, ``piper`` or ``nero``.
         faults: of its drives.
         delay: of targets, that the runtime is told of [s]; None: nothing.
 
