@@ -1,9 +1,10 @@
 """An arm behind its safety layer and its log: all that the runtime ever talks to."""
 
 import contextlib
+import ctypes
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +12,9 @@ import numpy as np
 from mjx_nero.deploy.arm import Arm, ArmError, Clock, Feedback
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Command, Fault, Safety
+
+_PRIORITY = 10  # of 1 to 99
+_LOCK = 1 | 2 | 4  # Linux's MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: what is in memory stays there
 
 
 class WallClock:
@@ -30,10 +34,18 @@ class WallClock:
             pass
 
 
-def urgent() -> None:
-    """Lets this process run before others, where the system lets it."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+@contextlib.contextmanager
+def urgent() -> Iterator[None]:
+    """Meanwhile this thread, and those that it starts, run before others, and memory stays in place, where the system lets it."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError, AttributeError):
+            before = os.sched_getscheduler(0), os.sched_getparam(0)
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_PRIORITY))
+            stack.callback(os.sched_setscheduler, 0, *before)
+            system = ctypes.CDLL(None)
+            if system.mlockall(_LOCK) == 0:
+                stack.callback(system.munlockall)
+        yield
 
 
 class Guarded(Protocol):

@@ -3,10 +3,13 @@
     time,target.joint1,...,position.joint1,...,velocity.joint1,...,inferring,inferred,limited,held,action.0,...
 
 A row is written when feedback was read, and one when a command was sent; all times are seconds since the log began.
-``target`` is what the drives were told. Rows are written as they come, so that a log ends where its program did.
+``target`` is what the drives were told. Rows are written as they come, so that a log ends where its program did, by a thread,
+as no arm may wait for a disk.
 """
 
 import pathlib
+import queue
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,6 +29,9 @@ class Log:
         actions: how many numbers an action has.
         notes: lines for its head.
 
+    Attributes:
+        error: why no more was written; empty: all was.
+
     Raises:
         UserError: the file cannot be written.
     """
@@ -42,6 +48,9 @@ class Log:
             self._file.write(",".join(head) + "\n")
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror or error}") from None
+        self.error, self._rows = "", queue.SimpleQueue[str]()
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
         self._row(begun, start, None, None)
 
     def read(self, feedback: Feedback) -> None:
@@ -66,8 +75,17 @@ class Log:
         cells = [f"{self._last:.7f}"]
         for values in (told, at, speed):
             cells += [""] * self._n if values is None else [f"{x:.7g}" for x in values]
-        self._file.write(",".join([*cells, *(rest or [""] * (4 + self._actions))]) + "\n")
+        self._rows.put(",".join([*cells, *(rest or [""] * (4 + self._actions))]) + "\n")
+
+    def _write(self) -> None:
+        try:
+            with self._file:
+                while row := self._rows.get():
+                    self._file.write(row)
+        except OSError as error:  # a full disk is no reason to stop an arm
+            self.error = f"the log {self._file.name} ends early: {error.strerror or error}"
 
     def close(self) -> None:
         """Ends the file."""
-        self._file.close()
+        self._rows.put("")
+        self._thread.join()

@@ -11,6 +11,7 @@ import numpy as np
 from mjx_nero.deploy.arm import Clock, Feedback
 from mjx_nero.deploy.executor import Lag
 from mjx_nero.deploy.guard import Guarded
+from mjx_nero.deploy.lateness import MOST, Lateness
 from mjx_nero.deploy.observe import Observer
 from mjx_nero.deploy.places import Lost
 from mjx_nero.deploy.policy import Policy
@@ -24,32 +25,39 @@ class Brain(Policy):
 
     def warm(self) -> None:
         """Runs the network once, which takes longer than every time after."""
-        self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]})
+        seen = {name: np.zeros(shape, np.uint8) for name, shape in self.cameras.items()}
+        self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]}, seen)
         gc.collect()
 
-    def begin(self, observer: Observer, feedback: Feedback, delay: float = 0.0) -> None:
+    def begin(self, observer: Observer, feedback: Feedback, delay: float | None = None) -> None:
         """A new episode, from where the joints are.
 
         Args:
-            delay: from a target's sending until it is in force [s]; what the policy sees of targets are those in force.
+            delay: from a target's sending until it is in force [s]; what the policy sees of targets are those in force. None: it
+                is found as the arm moves.
         """
         self.reset()
         self._observer, self._lag = observer, Lag.of(self.metadata)
         self._executor = self.executor(feedback.position)
         self.action = np.zeros(len(self._executor.home_action))
         self._meant = np.array(feedback.position, float)
-        past = 1 + round(delay / float(self.metadata["control_dt"]))
+        self._late = None if delay is None else round(delay / float(self.metadata["control_dt"]))
+        past = 1 + (MOST if self._late is None else self._late)
         self._targets = collections.deque([self._meant] * past, maxlen=past)
+        grips = self.metadata["gripper"]
+        self.lateness = Lateness(np.array([name not in grips for name in self.metadata["joints"]["names"]]))
 
     def __call__(self, feedback: Feedback, now: float) -> np.ndarray:
         """Computes where the joints must be next [rad or m].
 
         Raises:
-            ValueError: an object is not seen, or an observation or the action is not finite.
+            ValueError: an object is not seen, a picture is old, or an observation or the action is not finite.
         """
         self._targets.append(self._executor.last)
-        seen = self._observer(feedback, self._targets[0], self.action, now)
-        action = np.asarray(self.act(seen), float)
+        found = self.lateness(feedback.position, self._meant)
+        late = found if self._late is None else self._late
+        seen = self._observer(feedback, self._targets[-1 - late], self.action, now)
+        action = np.asarray(self.act(seen, self._observer.pictures(feedback, now)), float)
         if not np.all(np.isfinite(action)):
             raise ValueError("the policy's action is not finite")
         self.action = action
@@ -97,7 +105,7 @@ def run(
     seconds: float,
     stop: Stop,
     misses: int = 5,
-    delay: float = 0.0,
+    delay: float | None = None,
 ) -> Report:
     """Runs a policy until its time is over, somebody stops it, or something fails. Then the arm holds.
 
@@ -142,7 +150,7 @@ def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing)
     try:
         target = brain(feedback, inferring)
     except ValueError as error:
-        arm.hold(Fault("object" if isinstance(error, Lost) else "nan", str(error)))
+        arm.hold(Fault(error.kind if isinstance(error, Lost) else "nan", str(error)))
         target = feedback.position
     inferred = clock.now()
     command = arm.command(target, (inferring, inferred, *brain.action))

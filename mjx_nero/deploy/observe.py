@@ -11,6 +11,13 @@ from mjx_nero.deploy.body import Body, matrix, product
 from mjx_nero.deploy.places import Place, Places
 from mjx_nero.errors import UserError
 
+Pictures = Callable[[Feedback, float], Mapping[str, np.ndarray]]
+
+
+def no_pictures(feedback: Feedback, now: float) -> Mapping[str, np.ndarray]:
+    """Of a policy that does not look at any."""
+    return {}
+
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
@@ -94,6 +101,7 @@ class Observer:
         metadata: of the policy.
         goal: position in the robot's root frame [m], and perhaps orientation (wxyz); none: the middle of the task's region.
         places: where objects are.
+        pictures: of the policy's cameras, by name, at some feedback and time [s].
 
     Attributes:
         objects: names of those that the policy looks at.
@@ -102,8 +110,15 @@ class Observer:
         UserError: the policy reads what no arm can give, or commands what is not known.
     """
 
-    def __init__(self, metadata: Mapping[str, Any], body: Body, goal: list[float] | None, places: Places):
-        self._terms, self._body, self._places = metadata["observations"], body, places
+    def __init__(
+        self,
+        metadata: Mapping[str, Any],
+        body: Body,
+        goal: list[float] | None,
+        places: Places,
+        pictures: Pictures = no_pictures,
+    ):
+        self._terms, self._body, self._places, self.pictures = metadata["observations"], body, places, pictures
         self._home = np.array(metadata["joints"]["home"], float)
         if any("term" not in term for term in self._terms):
             raise UserError("the file does not say which terms it observes: export the policy again")

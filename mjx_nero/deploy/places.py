@@ -26,7 +26,9 @@ class Place:
 
 
 class Lost(ValueError):
-    """An object is not seen, or was too long ago."""
+    """An object is not seen, or was too long ago. ``kind``: of the fault that this is."""
+
+    kind = "object"
 
 
 class Places(Protocol):

@@ -49,7 +49,7 @@ class SafetyCfg:
     behind: float = 0.3
     behind_s: float = 0.3
     load: float = 0.85
-    load_s: float = 0.5
+    load_s: float = 1.0
     temperature: float = 60.0
     misses: int = 5
     silence: float = 0.08
@@ -101,8 +101,8 @@ class Fault:
     """The reason why an arm holds.
 
     Attributes:
-        kind: ``nan``, ``stale``, ``bus``, ``range``, ``jump``, ``stall``, ``load``, ``temperature``, ``object``, ``deadline``,
-            ``silence`` or ``stop``.
+        kind: ``nan``, ``stale``, ``bus``, ``range``, ``jump``, ``stall``, ``load``, ``temperature``, ``object``, ``picture``,
+            ``deadline``, ``silence`` or ``stop``.
     """
 
     kind: str

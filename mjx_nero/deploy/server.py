@@ -152,6 +152,8 @@ def serve(channel: socket.socket) -> None:
     finally:
         server.guard.hold(Fault("silence", "the policy's process ended"))
         server.guard.close()
+        if server.guard.log and server.guard.log.error:
+            print(server.guard.log.error, file=sys.stderr, flush=True)
 
 
 def main() -> None:
@@ -159,8 +161,8 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):  # they are for the policy's process, which then says so here
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    urgent()
-    serve(socket.socket(fileno=int(sys.argv[1])))
+    with urgent():
+        serve(socket.socket(fileno=int(sys.argv[1])))
 
 
 if __name__ == "__main__":

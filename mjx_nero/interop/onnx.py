@@ -93,7 +93,7 @@ def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
     """Collects what a runtime needs beside the graph; docs/guides/deploy_onnx.md explains every field."""
-    robot = env.cfg.robot
+    robot, own = env.cfg.robot, _own(policy.meta)
     return {
         "env": policy.meta["env"],
         "preset": policy.meta["preset"],
@@ -105,6 +105,7 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
         "command": {"term": env.cfg.command.name, **_plain(env.cfg.command.params)},
         "objects": {name: list(item.size) for name, item in env.cfg.scene.objects.items()},
         "observations": _observations(env),
+        "cameras": own.cameras(policy.meta, env.cfg) if own else {},
         "actions": env.actions.describe(),
         "action_clip": env.cfg.action_clip or None,
         "versions": versions(),

@@ -10,6 +10,7 @@ import pytest
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.drivers import agilex
 from mjx_nero.deploy.emulators import agilex as emulated
+from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.guard import Guard, WallClock
 from mjx_nero.envs import registry
@@ -153,7 +154,7 @@ def test_wrong_ports_are_one_line(kind, told, port):
 @pytest.fixture
 def adapter(bench):
     """The same arm behind a serial adapter."""
-    port = emulated.Port(bench.emulated)
+    port = emulated.Port(bench.emulated, Line(terminal=True))
     yield port
     port.close()
 

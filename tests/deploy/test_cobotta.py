@@ -14,7 +14,7 @@ from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.drivers import bcap, cobotta, rg6
 from mjx_nero.deploy.emulators import bcap as emulated
 from mjx_nero.deploy.emulators.plant import Plant
-from mjx_nero.deploy.guard import Guard, WallClock
+from mjx_nero.deploy.guard import Guard, WallClock, urgent
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms import cobotta_pro_900
 from mjx_nero.errors import UserError
@@ -81,7 +81,7 @@ class Stepped(cobotta.Cobotta):
 
 
 class Bench(arms.Bench):
-    def __init__(self, told, model, clock, kind):
+    def __init__(self, told, model, clock, kind, by=""):
         self.clock, self.home = clock, np.array(told["joints"]["home"])
         self.plant = Plant(model, told["joints"]["names"], self.home, clock)
         self.emulated = emulated.Controller(self.plant, np.array(told["joints"]["speed"])[:6], kind is cobotta.Cobotta)
@@ -89,7 +89,7 @@ class Bench(arms.Bench):
         self.gripper = rg6.Rg6(self.port.gripper)
         if kind is Stepped:
             self.gripper.engage = lambda: None
-        self.arm = kind(told, self.port.name, self.gripper, clock)
+        self.arm = kind(told, by + self.port.name, self.gripper, clock)
         self.guard = Guard(self.arm, setup.safety_of(told), clock)
         self.serve()
 
@@ -144,6 +144,24 @@ def test_the_way_between_targets_is_straight_and_smooth(bench):
     assert np.abs(np.diff(speed)).max() < np.abs(np.diff([0, *commands])).max() / 3 + 1e-6
 
 
+def test_lost_datagrams_are_asked_for_again(told, model):
+    """By UDP every fifth answer is lost; no target is moved to twice, and the arm goes on. Where all are lost, it holds."""
+    bench = Bench(told, model, arms.Clock(cobotta.CYCLE), Stepped, "udp:")
+    bench.start()
+    bench.arm._call.patience, moves, move = 0.2, [], bench.emulated._move
+    bench.emulated._move = lambda target: moves.append(target) or move(target)
+    bench.emulated.faults = emulated.BusFaults(lost=5)
+    cycles, cycle = [], bench.arm.turning._work
+    bench.arm.turning._work = lambda: cycles.append(1) or cycle()
+    bench.play([bench.towards(0.01 * k) for k in range(10)])
+    assert bench.guard.fault is None and len(moves) == len(cycles) > 20 and bench.port._count > len(moves)
+    bench.arm._call.patience = 0.02
+    bench.emulated.faults = emulated.BusFaults(cut=True)
+    bench.play([bench.home + 0.3] * 3)
+    assert bench.guard.fault.kind == "bus" and "does not answer" in bench.guard.fault.text
+    bench.close()
+
+
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
@@ -159,7 +177,7 @@ def test_faults_end_in_hold(bench, fault, says):
     bench.play([bench.towards(0.01 * k) for k in range(10)])
     assert bench.guard.fault is None
     if "cut" in fault:
-        bench.arm._call._channel.settimeout(0.05)
+        bench.arm._call.patience = 0.05
     bench.emulated.faults = emulated.BusFaults(**fault)
     bench.play([bench.home + 0.3] * 3)
     assert bench.guard.fault.kind == "bus" and says in bench.guard.fault.text
@@ -190,17 +208,18 @@ def test_closing_leaves_slave_mode_and_the_motors_on(bench):
 
 def test_threads_keep_the_controllers_pace(told, model):
     """In real time: 125 targets a second, by the controller's waiting."""
-    bench = Bench(told, model, WallClock(), cobotta.Cobotta)
-    bench.clock.ticks = []
-    bench.start()
-    begun, moves, do = time.monotonic(), [], bench.arm._do
-    bench.arm._do = lambda name, value=None: moves.append(name) or do(name, value)
-    time.sleep(0.4)
-    rate = len(moves) / (time.monotonic() - begun)
-    assert not bench.arm.turning._error and 80 < rate < 140, (rate, bench.arm.turning._error)
-    bench.arm.close()
-    assert bench.plant.powered.all() and bench.emulated.torque_cuts == 0
-    bench.close()
+    with urgent():  # as the arm's process does: a target may be 32 ms late
+        bench = Bench(told, model, WallClock(), cobotta.Cobotta)
+        bench.clock.ticks = []
+        bench.start()
+        begun, moves, do = time.monotonic(), [], bench.arm._do
+        bench.arm._do = lambda name, value=None: moves.append(name) or do(name, value)
+        time.sleep(0.4)
+        rate = len(moves) / (time.monotonic() - begun)
+        assert not bench.arm.turning._error and 80 < rate < 140, (rate, bench.arm.turning._error)
+        bench.arm.close()
+        assert bench.plant.powered.all() and bench.emulated.torque_cuts == 0
+        bench.close()
 
 
 def test_nobody_at_the_address_is_one_line(told, bench):

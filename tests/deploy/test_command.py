@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from mjx_nero.deploy import emulators
+
 FAST = ("--seconds", "1.5")
 
 
@@ -82,26 +84,41 @@ def test_files_that_are_no_policy(call, tmp_path):
 
 
 PROBE = """
-import sys
+import json, os, sys, time
+begun = time.monotonic()
+from mjx_nero.deploy.remote import Remote
 from mjx_nero.tools import deploy
-from mjx_nero.tools import cli
-sys.argv[0] = "mjx_nero"
-try:
-    flags = ["--port", "/dev/nothing", "--calibration", sys.argv[2], "--object", "0.2,0,0.015"]
-    deploy.main([sys.argv[1], "--arm", "so101", *flags])
-except Exception as error:
-    print(error)
-print([name for name in ("jax", "mujoco", "torch", "brax", "scipy", "rich") if name in sys.modules])
-print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+sys.argv[0], (policy, *flags) = "mjx_nero", sys.argv[1:]
+command, told = Remote.command, {}
+
+
+def first(remote, *given):
+    out = command(remote, *given)
+    if not told:
+        for name, pid in (("policy", os.getpid()), ("arm", remote.pid)):
+            state = open(f"/proc/{pid}/status").read().split("VmHWM:")[1].split()
+            ticks = open(f"/proc/{pid}/stat").read().rpartition(")")[2].split()[11:13]
+            maps = open(f"/proc/{pid}/maps").read()
+            told[f"{name}_MB"], told[f"{name}_cpu_s"] = int(state[0]) / 1e3, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+            told[f"{name}_has"] = [each for each in ("jaxlib", "mujoco", "torch", "scipy") if f"/{each}/" in maps]
+        told["wall_s"] = time.monotonic() - begun
+    return out
+
+
+Remote.command = first
+deploy.main([policy, "--arm", "so101", *flags])
+told["imported"] = [name for name in ("jax", "mujoco", "torch", "brax", "scipy", "rich") if name in sys.modules]
+print(json.dumps(told))
 """
 
 
-def test_a_robots_computer_needs_little(policy, told, tmp_path):
-    """Neither JAX nor MuJoCo is imported for a real arm, and the policy's process stays small."""
-    from mjx_nero.deploy.emulators import feetech
-
-    (tmp_path / "c.json").write_text(json.dumps(feetech.calibration(told, "so101")))
-    argv = [sys.executable, "-c", PROBE, str(policy), str(tmp_path / "c.json")]
-    lines = subprocess.run(argv, capture_output=True, text=True, timeout=60).stdout.splitlines()
-    assert "cannot open /dev/nothing" in "\n".join(lines)
-    assert lines[-2] == "[]" and int(lines[-1]) < 200_000  # kB
+def test_a_robots_computer_needs_little(lift, policy, told):
+    """Until the first target: neither JAX nor MuJoCo, less than 200 MB and two seconds of a core in both processes."""
+    with emulators.started("so101", {"model": str(lift / "scene.mjb")}, told) as arm:
+        flags = ["--port", arm["port"], "--calibration", arm["calibration"], "--object", "0.2,0,0.015", "--seconds", "0.1"]
+        run = subprocess.run([sys.executable, "-c", PROBE, str(policy), *flags], capture_output=True, text=True, timeout=120)
+    found = json.loads(run.stdout.splitlines()[-1])
+    print(found)
+    assert found["imported"] == found["policy_has"] == found["arm_has"] == []
+    assert found["policy_MB"] + found["arm_MB"] < 200
+    assert found["policy_cpu_s"] + found["arm_cpu_s"] < 2

@@ -7,7 +7,7 @@ from mjx_nero.tools.deploy import trial
 
 
 def test_episodes_succeed(lift, lift_cfg):
-    share, ended = trial.lifts(lift / "policy.onnx", lift_cfg, "so101", 2, Faults(late=0.04))
+    share, ended = trial.lifts(lift / "policy.onnx", lift_cfg, "so101", 2, Faults(late=0.04), delay=0.04)
     assert share == 1.0 and not ended
 
 

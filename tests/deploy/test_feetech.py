@@ -13,6 +13,7 @@ from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.drivers import feetech, so_arm
 from mjx_nero.deploy.emulators import feetech as emulated
 from mjx_nero.deploy.emulators import timeless
+from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.guard import Guard
 from mjx_nero.errors import UserError
@@ -75,7 +76,7 @@ class Bench(arms.Bench):
         self.plant = Plant(lift / "scene.mjb", joints, np.array(told["joints"]["home"]), clock)
         self.servos = emulated.servos_of(told, kind, entries, self.plant)
         self.servos.faults.turnaround = 0.0
-        self.port = emulated.Port(self.servos)
+        self.port = emulated.Port(self.servos, Line(terminal=True))
         self.arm = so_arm.of(kind, told, clock, self.port.name, str(self.calibration))
         self.guard = Guard(self.arm, setup.safety_of(told), clock)
         self.told, self.clock, self.asked, self._heard = told, clock, 0, 0

@@ -1,10 +1,13 @@
 """The loop in a simulated arm's own time: success, timing, stops; and the way home."""
 
+import contextlib
+import os
+
 import arms
 import numpy as np
 import pytest
 
-from mjx_nero.deploy import places, setup
+from mjx_nero.deploy import guard, places, setup
 from mjx_nero.deploy.drivers.sim import SimArm
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.executor import Lag
@@ -97,9 +100,9 @@ def test_late_cycles_are_reported_and_end_it(lift):
     act, late = world.brain.act, {10: 0.03, 20: 0.05, **dict.fromkeys(range(40, 60), 0.021)}
     count = iter(range(1000))
 
-    def slow(seen):
+    def slow(*seen):
         world.clock.time += late.get(next(count), 0.0)
-        return act(seen)
+        return act(*seen)
 
     world.brain.act = slow
     report = world.run()
@@ -111,7 +114,7 @@ def test_late_cycles_are_reported_and_end_it(lift):
 def test_a_policy_that_is_not_finite_holds(lift, broken):
     world = World(lift)
     act, count = world.brain.act, iter(range(1000))
-    world.brain.act = lambda seen: act(seen) * (broken if next(count) == 50 else 1.0)
+    world.brain.act = lambda *seen: act(*seen) * (broken if next(count) == 50 else 1.0)
     report = world.run()
     assert report.fault.kind == "nan" and len(report.timing.jitter) == 51
 
@@ -173,3 +176,14 @@ def test_a_dry_run_tells_the_arm_nothing(lift):
     assert report.fault.text == "its time is over" and not sent and len(said) >= 100
     assert (world.plant.data.ctrl == before).all()
     assert said[0] != said[-1] and said[0].startswith("shoulder_pan ")
+
+
+def test_the_hurry_ends_with_the_run():
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    with guard.urgent():
+        hurries = os.sched_getscheduler(0) == os.SCHED_RR
+    assert (os.sched_getscheduler(0), os.sched_getparam(0)) == before
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))  # this system lets it
+        os.sched_setscheduler(0, *before)
+        assert hurries

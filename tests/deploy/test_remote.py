@@ -26,7 +26,8 @@ import numpy as np
 from mjx_nero.deploy.guard import urgent
 from mjx_nero.deploy.remote import Remote
 from mjx_nero.deploy.server import Spec
-urgent()  # as the command does
+stay = urgent()
+stay.__enter__()  # as the command does
 remote = Remote(Spec(**json.loads(sys.argv[1])))
 remote.ready()
 at = remote.start(actions=0).position

@@ -130,9 +130,13 @@ class Agilex:
         interface, colon, channel = self._port.partition(":")
         if not colon or not channel:
             raise UserError(f"--port of a {self._model.name} is INTERFACE:CHANNEL, as in socketcan:can0, got {self._port!r}")
-        options: dict[str, Any] = {"sleep_after_open": _OPENING} if interface == "slcan" else {}
         try:
-            self._bus = can.Bus(interface=interface, channel=channel, bitrate=BITRATE, **options)
+            if interface == "slcan":
+                from mjx_nero.deploy.drivers.slcan import Slcan
+
+                self._bus: can.BusABC = Slcan(channel, bitrate=BITRATE, sleep_after_open=_OPENING, timeout=0)
+            else:
+                self._bus = can.Bus(interface=interface, channel=channel, bitrate=BITRATE)
         except (can.CanError, OSError, ValueError, TypeError) as error:
             raise UserError(f"cannot open {self._port}: {error}") from None
         self._error = can.CanError

@@ -1,12 +1,13 @@
-"""DENSO's b-CAP: packets over TCP, and a client.
+"""DENSO's b-CAP: packets over TCP or UDP, and a client.
 
 As in DENSORobot/orin_bcap (``Python/bCAPClient``, ``C/include/bcap_funcid.h``). All numbers are little-endian. A packet is
 
-    0x01, u32 length of it all, u16 serial, u16 of zeros, i32 function or result, u16 count of arguments,
+    0x01, u32 length of it all, u16 serial, u16, i32 function or result, u16 count of arguments,
     u32 length and VARIANT of each argument, 0x04
 
-and a VARIANT is u16 type, u32 count, then so many values; text is its length in bytes and UTF-16. Over a serial line two bytes of
-CRC stand before the last one; over TCP, which checks by itself, there are none.
+and a VARIANT is u16 type, u32 count, then so many values; text is its length in bytes and UTF-16. Over TCP the second
+u16 is zero; over UDP it is the serial of a request's first try, by which the controller knows a repeated one. (Over a serial line
+two bytes of CRC stand before the last one.)
 """
 
 import socket
@@ -20,6 +21,7 @@ PORT = 5007
 SERVICE_START, SERVICE_STOP, CONNECT, DISCONNECT, GET_ROBOT, ROBOT_NAMES, EXECUTE, RELEASE = 1, 2, 3, 4, 7, 13, 64, 84
 EXECUTING = 0x900  # the answer is still to come
 LONGEST = 1 << 16  # bytes of a packet
+_TRIES = 3  # of a datagram
 EMPTY, I2, I4, R4, R8, TEXT, BOOL, VARIANT, UI1, UI4, ARRAY = 0, 2, 3, 4, 5, 8, 11, 12, 17, 19, 0x2000
 _FORMATS = {I2: "h", I4: "i", R4: "f", R8: "d", BOOL: "h", UI1: "B", UI4: "I", 10: "i", 18: "H", 20: "q", 21: "Q"}
 _HEAD = struct.Struct("<BIHHiH")
@@ -96,11 +98,11 @@ def _unpack(form: str, data: bytes) -> tuple[Any, ...]:
         raise Damaged("too short") from None
 
 
-def packet(serial: int, function: int, arguments: Sequence[Any]) -> bytes:
-    """A request, or, with a result in place of the function, an answer."""
+def packet(serial: int, function: int, arguments: Sequence[Any], first: int = 0) -> bytes:
+    """A request, or, with a result in place of the function, an answer. ``first``: serial of a datagram's first try."""
     values = [encode(value) for value in arguments]
     body = b"".join(struct.pack("<I", len(value)) + value for value in values)
-    return _HEAD.pack(1, _HEAD.size + len(body) + 1, serial, 0, function, len(values)) + body + b"\x04"
+    return _HEAD.pack(1, _HEAD.size + len(body) + 1, serial, first, function, len(values)) + body + b"\x04"
 
 
 def parse(data: bytes) -> tuple[int, int, list[Any]]:
@@ -153,16 +155,21 @@ class Client:
     """A connection to a controller.
 
     Args:
-        patience: for an answer [s].
+        patience: for an answer [s]; it may be changed.
+        udp: by datagrams, where a request that nobody answers is sent again, three times in all.
 
     Raises:
         OSError: nobody is there.
     """
 
-    def __init__(self, host: str, port: int, patience: float):
-        self._channel = socket.create_connection((host, port), timeout=patience)
-        self._channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._serial = 0
+    def __init__(self, host: str, port: int, patience: float, udp: bool = False):
+        self.patience, self._udp, self._serial = patience, udp, 0
+        if udp:
+            self._channel = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._channel.connect((host, port))
+        else:
+            self._channel = socket.create_connection((host, port), timeout=patience)
+            self._channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def __call__(self, function: int, *arguments: Any) -> Any:
         """Calls a function and returns what it gives.
@@ -170,15 +177,15 @@ class Client:
         Raises:
             ArmError: the controller refuses, or does not answer.
         """
-        self._serial = self._serial % 0xFFFF + 1
+        first = self._serial % 0xFFFF + 1
         try:
-            self._channel.sendall(packet(self._serial, function, arguments))
-            while True:
-                if not (data := receive(self._channel)):
-                    raise ArmError("the controller has closed the connection")
-                serial, result, values = parse(data)
-                if serial == self._serial and result != EXECUTING:
+            for left in reversed(range(_TRIES if self._udp else 1)):
+                try:
+                    result, values = self._ask(function, arguments, first if self._udp else 0)
                     break
+                except TimeoutError:
+                    if not left:
+                        raise
         except Damaged as error:
             raise ArmError(f"the controller's answer is damaged: {error}") from None
         except OSError as error:
@@ -187,6 +194,18 @@ class Client:
             code = result & 0xFFFFFFFF
             raise ArmError(f"the controller reports {ERRORS.get(code, 'an error')} (0x{code:08X})")
         return values[0] if values else None
+
+    def _ask(self, function: int, arguments: Sequence[Any], first: int) -> tuple[int, list[Any]]:
+        """One try: the result and its values."""
+        self._serial = self._serial % 0xFFFF + 1
+        self._channel.settimeout(self.patience)
+        self._channel.sendall(packet(self._serial, function, arguments, first))
+        while True:
+            if not (data := self._channel.recv(LONGEST) if self._udp else receive(self._channel)):
+                raise ArmError("the controller has closed the connection")
+            serial, result, values = parse(data)
+            if serial == self._serial and result != EXECUTING:
+                return result, values
 
     def close(self) -> None:
         """Ends the connection."""

@@ -23,6 +23,7 @@ ANGLES, SLAVE, NORMAL = 0x0002, 0x0202, 0
 _SMOOTH = 3  # cycles
 _PATIENCE = 0.5  # [s] for an answer
 _AXES = 8  # that a target has
+_UDP = "udp:"
 _JOINTS = 6
 
 
@@ -30,13 +31,13 @@ class Cobotta:
     """The arm, and its RG6.
 
     Args:
-        host: ``HOST`` or ``HOST:PORT`` of the controller.
+        host: ``HOST`` or ``HOST:PORT`` of the controller, with ``udp:`` before it where it is to be spoken to by datagrams.
         gripper: None: there is none to talk to, and it seems to be where it is told.
     """
 
     def __init__(self, metadata: Mapping[str, Any], host: str, gripper: rg6.Rg6 | None, clock: Clock):
         self.joints = tuple(metadata["joints"]["names"])
-        self._address, (self._host, _, port) = host, host.partition(":")
+        self._address, (self._host, _, port) = host, host.removeprefix(_UDP).partition(":")
         self._port, self._clock, self._gripper = int(port or bcap.PORT), clock, gripper
         self._dt = float(metadata["control_dt"])
         self._lock, self.turning = threading.Lock(), Turning(self.cycle)  # the controller sets the pace
@@ -50,7 +51,7 @@ class Cobotta:
     def connect(self) -> None:
         """See ``Arm``."""
         try:
-            self._call = bcap.Client(self._host, self._port, _PATIENCE)
+            self._call = bcap.Client(self._host, self._port, _PATIENCE, self._address.startswith(_UDP))
         except OSError as error:
             raise UserError(f"no controller answers at {self._address}: {error}") from None
         try:
@@ -96,6 +97,8 @@ class Cobotta:
         self._sent = collections.deque([here] * _SMOOTH, maxlen=_SMOOTH)
         self._do("slvChangeMode", SLAVE)
         self._engaged = True
+        if self._address.startswith(_UDP):
+            self._call.patience = 2 * CYCLE
         if self._gripper:
             self._gripper.engage()
         self.turning.start()
@@ -145,6 +148,7 @@ class Cobotta:
             if self._engaged:
                 for _ in range(_SMOOTH):
                     self.cycle()
+                self._call.patience = _PATIENCE
                 self._do("slvChangeMode", NORMAL)
         except ArmError:
             pass  # it has left by itself
@@ -161,7 +165,7 @@ def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, gripper: str
     """
     assert port
     for flag, address in (("--port", port), ("--gripper", gripper)):
-        host, colon, number = (address or "x").partition(":")
+        host, colon, number = (address or "x").removeprefix(_UDP if flag == "--port" else "").partition(":")
         if not host or (colon and not (number.isdecimal() and int(number) < 65536)):
-            raise UserError(f"{flag} of a Cobotta is HOST or HOST:PORT, got {address!r}")
+            raise UserError(f"{flag} of a Cobotta is HOST or HOST:PORT{' (or udp:HOST)' * (flag == '--port')}, got {address!r}")
     return Cobotta(metadata, port, rg6.Rg6(gripper) if gripper else None, clock)

@@ -106,7 +106,7 @@ class SoArm:
         import serial  # pyserial, of the extra ``deploy``
 
         try:
-            port = serial.Serial(self._port, feetech.BAUD, timeout=_WAIT, write_timeout=_WAIT, exclusive=True)
+            port = serial.serial_for_url(self._port, feetech.BAUD, timeout=_WAIT, write_timeout=_WAIT, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise UserError(f"cannot open {self._port}: {error}") from None
         self._bus = feetech.Bus(port)

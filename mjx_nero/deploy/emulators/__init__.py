@@ -68,8 +68,8 @@ def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
     plant = Plant(pathlib.Path(told["model"]), own["names"], start, WallClock(), metadata["base"]["position"], tracker)
     plant.faults = dataclasses.replace(plant.faults, **told.get("faults", {}))
     plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
-    urgent()
     port = port_of(plant, told)
     gripper = getattr(port, "gripper", None)
     print(json.dumps({"port": port.name, **({"gripper": gripper} if gripper else {})}), flush=True)
-    port.serve(other=sys.stdin.fileno())
+    with urgent():
+        port.serve(other=sys.stdin.fileno())

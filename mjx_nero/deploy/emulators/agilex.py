@@ -1,24 +1,21 @@
-"""A Piper or Nero in software, behind a serial CAN adapter (SLCAN) in a pseudo-terminal: its frames, 200 times a second.
+"""A Piper or Nero in software, behind a serial CAN adapter (SLCAN): its frames, 200 times a second.
 
     python -m mjx_nero.deploy.emulators.agilex '{"model": "scene.mjb", ...}'
 
 prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted: ``torque_cuts``.
 """
 
-import contextlib
 import dataclasses
-import os
-import select
 import struct
-import time
-import tty
 from collections.abc import Callable
 
 import numpy as np
 
 from mjx_nero.deploy.drivers import agilex
+from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 
+_BRAKES = 1e4  # [N m s/rad]: without power it lies on something
 PERIOD = 0.005  # [s] between feedbacks
 _WAY, _STEPS = 0.02, 8  # [s] to a new target; steps on the way
 
@@ -48,7 +45,7 @@ class Arm:
     def __init__(self, plant: Plant, model: agilex.Model):
         self.plant, self.faults, self.torque_cuts, self._model = plant, BusFaults(), 0, model
         self._goal, self._told = plant.position(), plant.position()
-        plant.powered[:] = False
+        plant.powered[:], plant.gears = False, _BRAKES
         plant.stiffen()
 
     def take(self, frame: int, data: bytes) -> None:
@@ -130,35 +127,13 @@ class Port:
         name: as ``--port`` takes it.
     """
 
-    def __init__(self, arm: Arm):
-        self.arm = arm
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.name, self._bytes, self._left, self._open = f"slcan:{os.ttyname(self._slave)}", b"", b"", False
+    def __init__(self, arm: Arm, line: Line):
+        self.arm, self.name, self._line = arm, f"slcan:{line.name}", line
+        self.close, self._bytes, self._left, self._open = line.close, b"", b"", False
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Sends and takes frames until somebody says so, or until a file descriptor ends."""
-        due = time.monotonic()
-        while not until():
-            watched = [self._master, *([] if other is None else [other])]
-            ready, _, _ = select.select(watched, [], [], max(0.0, due - time.monotonic()))
-            if other in ready and not os.read(other or 0, 1000):
-                return
-            if self._master in ready:
-                self.take()
-            if time.monotonic() >= due:
-                due = max(due + PERIOD, time.monotonic())
-                self.say()
-
-    def take(self) -> None:
-        """Takes what has arrived."""
-        with contextlib.suppress(BlockingIOError):
-            self._take(os.read(self._master, 4096))
-
-    def say(self) -> None:
-        """One round of feedback."""
-        self._say(self.arm.frames())
+        self._line.serve(lambda: self._take(self._line.read()), self._say, PERIOD, until, other)
 
     def _take(self, data: bytes) -> None:
         *lines, self._bytes = (self._bytes + data).split(b"\r")
@@ -172,24 +147,19 @@ class Port:
                 except ValueError:
                     continue
 
-    def _say(self, frames: list[tuple[int, bytes]]) -> None:
-        """Sends frames; where nobody reads, they are lost, as on a bus, but none in its middle."""
+    def _say(self) -> None:
+        """One round of feedback; where nobody reads, frames are lost, as on a bus, but none in its middle."""
+        frames = self.arm.frames()
         if self._open and not self._left:
             self._left = "".join(f"t{frame:03X}{len(data)}{data.hex().upper()}\r" for frame, data in frames).encode()
-        with contextlib.suppress(BlockingIOError):
-            self._left = self._left[os.write(self._master, self._left) if self._left else 0 :]
-
-    def close(self) -> None:
-        """Unplugs it."""
-        for end in (self._master, self._slave):
-            os.close(end)
+        self._left = self._left[self._line.write(self._left) :]
 
 
 def main() -> None:
     """The process."""
     from mjx_nero.deploy.emulators import process
 
-    process(lambda plant, told: Port(Arm(plant, agilex.MODELS[told["kind"]])))
+    process(lambda plant, told: Port(Arm(plant, agilex.MODELS[told["kind"]]), Line()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A Cobotta Pro's controller and its RG6 in software: b-CAP and Modbus over TCP.
+"""A Cobotta Pro's controller and its RG6 in software: b-CAP over TCP and UDP, and Modbus over TCP.
 
     python -m mjx_nero.deploy.emulators.bcap '{"model": "scene.mjb", ...}'
 
@@ -25,6 +25,7 @@ from mjx_nero.deploy.emulators.plant import Plant
 _BUFFER, _LATE = 3, 4  # cycles: targets that wait; how late the next one may be
 _FAIL, _TOO_LATE = 0x80004005 - (1 << 32), 0x84201482 - (1 << 32)
 _ARM = 6
+_GRIPS = 0.1  # [m/s]: the RG6 opens and closes at 51 to 160 mm/s, by its data sheet
 _FASTEST = 3.0  # times the model's speed, from one target to the next
 
 
@@ -36,6 +37,7 @@ class BusFaults:
         cut: nobody answers.
         corrupt: answers lose their last byte.
         closed: connections are closed at the next request.
+        lost: every so many a datagram's answer is lost; 0: none.
         error: result of every slvMove; 0: none.
         tripped: a safety switch of the gripper is.
     """
@@ -43,6 +45,7 @@ class BusFaults:
     cut: bool = False
     corrupt: bool = False
     closed: bool = False
+    lost: int = 0
     error: int = 0
     tripped: bool = False
 
@@ -58,7 +61,8 @@ class Controller:
     def __init__(self, plant: Plant, speed: np.ndarray, wait: bool = True):
         self.plant, self.faults, self.torque_cuts, self.slave = plant, BusFaults(), 0, False
         self._speed, self._wait, self._goal = speed, wait, plant.position()
-        self._turn = self._grip_to = 0.0
+        self._turn = self._before = 0.0
+        self._width = self._grip_to = rg6.width(float(self._goal[_ARM]))
         plant.powered[:_ARM] = False
         plant.gears = 1e5  # brakes
         plant.model.opt.timestep = cobotta.CYCLE / 2  # answers that come so often must not show the steps of physics
@@ -82,8 +86,20 @@ class Controller:
             return self._execute(values[1], values[2])
         return (0, None) if function in (bcap.SERVICE_START, bcap.SERVICE_STOP, bcap.DISCONNECT, bcap.RELEASE) else (_FAIL, None)
 
-    def _execute(self, command: str, argument: Any) -> tuple[int, Any]:
+    def _advance(self) -> None:
+        """Catches up with the clock; the gripper goes to its width at its own speed."""
+        now, left = self.plant.time, self._grip_to - self._width
+        if left:
+            most = _GRIPS * max(now - self._before, 0.0)
+            self._width += min(max(left, -most), most)
+            angle = rg6.angle(self._width)
+            self._goal[_ARM:] = angle, -angle
+            self.plant.target(self._goal)
+        self._before = now
         self.plant.advance()
+
+    def _execute(self, command: str, argument: Any) -> tuple[int, Any]:
+        self._advance()
         if command == "HighCurJntEx":
             return 0, [0.0, *self._degrees()]
         if command == "Motor":
@@ -118,24 +134,21 @@ class Controller:
         self.plant.target(self._goal, self._turn - now)
         if self._wait and (early := self._turn - now - _BUFFER * cycle) > 0:
             time.sleep(early)
-        self.plant.advance()
+        self._advance()
         return 0, self._degrees()
 
     def grip(self, request: bytes) -> bytes:
         """The gripper's answer to a Modbus request; of functions 3 and 16."""
-        self.plant.advance()
+        self._advance()
         head, (unit, function, first, count) = request[:4], struct.unpack(">BBHH", request[6:12])
         here = rg6.width(float(self.plant.position()[_ARM]))
         if function == 16 and first == rg6.FORCE and count == 3:
             _, width, control = struct.unpack(">HHH", request[13:19])
             if control == rg6.GRIP:
                 self._grip_to = width * 1e-4
-                angle = rg6.angle(self._grip_to)
-                self._goal[_ARM:] = angle, -angle
-                self.plant.target(self._goal)
             body = struct.pack(">BBHH", unit, function, first, count)
         elif function == 3 and first == rg6.WIDTH and count <= 2:
-            busy = bool(abs(self.plant.velocity()[_ARM]) > 0.02)
+            busy = self._width != self._grip_to or bool(abs(self.plant.velocity()[_ARM]) > 0.02)
             status = busy * rg6.BUSY | self.faults.tripped * 8
             body = struct.pack(">BBB", unit, function, 2 * count)
             body += struct.pack(">HH", max(0, round(here * 1e4)), status)[: 2 * count]
@@ -156,11 +169,14 @@ class Port:
         self._arm, self._hand = (socket.create_server(("127.0.0.1", 0)) for _ in range(2))
         self.name, self.gripper = (f"127.0.0.1:{door.getsockname()[1]}" for door in (self._arm, self._hand))
         self._guests: dict[socket.socket, bool] = {}
+        self._post = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._post.bind(self._arm.getsockname())
+        self._before, self._count = (0, b""), 0
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Answers until somebody says so, or until a file descriptor ends."""
         while not until():
-            watched: list[Any] = [self._arm, self._hand, *self._guests, *([] if other is None else [other])]
+            watched: list[Any] = [self._arm, self._hand, self._post, *self._guests, *([] if other is None else [other])]
             ready, _, _ = select.select(watched, [], [], 0.02)
             if other in ready and not os.read(other or 0, 1000):
                 return
@@ -169,8 +185,22 @@ class Port:
                 guest.settimeout(0.5)
                 guest.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._guests[guest] = door is self._arm
+            if self._post in ready:
+                self._reply()
             for guest in set(self._guests) & set(ready):
                 self._serve(guest)
+
+    def _reply(self) -> None:
+        """Answers a datagram; one that is repeated as it was answered before."""
+        with contextlib.suppress(OSError, struct.error):
+            data, sender = self._post.recvfrom(bcap.LONGEST)
+            faults, (serial, first) = self.controller.faults, struct.unpack_from("<HH", data, 5)
+            if first != self._before[0]:
+                self._before = first, self.controller.answer(data)
+            self._count += 1
+            if not faults.cut and not (faults.lost and self._count % faults.lost == 0):
+                answer = self._before[1]
+                self._post.sendto(answer[:5] + struct.pack("<H", serial) + answer[7:], sender)
 
     def _serve(self, guest: socket.socket) -> None:
         faults, arm = self.controller.faults, self._guests[guest]
@@ -185,7 +215,7 @@ class Port:
 
     def close(self) -> None:
         """Closes all."""
-        for each in (self._arm, self._hand, *self._guests):
+        for each in (self._arm, self._hand, self._post, *self._guests):
             each.close()
 
 

@@ -1,4 +1,4 @@
-"""STS3215 servos in software, behind a pseudo-terminal: registers, EEPROM and RAM, answers at the pace of the real bus.
+"""STS3215 servos in software, behind a serial line: registers, EEPROM and RAM, answers at the pace of the real bus.
 
     python -m mjx_nero.deploy.emulators.feetech '{"model": "scene.mjb", ...}'
 
@@ -7,23 +7,22 @@ prints the port's name and serves until its input ends. What a runtime must not 
 
 import dataclasses
 import json
-import os
 import pathlib
 import random
-import select
 import time
-import tty
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mjx_nero.deploy.drivers import feetech
+from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 
 _EEPROM_END, _FACTORY = 40, 80
 _GEARS = 100.0  # [N m s/rad]: 1 to 345, so that an arm without power sinks slowly
 _BYTE = 1e-5  # [s] at 1 Mbaud
+_REFRESH = 0.02  # [s] between looks at the arm where nobody asks
 
 
 @dataclasses.dataclass
@@ -174,30 +173,19 @@ class Servos:
 
 
 class Port:
-    """A pseudo-terminal with servos at its other end.
+    """Servos at the other end of a line.
 
     Attributes:
         name: of the port to open.
     """
 
-    def __init__(self, servos: Servos):
-        self.servos = servos
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.name = os.ttyname(self._slave)
-        self._bytes = b""
+    def __init__(self, servos: Servos, line: Line):
+        self.servos, self.name, self._line, self._bytes = servos, line.name, line, b""
+        self.close = line.close
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
         """Answers until somebody says so, or until a file descriptor ends."""
-        while not until():
-            watched = [self._master, *([] if other is None else [other])]
-            ready, _, _ = select.select(watched, [], [], 0.02)
-            if other in ready and not os.read(other or 0, 1000):
-                return
-            if self._master in ready:
-                self._take(os.read(self._master, 4096))
-            else:
-                self.servos.refresh()
+        self._line.serve(lambda: self._take(self._line.read()), self.servos.refresh, _REFRESH, until, other)
 
     def _take(self, data: bytes) -> None:
         """Splits what came into packets."""
@@ -217,12 +205,7 @@ class Port:
             wait = faults.turnaround * max(1, out.count(b"\xff\xff")) + _BYTE * (len(request) + len(out))
             wait += faults.hiccup_s if random.random() < faults.hiccup else 0.0
             time.sleep(max(0.0, began + wait - time.monotonic()))
-            os.write(self._master, out)
-
-    def close(self) -> None:
-        """Unplugs the port."""
-        for end in (self._master, self._slave):
-            os.close(end)
+            self._line.write(out)
 
 
 def calibration(metadata: Mapping[str, Any], kind: str) -> dict[str, dict[str, int]]:
@@ -254,7 +237,7 @@ def main() -> None:
 
     def port(plant: Plant, told: Mapping[str, Any]) -> Port:
         entries = json.loads(pathlib.Path(told["calibration"]).read_text())
-        made = Port(servos_of(told["metadata"], told["kind"], entries, plant))
+        made = Port(servos_of(told["metadata"], told["kind"], entries, plant), Line())
         made.servos.faults = dataclasses.replace(made.servos.faults, **told.get("bus", {}))
         return made
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.arm import Arm
-from mjx_nero.deploy.drivers import agilex, feetech, so_arm
+from mjx_nero.deploy.drivers import agilex, feetech, sim, so_arm
 from mjx_nero.deploy.emulators import agilex as can
 from mjx_nero.deploy.emulators import feetech as serial
 from mjx_nero.deploy.emulators.plant import Plant
+from mjx_nero.deploy.executor import Lag
 from mjx_nero.deploy.places import Known, Place
 
 
@@ -60,15 +61,17 @@ class Wire:
 
 
 class Sees(Known):
-    """Places that the simulator has."""
+    """Places that the simulator has.
 
-    def __init__(self, plant: Plant):
-        super().__init__()
-        self._plant = plant
+    Attributes:
+        plant: the simulator; set it first.
+    """
+
+    plant: Plant
 
     def find(self, name: str, now: float) -> Place:
         """See ``Places``."""
-        return Place(self._plant.place(name), self._plant.data.qpos[self._plant.objects[name] :][3:7].copy())
+        return Place(self.plant.place(name), self.plant.data.qpos[self.plant.objects[name] :][3:7].copy())
 
 
 def _servos(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
@@ -82,7 +85,6 @@ def _servos(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, C
 def _frames(kind: str) -> Callable[[Mapping[str, Any], Plant, Clock], tuple[Arm, Callable[[], None]]]:
     def made(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
         port = can.CanPort(can.Arm(plant, agilex.MODELS[kind]), f"virtual:{id(plant)}")
-        plant.gears = 1e4  # it lies on something
         clock.ticks = [port.take, port.say]
         arm = agilex.of(kind, told, clock, port.name)
         arm.connect()
@@ -91,8 +93,11 @@ def _frames(kind: str) -> Callable[[Mapping[str, Any], Plant, Clock], tuple[Arm,
     return made
 
 
-LINES = {"so101": _servos, "piper": _frames("piper"), "nero": _frames("nero")}
-LATE = {"so101": 0.0, "piper": 0.02, "nero": 0.02}  # [s] until such an arm has got to a target
+def _drives(told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
+    return sim.SimArm(plant, tuple(told["joints"]["names"]), Lag.of(told).lead, clock), lambda: None
+
+
+LINES = {"sim": _drives, "so101": _servos, "piper": _frames("piper"), "nero": _frames("nero")}
 
 
 def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:

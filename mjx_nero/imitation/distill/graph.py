@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_nero.envs.task import EnvCfg
 from mjx_nero.imitation.distill import networks
 from mjx_nero.learn.policy import Policy
 
@@ -17,6 +18,19 @@ def pictures(meta: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], bool]]
     """Lists the inputs of a policy that sees: name -> ([height, width, channels], whether it is whole numbers to 255)."""
     sizes = meta["observation_size"].get(networks.SEEN, {}) if "student" in meta else {}
     return {f"picture_{name}": (tuple(size), size[-1] == 3) for name, size in sizes.items()}
+
+
+def cameras(meta: Mapping[str, Any], cfg: EnvCfg) -> dict[str, dict[str, Any]]:
+    """Says what gives each picture in training: place, field of view, size, steps a picture and delay; by the camera's name."""
+    lenses = [term.params for term in cfg.sensors.values() if "camera" in term.params]
+    out: dict[str, dict[str, Any]] = {}
+    for picture, (shape, _) in pictures(meta).items():
+        name = picture.removeprefix("picture_")
+        own, lens = cfg.scene.cameras[name], next((each for each in lenses if each["camera"] == name), {})
+        place = {"link": own.link, "position": list(own.pos), "quaternion": list(own.quat)}
+        late = {"every_steps": lens.get("every", 1), "delay_steps": list(lens.get("delay", (0, 0)))}
+        out[name] = {"input": picture, "shape": list(shape), "fovy_deg": own.fovy, **place, **late}
+    return out
 
 
 def build(policy: Policy, graph: Graph) -> None:

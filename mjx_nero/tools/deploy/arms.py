@@ -102,7 +102,7 @@ def safety_of(args: argparse.Namespace) -> Any:
 
 
 def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping[str, Any], log: pathlib.Path | None, note: str):
-    """Returns what the arm's process has to know, and the delay of its targets [s].
+    """Returns what the arm's process has to know, and the delay of its targets [s]; None: nobody has said it.
 
     Raises:
         UserError: a flag says something impossible.
@@ -115,7 +115,7 @@ def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping
     for low, high in pairs or ():
         if not low < high:
             raise UserError(f"--workspace takes ranges from low to high, got {low:g} to {high:g}")
-    delay, offsets = identified.read(args.identified, metadata) if args.identified else (0.0, [])
+    delay, offsets = identified.read(args.identified, metadata) if args.identified else (None, [])
     fence = {"table": args.table, "box": pairs, "apart": args.apart}
     kept = {name: metadata[name] for name in KEPT}
     dry, out = getattr(args, "dry_run", False), str(log.absolute()) if log else ""

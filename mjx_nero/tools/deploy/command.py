@@ -10,6 +10,7 @@ from mjx_nero import files
 from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
+from mjx_nero.deploy.pictures import summary
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import arms
@@ -53,6 +54,8 @@ def _parser() -> cli.Parser:
     add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")
     text = "where the object is: X,Y,Z, a JSON file of its place or of a camera, udp://HOST:PORT to listen at, or tcp://HOST:PORT"
     add("--object", metavar="PLACE", help=f"{text} (default: where the simulator has it)")
+    text = "JSON file that says which camera, video or folder each camera of a policy is that looks at pictures"
+    add("--cameras", type=cli.path(".json"), metavar="FILE", help=f"{text} (default: the simulator's)")
     add(
         "--goal",
         metavar="X,Y,Z",
@@ -60,7 +63,11 @@ def _parser() -> cli.Parser:
     )
     add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts (default: %(default)s)")
     text = "until a target is in force, s, as identify finds it: what the policy sees of its targets is then as late"
-    add("--delay", type=cli.number(Annotated[float, Bounds(0.0, 1.0)]), help=f"{text} (default: that of --identified, or 0)")
+    add(
+        "--delay",
+        type=cli.number(Annotated[float, Bounds(0.0, 1.0)]),
+        help=f"{text} (default: that of --identified, or found as it moves)",
+    )
     add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line of its joints")
     add("--dry-run", action="store_true", help="read the arm, and show what would be sent; nothing is")
     text = "in place of the policy, move one joint after another a little, ask what you saw, and write offsets and delay"
@@ -101,7 +108,7 @@ def _run(args: argparse.Namespace) -> bool:
     from mjx_nero.deploy.remote import Remote
     from mjx_nero.deploy.safety import Limits
     from mjx_nero.deploy.stop import operator
-    from mjx_nero.tools.deploy.world import places_and_options
+    from mjx_nero.tools.deploy.world import pictures_of, places_and_options
 
     brain = _brain(args)
     metadata = brain.metadata
@@ -109,7 +116,8 @@ def _run(args: argparse.Namespace) -> bool:
     limits = Limits.of(metadata, safety)
     with contextlib.ExitStack() as stack:
         places, options = stack.enter_context(places_and_options(args, metadata))
-        observer = Observer(metadata, setup.body_of(metadata), goal, places)
+        pictures = stack.enter_context(pictures_of(args, metadata, places))
+        observer = Observer(metadata, setup.body_of(metadata), goal, places, pictures)
         arms.warn(args)
         note = f"{metadata['env']} on {args.arm}{' (emulated)' if args.emulate else ''}, policy {args.policy.name}"
         spec, delay = arms.spec(args, metadata, options, args.log, note)
@@ -118,13 +126,13 @@ def _run(args: argparse.Namespace) -> bool:
         brain.warm()
         remote.ready()
         stop = stack.enter_context(operator(args.alive))
+        stack.enter_context(urgent())
         remote.start(anywhere=args.go_home, actions=brain.actions)
         if args.go_home:
             if fault := go_home(remote, limits, clock, stop):
                 print(f"the arm holds: {fault.text}")
                 return fault.kind != "stop"
             print("the arm is at home")
-        urgent()
         if args.check:
             from mjx_nero.tools.deploy.checking import checked
 
@@ -132,16 +140,19 @@ def _run(args: argparse.Namespace) -> bool:
         report = run(
             remote, brain, observer, clock, args.seconds, stop, safety.misses, delay if args.delay is None else args.delay
         )
-    _tell(args, report)
+    _tell(args, report, brain.lateness.steps * limits.dt, getattr(pictures, "ages", ()))
     return report.fault.kind != "stop"
 
 
-def _tell(args: argparse.Namespace, report: Any) -> None:
+def _tell(args: argparse.Namespace, report: Any, late: float, ages: Sequence[float]) -> None:
     """Prints how a run ended."""
     print(f"the arm holds: {report.fault.text}")
     print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
     print("timing: " + json.dumps(report.timing.summary()))
-    for cycle, late in report.timing.missed[:20]:
-        print(f"  cycle {cycle} was {1e3 * late:.1f} ms late")
+    if report.timing.missed:
+        print("missed: " + ", ".join(f"cycle {cycle} by {1e3 * over:.1f} ms" for cycle, over in report.timing.missed))
+    print(f"delay: the joints went where they were told {1e3 * late:.0f} ms later")
+    if len(ages):
+        print(f"pictures: {summary(ages)}")
     if args.log:
         print(f"log: {args.log}")

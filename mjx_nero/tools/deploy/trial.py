@@ -8,11 +8,12 @@ import numpy as np
 
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.emulators import timeless
+from mjx_nero.deploy.emulators.eyes import Eyes
 from mjx_nero.deploy.emulators.plant import Faults, Plant
 from mjx_nero.deploy.guard import Guard
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.loop import Brain, run
-from mjx_nero.deploy.observe import Observer
+from mjx_nero.deploy.observe import Observer, no_pictures
 from mjx_nero.deploy.safety import Fault
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.identify.excitation import sweeps
@@ -37,9 +38,9 @@ def lifts(
 
     Args:
         cfg: of the environment.
-        kind: of the arm: ``so101``, ``piper`` or ``nero``.
+        kind: of the arm: ``sim``, ``so101``, ``piper`` or ``nero``.
         faults: of its drives.
-        delay: of targets, that the runtime is told of [s]; None: what they are late by.
+        delay: of targets, that the runtime is told of [s]; None: nothing.
 
     Returns:
         share of the episodes that end with the cube within 2 cm of the goal, and the faults that ended others.
@@ -49,17 +50,20 @@ def lifts(
     home, region = timeless.home_of(told), np.array([told["command"][axis] for axis in "xyz"])
     event = next(term for term in cfg.events.values() if "x" in term.params)
     cubes, base = np.array([event.params[axis] for axis in "xy"]), told["base"]["position"]
-    model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
-    delay = faults.late + timeless.LATE[kind] if delay is None else delay
+    model, names = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False), told["joints"]["names"]
+    sees, pictures = timeless.Sees(), no_pictures
+    if brain.cameras:
+        shown = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=True)
+        pictures = Eyes(shown, told["cameras"], names, base, sees)
     for _ in range(episodes):
-        plant = Plant(model, told["joints"]["names"], home, clock, base)
+        plant = sees.plant = Plant(model, names, home, clock, base)
         cube, goal = rng.uniform(*cubes.T), rng.uniform(*region.T)
         plant.reset(home, {"cube": np.array([*cube, told["objects"]["cube"][2] / 2 - base[2]])})
         arm, unplug = timeless.engaged(kind, told, plant, clock)
         plant.faults = faults
         guard: Any = Guard(arm, setup.safety_of(told), clock)
         guard.start()
-        observer = Observer(told, setup.body_of(told), goal.tolist(), timeless.Sees(plant))
+        observer = Observer(told, setup.body_of(told), goal.tolist(), sees, pictures)
         report = run(guard, brain, observer, clock, cfg.episode_length_s, lambda: None, delay=delay)
         ended += [report.fault] if report.fault.kind != "stop" else []
         good += float(np.linalg.norm(plant.place("cube") - goal)) < _NEAR

@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mjx_nero.errors import UserError
 from mjx_nero.tools.deploy import arms
 
 
@@ -47,6 +48,38 @@ def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> It
         point = args.object if constant else None
         with arms.options_of(args, metadata, functools.partial(_world, args, metadata, point), told) as options:
             yield source, options
+
+
+@contextlib.contextmanager
+def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any) -> Iterator[Any]:
+    """What gives the policy's pictures, see ``observe.Pictures``; a policy that does not look at any gets none.
+
+    Raises:
+        UserError: nothing gives them, or no policy wants them.
+    """
+    from mjx_nero.deploy.observe import no_pictures
+
+    told = metadata.get("cameras") or {}
+    if not told:
+        if args.cameras:
+            raise UserError(f"--cameras is for policies that look at pictures: {args.policy} does not")
+        yield no_pictures
+        return
+    if args.cameras:
+        from mjx_nero.deploy import pictures
+
+        source: Any = pictures.Cameras(pictures.read(args.cameras, told), told, float(metadata["control_dt"]))
+    elif args.arm == "sim" or args.emulate:
+        from mjx_nero.deploy.emulators.eyes import Eyes
+        from mjx_nero.sim import scene
+
+        cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
+        model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=True)
+        source = Eyes(model, told, metadata["joints"]["names"], metadata["base"]["position"], places)
+    else:
+        raise UserError(f"the policy looks at pictures of {' and '.join(told)}: say with --cameras which cameras these are")
+    with contextlib.closing(source):
+        yield source
 
 
 def _is_point(text: str) -> bool:

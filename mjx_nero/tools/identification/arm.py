@@ -61,10 +61,10 @@ def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
         stack.callback(remote.close)
         remote.ready()
         stop = stack.enter_context(operator())
+        stack.enter_context(urgent())
         remote.start(anywhere=True)
         fault = go_home(remote, limits, clock, stop)
         if not fault:
-            urgent()
             print(f"the arm is where the movement begins: it takes {args.seconds:g} s")
             fault, limited = play(remote, targets, clock, stop)
             print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in limited.items()) or "never"))
