@@ -133,7 +133,8 @@ class PickUp:
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
         found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
-        q, qd = setpoint.follow(memory.q, memory.qd, jnp.where(phase == ABOVE, memory.above, found), self._speed, self.dt)
+        wanted_q = jnp.where(phase == ABOVE, memory.above, found)
+        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt)
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 

@@ -1,4 +1,4 @@
-"""How late an arm is, found while it moves: the delay after which its joints go where they were told to be."""
+"""The delay of an arm, found while it moves: after this time its joints are where they were told to be."""
 
 import collections
 

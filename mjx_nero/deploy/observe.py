@@ -15,7 +15,7 @@ Pictures = Callable[[Feedback, float], Mapping[str, np.ndarray]]
 
 
 def no_pictures(feedback: Feedback, now: float) -> Mapping[str, np.ndarray]:
-    """Of a policy that does not look at any."""
+    """The pictures of a policy that looks at none."""
     return {}
 
 

@@ -215,6 +215,6 @@ def _camera(found: Mapping[str, Any], told: Mapping[str, Any]) -> tuple[int | st
 
 
 def summary(ages: Sequence[float]) -> str:
-    """How old pictures were."""
+    """The age of pictures."""
     middle, late = (1e3 * float(np.percentile(ages, p)) for p in (50, 99))
     return f"{middle:.0f} ms old (median), {late:.0f} ms (99th percentile)"

@@ -95,15 +95,16 @@ class Gauge:
         value = view.readings[self.reading]
         offset = jnp.array(self.offset) * jax.random.uniform(k_offset, value.shape, minval=-1.0, maxval=1.0)
         factor = 1.0 + self.scale * jax.random.uniform(k_scale, value.shape, minval=-1.0, maxval=1.0)
-        return key, offset, factor, Delay(self.delay, self.hold).init(k_delay, value) if self.delay != (0, 0) else ()
+        late = delay(self.delay, self.hold)
+        return key, offset, factor, late.init(k_delay, value) if late else ()
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
         """Replaces the reading by what the sensor tells."""
         key, offset, factor, line = memory
         key, k_noise = jax.random.split(key)
         value = view.readings[self.reading]
-        if self.delay != (0, 0):
-            line, value = Delay(self.delay, self.hold).step(line, value)
+        if late := delay(self.delay, self.hold):
+            line, value = late.step(line, value)
         value = factor * value + offset
         value = value + jnp.array(self.noise) * jax.random.uniform(k_noise, value.shape, minval=-1.0, maxval=1.0)
         return (key, offset, factor, line), dataclasses.replace(view, readings={**view.readings, self.reading: value})

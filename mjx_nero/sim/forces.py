@@ -131,9 +131,9 @@ def _wrench(m: mujoco.MjModel, model: Any, data: Any, out: Any) -> Callable[[], 
         w = wp.tid()
         # Of the tree's centre of mass, in the world's axes: torque, then force.
         force = wp.spatial_bottom(inner[w, body])
-        torque = wp.spatial_top(inner[w, body]) - wp.cross(place[w, site] - middle[w, root], force)
+        torque = wp.spatial_top(inner[w, body]) - wp.cross(place[w, site] - middle[w, root], force)  # type: ignore[operator]
         axes = wp.transpose(turn[w, site])
-        force = axes @ force
+        force = axes @ force  # type: ignore[operator]
         torque = axes @ torque
         for i in range(3):
             out[w, i] = force[i]
@@ -186,11 +186,11 @@ def _press(m: mujoco.MjModel, model: Any, data: Any, out: Any) -> Callable[[], N
             k = pads[geom[i][side]]
             if k >= 0:
                 force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, True)
-                wp.atomic_add(net, world, k, wp.spatial_top(force) * float(2 * side - 1))
+                wp.atomic_add(net, world, k, wp.spatial_top(force) * float(2 * side - 1))  # type: ignore[operator]
 
     @wp.kernel(module="unique", enable_backward=False)
     def lengths(net: wp.array2d(dtype=wp.vec3), out: wp.array2d(dtype=float)):  # type: ignore
-        w, k = wp.tid()
+        w, k = wp.tid()  # type: ignore[misc]
         out[w, k] = wp.length(net[w, k])
 
     def measure():

@@ -33,7 +33,7 @@ class Line:
             self._end, self.name = self._door.fileno(), f"socket://127.0.0.1:{self._door.getsockname()[1]}"
 
     def read(self) -> bytes:
-        """What has come; empty where nothing has."""
+        """Returns what has come; empty where nothing has."""
         if self._door and not self._guest:
             self._guest, _ = self._door.accept()
             self._guest.setblocking(False)

@@ -98,7 +98,8 @@ class Task:
         lies = abs(1 - 2 * (site[1] ** 2 + site[2] ** 2)) < 0.5
         hand = _product(forward, _product(_turn((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0), self.robot.down))
         grip = _product(site * [1, -1, -1, -1], hand)
-        return dataclasses.replace(self.handle, grip=tuple(round(float(x), 6) + 0.0 for x in grip))
+        w, x, y, z = (round(float(part), 6) + 0.0 for part in grip)
+        return dataclasses.replace(self.handle, grip=(w, x, y, z))
 
     @functools.cached_property
     def scene(self) -> SceneCfg:
@@ -109,8 +110,9 @@ class Task:
         scene = scenes.around(
             self.robot, SceneCfg(objects={}, fixtures={self.file: FixtureCfg(self.file, (x, y, z))}, goal="none")
         )
+        look = np.round(wanted, 4)
         # From behind the robot's shoulder: it stands in front of the fixture.
-        return dataclasses.replace(scene, view_from=(-0.6, -0.72, 0.35), look_at=tuple(round(float(v), 4) for v in wanted))
+        return dataclasses.replace(scene, view_from=(-0.6, -0.72, 0.35), look_at=(float(look[0]), float(look[1]), float(look[2])))
 
     def controllers(self) -> dict[str, dict[str, Any]]:
         """Settings of the script that moves the handle."""

@@ -52,7 +52,7 @@ def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> It
 
 @contextlib.contextmanager
 def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any) -> Iterator[Any]:
-    """What gives the policy's pictures, see ``observe.Pictures``; a policy that does not look at any gets none.
+    """The source of the policy's pictures, see ``observe.Pictures``; a policy that does not look at any gets none.
 
     Raises:
         UserError: nothing gives them, or no policy wants them.
