@@ -1,4 +1,4 @@
-"""What is varied of what a policy sees: one property of the picture at a time, and all of the preset's look at once."""
+"""Sweeps of what a policy sees: one property of the picture at a time, and all of the preset's look at once."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ _AS_THEY_ARE = ("x", "y", "z")  # parameters that are places
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How the world looks.
+    """The look of the world.
 
     Attributes:
         terms: of the look.
@@ -30,7 +30,7 @@ class Look:
 
 
 def lenses(cfg: EnvCfg) -> dict[str, Term]:
-    """By name, the lenses of a task, of which each only delays, by as much as is said at the start."""
+    """The lenses of a task by name; each only delays, by as much as is said at the start."""
     plain = {name: term.made.camera for name, term in cfg.sensors.items() if isinstance(term.made, Lens)}
     cameras = plain or {f"lens_{camera}": camera for camera in cfg.scene.cameras}
     return {name: Term(images.Lens, params={"camera": camera, "delay": (0, LATEST)}) for name, camera in cameras.items()}

@@ -36,7 +36,7 @@ _Axis = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 
 
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
-    """What a gamepad holds: sticks to the right and down, the left one first, and which buttons are pressed."""
+    """The state of a gamepad: sticks to the right and down, the left one first, and which buttons are pressed."""
 
     axes: tuple[_Axis, _Axis, _Axis, _Axis]
     buttons: Annotated[list[bool], msgspec.Meta(max_length=32)]

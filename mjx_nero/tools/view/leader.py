@@ -127,7 +127,7 @@ class Way:
         self._from: tuple | None = None
 
     def begin(self) -> None:
-        """From where both hands are at the next step."""
+        """Starts from where both hands are at the next step."""
         self._hand.here()
         self._from = None
 
