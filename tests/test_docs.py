@@ -35,6 +35,7 @@ RUN = {
     "deploy_onnx.md": "tests/interop/test_onnx.py",
     "adding_an_arm.md": "tests/test_docs.py",
     "cameras.md": "tests/sim/test_cameras.py",
+    "fixtures.md": "tests/sim/test_fixtures.py",
     "objects.md": "tests/sim/test_objects.py",
 }
 

@@ -1,6 +1,8 @@
 """Fixtures: where they stand, what their joints do, the same on all backends; and files that are none."""
 
 import math
+import pathlib
+import re
 
 import jax
 import jax.numpy as jnp
@@ -205,3 +207,16 @@ def test_bad_files_get_a_line(tmp_path, text, message):
 def test_a_name_that_is_taken_is_refused(name):
     with pytest.raises(UserError, match="needs another name"):
         scene.build(ROBOT, SceneCfg(objects={}, fixtures={name: FixtureCfg("knob")}), CFG, visuals=False)
+
+
+def test_the_guides_scenes():
+    """The Python of docs/guides/fixtures.md: a cabinet in another task, and a wrist that feels."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / "guides" / "fixtures.md"
+    cabinet, wrist = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    names: dict = {}
+    exec(cabinet, names)
+    state = names["env"].reset(jax.random.PRNGKey(0))
+    assert set(names["env"].view(state).fixtures) == {"box"}
+    exec(wrist, names)
+    felt = names["env"].named_observations(names["env"].reset(jax.random.PRNGKey(0)))["state"]["wrist"]
+    assert felt.shape == (6,) and jnp.isfinite(felt).all()

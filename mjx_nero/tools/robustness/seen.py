@@ -1,4 +1,4 @@
-"""Variations of what a policy sees: one property of the picture at a time, and all of the preset's look at once."""
+"""Sweeps of what a policy sees: one property of the picture at a time, and all of the preset's look at once."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -228,7 +228,7 @@ def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
 
 
 def _played(demos: pathlib.Path) -> dict[str, Any]:
-    """The environment and preset of a data set."""
+    """The environment and the preset of a data set."""
     about = open_dataset(demos).schema.about
     return {"env_name": about["env"], "preset": about["preset"]}
 

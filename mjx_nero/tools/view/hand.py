@@ -170,7 +170,7 @@ class Recording:
         return len(self._steps)
 
     def tape(self) -> Iterator[Frame]:
-        """The recorded episodes, to be shown."""
+        """Frames of what was recorded."""
         goals = [np.concatenate([one.scenery.goal_pos_w, one.scenery.goal_quat_w]) for _, one in self._steps]
         return tape.frames(self._session.frame, [qpos.astype(float) for qpos, _ in self._steps], np.array(goals))
 

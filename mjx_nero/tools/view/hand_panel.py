@@ -99,7 +99,7 @@ class HandPanel:
 
     @property
     def _of_corrections(self) -> Recording | None:
-        """The recording of what the user corrects, and of nothing else."""
+        """The recorder, if it takes what the user mends and nothing else."""
         return self._recording if self._recording is not None and self._when.value == WHEN[1] else None
 
     def _grip(self) -> None:

@@ -48,6 +48,6 @@ def of_dataset(path: pathlib.Path, index: int, frame: Frame) -> Iterator[Frame]:
 
 
 def goal(schema: Schema) -> list[int]:
-    """The place of the goal's pose in ``episode.ENVIRONMENT``."""
+    """Numbers of the goal's pose in ``episode.ENVIRONMENT``."""
     known = schema.features[names.ENVIRONMENT].names
     return [known.index(f"goal.{axis}") for axis in _POSE]
