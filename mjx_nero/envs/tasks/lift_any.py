@@ -10,8 +10,9 @@ from typing import Any
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, arm_state, velocity_actions
-from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.envs.tasks import lift
+from mjx_nero.mdp import commands, events, metrics, observations, success, terminations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp, objects
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.objects import events as thing_events
@@ -86,16 +87,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
             ),
             "reset_object_shape": Term(thing_events.at_rest, params={"files": files, **one}),
         },
-        rewards={
-            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **one}),
-            "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
-            "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
-            "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
-            "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
-            "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
-            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
-            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
-        },
+        rewards=lift.carrying(held, **one),
         curriculum=CurriculumCfg(expert_starts=0.5),
         training=CALM,
         budget=Budget(steps=250_000_000),
