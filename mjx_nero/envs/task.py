@@ -8,7 +8,7 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, curriculum, observations, success
+from mjx_nero.mdp import actions, curriculum, observations, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -47,6 +47,25 @@ def step_weights(num_steps: int, **to: float) -> dict[str, Term]:
     return {name: Term(curriculum.step_weight, params={"to": weight, "num_steps": num_steps}) for name, weight in to.items()}
 
 
+def nearer(name: str, func: Callable, **params: Any) -> dict[str, RewardTerm]:
+    """Lists three rewards of one distance, the nearer the steeper: over 0.3, 0.1 and 0.03 m.
+
+    Args:
+        func: a term that takes ``std``, and ``params``.
+    """
+    scales = {name: (10.0, 0.3), f"{name}_near": (10.0, 0.1), f"{name}_fine": (15.0, 0.03)}
+    return {each: RewardTerm(func, weight=weight, params={"std": std, **params}) for each, (weight, std) in scales.items()}
+
+
+def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:
+    """Lists the ends of an episode: its time is over, or the object has left the table."""
+    table = {"center": scene.table_center, "size": scene.table_size, **object}
+    return {
+        "time_out": DoneTerm(terminations.time_out, time_out=True),
+        "object_off_table": DoneTerm(terminations.object_off_table, params=table),
+    }
+
+
 # Learner settings. Quiet: noise of at most half an action. Calm, for velocities: changing the action costs, too.
 QUIET = {"network.init_std": 0.5, "max_std": 0.5}
 CALM = {**QUIET, "change_cost": 0.03}
@@ -80,6 +99,12 @@ class SuccessCfg:
     distance: Term = Term(success.object_distance)
     hold_s: NonNegative = 0.5
     follows: bool = False
+
+
+def object_at_goal(**object: str) -> SuccessCfg:
+    """Success of carrying: the object is within 2 cm of the goal."""
+    condition = Term(success.object_at_goal, params={"threshold": 0.02, **object})
+    return SuccessCfg(condition=condition, distance=Term(success.object_distance, params=object))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,12 +19,6 @@ def env():
     return make("nero_open_drawer", impl="native", num_envs=8)
 
 
-@pytest.fixture(scope="module")
-def functions(env):
-    """``reset`` and ``finish``, compiled once."""
-    return jax.jit(env.reset), jax.jit(env.finish)
-
-
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("robot", ["nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101"])
 def test_every_arm_has_the_handle_in_front_of_it(task, robot):

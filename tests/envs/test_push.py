@@ -19,12 +19,6 @@ def env():
     return make("nero_push", impl="native", num_envs=8)
 
 
-@pytest.fixture(scope="module")
-def functions(env):
-    """``reset`` and ``finish``, compiled once."""
-    return jax.jit(env.reset), jax.jit(env.finish)
-
-
 def placed(env, state, off=(0.0, 0.0, 0.0), degrees=0.0):
     """The state with the box at its goal but for an offset and a turn."""
     shown, at = env.scenery(state), env.physics_model.joint("box").qposadr[0]

@@ -339,15 +339,14 @@ def an_identified() -> bytes:
     return json.dumps(found).encode()  # JSON is YAML
 
 
+IN_FOLDER = {"robot": "robot.yaml", "model_in_folder": "model.xml", "mesh_in_folder": "meshes/m.stl"}
 READERS: dict[str, Callable[[pathlib.Path, bytes], None]] = {
     "yaml": read_yaml,
     "gains": read_gains,
     "descriptor": read_descriptor,
     "flow": read_flow,
-    "robot": functools.partial(read_robot, name="robot.yaml"),
     "model": read_model,
-    "model_in_folder": functools.partial(read_robot, name="model.xml"),
-    "mesh_in_folder": functools.partial(read_robot, name="meshes/m.stl"),
+    **{reader: functools.partial(read_robot, name=name) for reader, name in IN_FOLDER.items()},
     "policy": read_policy,
     **{kind: functools.partial(read_mesh, kind=kind) for kind in ("stl", "obj", "dae")},
     "urdf": read_urdf,

@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.regions import Regions
-from mjx_nero.envs.task import EnvCfg, SuccessCfg
+from mjx_nero.envs.task import EnvCfg, SuccessCfg, nearer
 from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -130,9 +130,7 @@ class Tower:
         return {
             "reaching_object": RewardTerm(towers.reached, weight=1.0, params={"std": 0.1, **place}),
             "holding_object": RewardTerm(towers.carried, weight=5.0, params=place),
-            "approaching": RewardTerm(towers.approached, weight=10.0, params={"std": 0.3, **way}),
-            "approaching_near": RewardTerm(towers.approached, weight=10.0, params={"std": 0.1, **way}),
-            "approaching_fine": RewardTerm(towers.approached, weight=15.0, params={"std": 0.03, **way}),
+            **nearer("approaching", towers.approached, **way),
             **(turned if self.angle < math.pi else {}),
             "standing": RewardTerm(towers.standing, weight=10.0, params=place),
             "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**place, **fingers}),

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
+from mjx_nero.envs.task import EnvCfg, Presets, arm_state, joint_actions, object_at_goal
 from mjx_nero.envs.tasks.lift import carrying
-from mjx_nero.mdp import commands, events, metrics, observations, randomization, success, terminations
+from mjx_nero.mdp import commands, events, metrics, observations, randomization, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
@@ -171,10 +171,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
             resample_s=ONCE,
             targets=names,
         ),
-        success=SuccessCfg(
-            condition=Term(success.object_at_goal, params={"threshold": 0.02, **commanded}),
-            distance=Term(success.object_distance, params=commanded),
-        ),
+        success=object_at_goal(**commanded),
         metrics=metrics.grasping(**held),
         observations={
             "state": ObservationGroup(state),

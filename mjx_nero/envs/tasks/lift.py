@@ -10,7 +10,17 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, CurriculumCfg, EnvCfg, Presets, arm_state, joint_actions, step_weights, velocity_actions
+from mjx_nero.envs.task import (
+    CALM,
+    CurriculumCfg,
+    EnvCfg,
+    Presets,
+    arm_state,
+    joint_actions,
+    nearer,
+    step_weights,
+    velocity_actions,
+)
 from mjx_nero.envs.tasks import seeing
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
@@ -155,9 +165,7 @@ def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
     return {
         "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **object}),
         "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
-        "goal_tracking": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.3, **held}),
-        "goal_tracking_near": RewardTerm(rewards.held_goal_distance, weight=10.0, params={"std": 0.1, **held}),
-        "goal_tracking_fine": RewardTerm(rewards.held_goal_distance, weight=15.0, params={"std": 0.03, **held}),
+        **nearer("goal_tracking", rewards.held_goal_distance, **held),
         "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
         "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
         "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),

@@ -9,10 +9,20 @@ import functools
 from typing import Any
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, arm_state, velocity_actions
-from mjx_nero.envs.tasks import lift
-from mjx_nero.mdp import commands, events, metrics, observations, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, Term, privileged
+from mjx_nero.envs.task import (
+    CALM,
+    Budget,
+    CurriculumCfg,
+    EnvCfg,
+    Presets,
+    arm_state,
+    object_at_goal,
+    stays_on_table,
+    velocity_actions,
+)
+from mjx_nero.envs.tasks.lift import carrying
+from mjx_nero.mdp import commands, events, metrics, observations
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp, objects
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.objects import events as thing_events
@@ -72,10 +82,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         actions=velocity_actions(hysteresis=0.5),
         controllers=expert(robot, THING, item),
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", there.hold, strict=True)), resample_s=ONCE),
-        success=SuccessCfg(
-            condition=Term(success.object_at_goal, params={"threshold": 0.02, **one}),
-            distance=Term(success.object_distance, params=one),
-        ),
+        success=object_at_goal(**one),
         metrics=metrics.grasping(**held),
         observations={
             "state": ObservationGroup(state),
@@ -87,16 +94,11 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
             ),
             "reset_object_shape": Term(thing_events.at_rest, params={"files": files, **one}),
         },
-        rewards=lift.carrying(held, **one),
+        rewards=carrying(held, **one),
         curriculum=CurriculumCfg(expert_starts=0.5),
         training=CALM,
         budget=Budget(steps=250_000_000),
-        terminations={
-            "time_out": DoneTerm(terminations.time_out, time_out=True),
-            "object_off_table": DoneTerm(
-                terminations.object_off_table, params={"center": scene.table_center, "size": scene.table_size, **one}
-            ),
-        },
+        terminations=stays_on_table(scene, **one),
     )
 
 

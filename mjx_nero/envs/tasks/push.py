@@ -4,9 +4,9 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
-from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, stays_on_table
+from mjx_nero.mdp import commands, events, observations, rewards, success
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -91,12 +91,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
         budget=Budget(steps=150_000_000),
-        terminations={
-            "time_out": DoneTerm(terminations.time_out, time_out=True),
-            "object_off_table": DoneTerm(
-                terminations.object_off_table, params={"center": scene.table_center, "size": scene.table_size, **object}
-            ),
-        },
+        terminations=stays_on_table(scene, **object),
     )
 
 
