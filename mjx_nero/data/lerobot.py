@@ -1,6 +1,6 @@
 """LeRobotDataset v3.0, written and read with Arrow alone.
 
-Format: huggingface/lerobot 0.4.4, ``src/lerobot/datasets``. A piece is one Parquet file of steps (``data/``), one of
+Format: huggingface/lerobot 0.4.4 and 0.6.1, ``src/lerobot/datasets``. A piece is one Parquet file of steps (``data/``), one of
 its episodes (``meta/episodes/``), and the index (``meta/info.json``). Columns of episodes that LeRobot does not know of are ours:
 ``success`` and ``number``.
 """
