@@ -357,10 +357,9 @@ READERS: dict[str, Callable[[pathlib.Path, bytes], None]] = {
     "run": functools.partial(read_run, name="config.json"),
     **{name: functools.partial(read_run, name=f"{name}.json") for name in ("summary", "seeds")},
     "metrics": functools.partial(read_run, name="metrics.jsonl"),
-    **{
-        of.__name__.rpartition(".")[2]: functools.partial(read_figures, read=of.read)
-        for of in (results, robustness, public_robots)
-    },
+    "results": functools.partial(read_figures, read=results.read),
+    "robustness": functools.partial(read_figures, read=robustness.read),
+    "public_robots": functools.partial(read_figures, read=public_robots.read),
     "identified": read_identified,
     "log": read_log,
     "onnx": read_onnx,
