@@ -35,8 +35,8 @@ RUN = {
     "deploy_onnx.md": "tests/interop/test_onnx.py",
     "adding_an_arm.md": "tests/test_docs.py",
     "cameras.md": "tests/sim/test_cameras.py",
-    "fixtures.md": "tests/sim/test_fixtures.py",
-    "objects.md": "tests/sim/test_objects.py",
+    "fixtures.md": "tests/sim/test_fixtures_physics.py",
+    "objects.md": "tests/sim/test_meshes.py",
 }
 
 NO_BEGINNING = set(

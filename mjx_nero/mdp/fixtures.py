@@ -120,12 +120,12 @@ def joint_velocity(view: View, *, handle: Handle) -> Float[Array, "1"]:
 
 
 def opening_way(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Way that is left until the joint is as far as its target, or farther: lever * max(0, target - position) [m]."""
+    """Way that is left until the joint is as far as its target, or farther: ``lever * max(0, target - position)`` [m]."""
     return handle.lever * jnp.maximum(0.0, target(view, handle) - _fixture(view, handle).joint_pos[handle.joint])
 
 
 def turning_way(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Way from the joint to its target, on either side: lever * |target - position| [m]."""
+    """Way from the joint to its target, on either side: ``lever * |target - position|`` [m]."""
     return handle.lever * jnp.abs(target(view, handle) - _fixture(view, handle).joint_pos[handle.joint])
 
 

@@ -20,7 +20,6 @@ from typing import Annotated, Any, NoReturn
 from mjx_nero import config
 from mjx_nero.config import bounds, docs, values
 from mjx_nero.errors import UserError, missing
-from mjx_nero.files import cache
 
 LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 
@@ -196,6 +195,8 @@ def fields_help(cfgs: Mapping[str, Any]) -> str:
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     """Runs a program: mistakes of the user end in one line on stderr and exit status 2, Ctrl-C in 130."""
     try:
+        from mjx_nero.files import cache  # which needs what pip installs
+
         cache.check_addresses()
         main(sys.argv[1:])
         code = 0
@@ -234,6 +235,8 @@ def setup_jax() -> None:
     import jax
 
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 in the physics or the learner costs success
+    from mjx_nero.files import cache
+
     kept = cache.folder()
     if kept:
         if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):

@@ -461,7 +461,16 @@ def test_make_by_name():
     assert isinstance(control.make("ik", NERO, DT), IkFollower)
     made = control.make("rmpflow", NERO, DT, {"maximum_substep_size": 0.01})
     assert isinstance(made, RmpFollower)
-    assert set(control.CONTROLLERS) == {"ik", "rmpflow", "pick_place", "pick_up", "detour", "carry"}
+    assert set(control.CONTROLLERS) == {
+        "ik",
+        "rmpflow",
+        "pick_place",
+        "pick_up",
+        "detour",
+        "carry",
+        "follow_joint",
+        "grasp_thing",
+    }
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from mjx_nero import UserError
 from mjx_nero.mdp import actions, commands, curriculum, events, metrics, observations, rewards, success, terminations, terms
 from mjx_nero.mdp.memory import Delay, History
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
-from mjx_nero.types import LEVEL, ObjectView, ObstacleView, Start, View
+from mjx_nero.types import LEVEL, ObjectView, ObstacleView, ShapeView, Start, View
 
 KEY = jax.random.PRNGKey(0)
 RECALL = terms.Recall({})  # no term here remembers anything
@@ -148,6 +148,21 @@ def test_held_and_at_goal():
 
 THIRD = 2 * math.pi / 3 / 3**0.5
 FAR = 0.05 * np.array([0.97, 1.96, 3.2]) / np.linalg.norm([0.97, 1.96, 3.2])  # 5 cm of the way from the grasp point to the other
+
+
+def feeling(view):
+    """The same arm with sensors: six numbers at the wrist, one of the hand."""
+    return dataclasses.replace(view, readings={"wrist": jnp.array([0.0, 0.0, -9.81, 0.1, 0.2, 0.3]), "hand": jnp.array(2.5)})
+
+
+def shaped(view):
+    """The cube has the code of a mesh."""
+    mesh = dataclasses.replace(
+        view.objects["cube"], shape=ShapeView(*[jnp.array([0.1, 0.2, 0.05])] * len(dataclasses.fields(ShapeView)))
+    )
+    return dataclasses.replace(view, objects={**view.objects, "cube": mesh})
+
+
 OBSERVATIONS = [
     (observations.joint_pos, [0.5, -0.25]),
     (observations.joint_pos_rel, [0.25, -0.5]),
@@ -171,6 +186,9 @@ OBSERVATIONS = [
     (lambda view: observations.ee_to_objects(view, objects=("cube", "other"), limit=0.05), [-0.03, -0.04, 0, *FAR]),
     (observations.goal_position, [0, 0, 0.3]),
     (observations.goal_orientation, [0, 1, 0, 0]),
+    (lambda view: observations.reading(feeling(view), name="wrist"), [0.0, 0.0, -9.81, 0.1, 0.2, 0.3]),
+    (lambda view: observations.reading(feeling(view), name="hand"), [2.5]),
+    (lambda view: observations.object_shape(shaped(view)), [0.1, 0.2, 0.05]),
     (lambda view: observations.obstacle(beside(), obstacle="one"), [0.13, 0.04, 0.2, 0.5**0.5, 0, 0, 0.5**0.5, 0.04, 0.1, 0.2]),
 ]
 
@@ -182,7 +200,16 @@ def test_observations(func, value):
 
 def test_every_observation_is_tested():
     public = {f for f in vars(observations).values() if getattr(f, "__module__", "") == observations.__name__}
-    assert public - {row[0] for row in OBSERVATIONS} == {observations.ee_to_objects, observations.obstacle}  # in a lambda
+    assert public - {row[0] for row in OBSERVATIONS} == {
+        *(observations.ee_to_objects, observations.obstacle, observations.reading, observations.object_shape)  # in a lambda
+    }
+
+
+def test_what_is_not_measured_is_said():
+    with pytest.raises(UserError, match="measures no 'wrist': its readings are hand "):
+        observations.reading(dataclasses.replace(view(), readings={"hand": 2.5}), name="wrist")
+    with pytest.raises(UserError, match="the shape of a mesh, and 'cube' is none"):
+        observations.object_shape(view())
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import mjx_nero
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.drivers import so_leader
 from mjx_nero.deploy.emulators import feetech as emulated
+from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.emulators.timeless import Clock
 from mjx_nero.envs import registry
@@ -42,7 +43,7 @@ def arm(tmp_path):
     plant = Plant(scene.build(robot, cfg.scene, cfg.sim, visuals=False), robot.joints, np.array(robot.home), Clock())
     servos = emulated.servos_of(told, "so101", entries, plant)
     servos.faults.turnaround = 0.0
-    port, over = emulated.Port(servos), threading.Event()
+    port, over = emulated.Port(servos, Line(terminal=True)), threading.Event()
     thread = threading.Thread(target=port.serve, args=(over.is_set,), daemon=True)
     thread.start()
     made = so_leader.of(told, port.name, tmp_path / "leader.json", Clock())

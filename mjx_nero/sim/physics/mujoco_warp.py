@@ -277,6 +277,8 @@ class WarpPhysics:
 def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:
     """Replaces fields of the model by views of one array [n, numbers], one row a world. None without fields.
 
+    Whole numbers are read as they lie in memory (see ``whole_numbers``).
+
     Args:
         model: MuJoCo Warp's.
         shapes: of the fields, by name.
@@ -295,15 +297,14 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
         strides: tuple[int, ...] = (row, item)
         if getattr(model, name).ndim == 3:  # two vectors a row
             shape, strides = (n, rows, 2), (row, item, item // 2)
-        if kind is not wp.int32:  # see ``whole_numbers``
-            view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=shape, strides=strides)
-            setattr(model, name, view)
+        view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=shape, strides=strides)
+        setattr(model, name, view)
         at += size
     return drawn
 
 
 def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any) -> Callable[[], None]:
-    """Makes the function that converts those fields of ``world_fields`` that are whole numbers, such as the ids of meshes."""
+    """Makes the function that converts fields of ``world_fields`` which are whole numbers, but given as floats: ids of meshes."""
     import warp as wp
 
     @wp.kernel(module="unique", enable_backward=False)
