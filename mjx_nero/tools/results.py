@@ -160,7 +160,7 @@ def page(cells: Sequence[tuple[str, ...]], json_name: str, page_name: str) -> st
 
 def task_of(env: str) -> str:
     """The task's name: an environment's name without the arm's, as ``nero_lift_obstacles`` is ``lift_obstacles``."""
-    env, *preset = env.split()
+    env, *preset = env.split(" ")
     names = [name for name in registry.list_envs() if registry.robot_of(name) is None and env.endswith(f"_{name}")]
     return " ".join([max(names, key=len, default=env), *preset])
 

@@ -34,12 +34,12 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, dotted = parser.parse(argv, ("env",))
-    if dotted["env"] and not args.cameras:
-        parser.error("fields of the environment are for its cameras: pass --cameras FILE, too")
     for path in filter(None, (args.render, args.cameras, args.json)):
         files.check_writable(path)
     if args.object is not None:
         return _thing(args)
+    if dotted["env"] and not args.cameras:
+        parser.error("fields of the environment are for its cameras: pass --cameras FILE, too")
     if args.name is None and args.robot is None:
         parser.error("name a robot, an environment or the folder of an imported robot")
     what = (args.name, args.preset, args.robot) if args.name else (args.robot, args.preset, None)
