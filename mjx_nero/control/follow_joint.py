@@ -13,6 +13,7 @@ from mjx_nero.config.bounds import NonNegative, Positive, Share
 from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.control.pick_up import UNREACHABLE
 from mjx_nero.mdp import fixtures as terms
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.mdp.fixtures import Handle
@@ -22,7 +23,6 @@ from mjx_nero.types import UserError, View
 
 BEFORE, IN, CLOSE, MOVE = range(4)
 _LOST = 0.04  # [m] further than this from the grasp point, the handle has been lost
-_UNREACHABLE = 100.0  # counts as so many radians to move
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
 
@@ -118,7 +118,7 @@ class FollowJoint:
         found = [self._ik.solve_batch(*poses[0], start, jax.random.PRNGKey(0))]
         for pose in poses[1:]:
             found.append(jax.vmap(self._ik.local)(*pose, found[-1].q))
-        way = jnp.linalg.norm(found[0].q - q, axis=1) + _UNREACHABLE * sum(~one.success for one in found)
+        way = jnp.linalg.norm(found[0].q - q, axis=1) + UNREACHABLE * sum(~one.success for one in found)
         best = jnp.argmin(way)
         out = jnp.asarray(self.cfg.before)
         return FollowJointMemory(zero, zero, q, jnp.zeros_like(q), found[0].q[best], flips[best], out, now, zero)

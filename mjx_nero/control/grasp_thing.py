@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
-from mjx_nero.control.pick_up import CLOSE, PickUp, PickUpCfg, PickUpMemory
+from mjx_nero.control.pick_up import CLOSE, UNREACHABLE, PickUp, PickUpCfg, PickUpMemory
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import grasp
 from mjx_nero.sim.objects import kept_grasps
@@ -72,7 +72,7 @@ class GraspThing(PickUp):
         starts = jnp.broadcast_to(q, (len(angles), self._n))
         over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
         low = jax.vmap(self._ik.local)(picks, quats, over.q)
-        way = jnp.linalg.norm(over.q - q, axis=1) + 100.0 * ~(over.success & low.success)
+        way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
         best = jnp.argmin(way + _COST_COUNTS * costs)
         zero, pick = jnp.zeros((), jnp.int32), picks[best]
         return GraspThingMemory(

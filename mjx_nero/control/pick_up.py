@@ -19,7 +19,7 @@ from mjx_nero.types import UserError, View
 
 ABOVE, DOWN, CLOSE, UP, CARRY = range(5)
 _CHOICES = 8  # ways to turn the hand that are looked at
-_UNREACHABLE = 100.0  # counts as so many radians to move
+UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
@@ -114,7 +114,7 @@ class PickUp:
         starts = jnp.broadcast_to(q, (_CHOICES, self._n))
         over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
         low = jax.vmap(self._ik.local)(picks, quats, over.q)
-        way = jnp.linalg.norm(over.q - q, axis=1) + _UNREACHABLE * ~(over.success & low.success)
+        way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
         best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
         above, pick, yaw = over.q[best], picks[best], angles[best]
         return PickUpMemory(zero, zero, q, jnp.zeros_like(q), above, pick + self._up, pick, yaw, jnp.zeros(3), zero)

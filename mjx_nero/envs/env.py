@@ -344,7 +344,8 @@ class ManipulationEnv(Env):
         goal, _ = self._viewer.goal(carry)
         boxes, look = self._obstacles.views(sim.fields), dict(carry.memory.get(LOOK, {}))
         if SHAPE in carry.memory:
-            look |= bank.look(self.mj_model, self._banks.counts, carry.memory[SHAPE])
+            colors = look.get("geom_rgba", jnp.asarray(self.mj_model.geom_rgba, jnp.float32))
+            look |= bank.look(self.mj_model, self._banks.counts, carry.memory[SHAPE], colors)
         if self.cfg.scene.fixtures:
             look |= self._fixtures.drawn(self.mj_model, sim.fields)
         return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)

@@ -15,7 +15,7 @@ from mjx_nero.envs.tasks.lift_any import HELD_OUT, SEEN, THING
 from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import observations, rewards
 from mjx_nero.sim import grasp, objects, scene
-from mjx_nero.sim.objects import events, grasps, rests, shapes
+from mjx_nero.sim.objects import bank, body, events, grasps, rests, shapes
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.types import ObjectView, ShapeView, Start
 
@@ -30,6 +30,16 @@ def worlds():
 @pytest.fixture(scope="module")
 def starts(worlds):
     return jax.jit(jax.vmap(worlds.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
+
+
+def test_a_drawn_colour_stays_and_the_other_shapes_are_hidden(worlds):
+    model, count = worlds.mj_model, len(SEEN)
+    drawn = jnp.full((model.ngeom, 4), 0.5)
+    rgba = bank.look(model, {THING: count}, {THING: jnp.array(2)}, drawn)["geom_rgba"]
+    rows = np.array([model.geom(body.drawn_name(THING, k)).id for k in range(count)])
+    assert rgba[rows, 3].tolist() == [float(k == 2) for k in range(count)]
+    np.testing.assert_array_equal(rgba[:, :3], drawn[:, :3])
+    np.testing.assert_array_equal(np.delete(rgba[:, 3], rows), 0.5)
 
 
 def test_a_quarter_is_held_out():

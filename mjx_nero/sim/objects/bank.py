@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.objects.solid import Solid
@@ -57,9 +57,10 @@ class Banks:
         return out
 
 
-def look(model: mujoco.MjModel, counts: Mapping[str, int], shapes: Mapping[str, Int[Array, ""]]) -> Fields:
-    """Colours of a drawn model's geoms when objects have the given shapes: those of the other shapes cannot be seen."""
-    rgba = jnp.asarray(model.geom_rgba, jnp.float32)
+def look(
+    model: mujoco.MjModel, counts: Mapping[str, int], shapes: Mapping[str, Int[Array, ""]], rgba: Float[Array, "n 4"]
+) -> Fields:
+    """Colours of a drawn model's geoms, of ``rgba``, when objects have the given shapes: the other shapes cannot be seen."""
     for name, count in counts.items():
         rows = np.array([model.geom(bodies.drawn_name(name, k)).id for k in range(count)])
         rgba = rgba.at[rows, 3].set((jnp.arange(count) == shapes[name]).astype(jnp.float32))
