@@ -81,3 +81,13 @@ def test_the_pull_is_as_strong_as_its_weight_and_no_critics(shown, cloned):
     whole, half, none = (pull(before, weight) for weight in (1.0, 0.5, 0.0))
     assert norm(half.policy) == pytest.approx(norm(whole.policy) / 2) and norm(none) == 0 == norm(whole.value)
     assert norm(pull(after, 1.0).policy) < norm(whole.policy) / 5  # hardly any from where it already acts so
+
+
+@pytest.mark.parametrize("waits, weight, moves", [(True, 1.0, 0.0), (False, 1.0, 1.0), (True, 0.0, 1.0)])
+def test_a_clone_waits_for_its_critic_and_nobody_else_does(cloned, waits, weight, moves):
+    """PPO's own gradient reaches the critic always, and the policy unless it waits while the school still counts."""
+    school = imitation.School(Shown({}, jnp.zeros((1, 2))), jnp.array(weight), jnp.zeros(()))
+    ones = jax.tree.map(jnp.ones_like, cloned[2])
+    after = imitation.held_back(ones, jnp.array(waits), school)
+    assert all((leaf == moves).all() for leaf in jax.tree.leaves(after.policy))
+    assert all((leaf == 1).all() for leaf in jax.tree.leaves(after.value))

@@ -101,6 +101,7 @@ class PpoCfg:
     entropy_cost: NonNegative = 0.01  # weight of the entropy bonus, which keeps the policy exploring
     change_cost: NonNegative = 0.0  # weight of the squared change of mean actions from step to step, which keeps the policy calm
     imitation: NonNegative = 0.0  # weight of the distance from the expert's actions, until half of the episodes succeed
+    critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which an imitating policy waits for its critic
     min_std: NonNegative = 0.2  # least standard deviation of actions, so exploration lasts until the goal is found; 0: none
     max_std: NonNegative = 1.0  # greatest standard deviation, since noise costs nothing where targets saturate; 0: none
     value_loss: NonNegative = 1.0  # weight of the critic's loss

@@ -12,7 +12,7 @@ import optax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, networks
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn.learner import ROWS
@@ -74,6 +74,16 @@ def cloned(
     if "std_logparam" in layers:
         layers["std_logparam"] = jax.tree.map(lambda x: jnp.full_like(x, jnp.log(STILL)), layers["std_logparam"])
     return params.replace(policy={**policy, "params": layers})
+
+
+def held_back(grads: losses.PPONetworkParams, waits: Bool[Array, ""], school: School) -> losses.PPONetworkParams:
+    """Returns the gradient of PPO's loss without the policy's part while the policy waits for its critic.
+
+    A new critic knows nothing, so its advantages are noise, and a clone that follows them unlearns what it knows. Only a clone
+    waits: once the school counts nothing, there is no reason to.
+    """
+    moves = 1.0 - waits * (school.weight > 0)
+    return grads.replace(policy=jax.tree.map(lambda x: x * moves, grads.policy))
 
 
 def gradient(

@@ -333,6 +333,7 @@ class Learner:
             part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat, for faster products on a CPU
             grads, metrics = jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key)
             if state.school:
+                grads = imitation.held_back(grads, state.iteration < cfg.critic_first, state.school)
                 pull = imitation.gradient(self.networks, state.normalizer, params, state.school, key)
                 grads = jax.tree.map(lambda own, to: own + cfg.imitation * to, grads, pull)
             grads, metrics = self._mean((grads, metrics))
