@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.regions import Regions
-from mjx_nero.envs.task import EnvCfg, SuccessCfg, nearer
+from mjx_nero.envs.task import SHOWN, EnvCfg, SuccessCfg, nearer, velocity_actions
 from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -110,6 +110,8 @@ class Tower:
             "metrics": self.metrics(),
             "terminations": self.terminations(),
             "controllers": self.controllers(),
+            "actions": lets_go({**velocity_actions(), "gripper": Term(actions.ContinuousGripper)}),
+            "training": SHOWN,
         }
         return EnvCfg(**{**shared, **own})
 

@@ -8,7 +8,7 @@ import functools
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
+from mjx_nero.envs.task import SHOWN, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
 from mjx_nero.envs.tasks import lift, reach_obstacles
 from mjx_nero.mdp import curriculum, metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, MetricTerm, RewardTerm, Term
@@ -48,8 +48,8 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
         episode_length_s=12.0,
         actions=velocity_actions(),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
-        training=CALM,
-        budget=Budget(steps=170_000_000),
+        training=SHOWN,
+        budget=Budget(steps=80_000_000),
         command=dataclasses.replace(plain.command, resample_s=ONCE),
         obstacles=reach_obstacles.between(ways, "cube"),
         success=SuccessCfg(condition=Term(success.AtGoalUntouched, params=done), distance=Term(success.object_distance)),

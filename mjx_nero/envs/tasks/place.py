@@ -4,8 +4,8 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import QUIET, Budget, EnvCfg, Presets, arm_state, joint_actions
-from mjx_nero.envs.tasks.building import Tower, lets_go
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
+from mjx_nero.envs.tasks.building import Tower
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
 from mjx_nero.sim import grasp
@@ -42,7 +42,6 @@ def default(robot: RobotCfg) -> EnvCfg:
     }
     return tower.task(
         length_s=7.0,
-        actions=lets_go(joint_actions(scale=0.5)),
         command=CommandTerm(
             commands.uniform_pose,
             params={"x": there.place[0], "y": there.place[1], "z": (rest, rest), "roll": STILL, "pitch": STILL, "yaw": yaw},
@@ -56,8 +55,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
-        training=QUIET,
-        budget=Budget(steps=150_000_000),
+        budget=Budget(steps=90_000_000),
     )
 
 

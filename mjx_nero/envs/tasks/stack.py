@@ -6,10 +6,9 @@ The preset ``three`` adds a third cube on top.
 import dataclasses
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, EnvCfg, Presets, arm_state, velocity_actions
-from mjx_nero.envs.tasks.building import LIFTED, Tower, lets_go
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
+from mjx_nero.envs.tasks.building import LIFTED, Tower
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.actions import ContinuousGripper
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
@@ -56,7 +55,6 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     apart = round(robot.opening / 2 + edge / 2 + BESIDE, 4)
     return tower.task(
         length_s=episode_length_s,
-        actions=lets_go({**velocity_actions(), "gripper": Term(ContinuousGripper)}),
         command=CommandTerm(commands.nothing, resample_s=ONCE),
         events={
             "reset_object_positions": Term(
@@ -66,8 +64,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards={**tower.rewards(), "leaving": leaving},
-        training=CALM,
-        budget=Budget(steps=180_000_000),
+        budget=Budget(steps=90_000_000),
     )
 
 
