@@ -1,6 +1,7 @@
 """Lift any: which shapes come, how they lie, what their worlds weigh, what counts as held, and the expert that lifts them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from mjx_nero.mdp import observations, rewards
 from mjx_nero.sim import grasp, objects, scene
 from mjx_nero.sim.objects import bank, body, events, grasps, rests, shapes
 from mjx_nero.sim.physics.mjx import JaxPhysics
-from mjx_nero.types import ObjectView, ShapeView, Start
+from mjx_nero.types import SHAPE, ObjectView, ShapeView, Start
 
 WORLDS = 64
 
@@ -35,7 +36,9 @@ def starts(worlds):
 def test_a_drawn_colour_stays_and_the_other_shapes_are_hidden(worlds):
     model, count = worlds.mj_model, len(SEEN)
     drawn = jnp.full((model.ngeom, 4), 0.5)
-    rgba = bank.look(model, {THING: count}, {THING: jnp.array(2)}, drawn)["geom_rgba"]
+    banks = bank.Banks(worlds.physics_model, worlds.cfg.scene.objects, lambda: model)
+    third = SimpleNamespace(memory={SHAPE: {THING: jnp.array(2)}})
+    rgba = banks.scenery(None, third, {"geom_rgba": drawn})["look"]["geom_rgba"]
     rows = np.array([model.geom(body.drawn_name(THING, k)).id for k in range(count)])
     assert rgba[rows, 3].tolist() == [float(k == 2) for k in range(count)]
     np.testing.assert_array_equal(rgba[:, :3], drawn[:, :3])
@@ -76,7 +79,7 @@ def one(worlds, name):
 def test_a_world_steps_as_a_scene_of_its_shape_alone(worlds, starts):
     """Ten control steps of each shape, the thing 2 cm above the table and turned, against MuJoCo itself."""
     which = np.asarray(jax.vmap(worlds.view)(starts).objects[THING].shape.index)
-    at = worlds._viewer.objects[THING][0]
+    at = int(worlds.physics_model.joint(THING).qposadr[0])
     state = starts.pipeline_state
     lifted = dataclasses.replace(state, qpos=state.qpos.at[:, at + 2].add(0.02).at[:, at + 1].add(1.0))
     step, after = jax.jit(jax.vmap(worlds.physics.step)), lifted
@@ -185,7 +188,7 @@ def test_hands_can_grasp_every_object(robot):
 
 def test_jax_says_what_it_cannot(worlds):
     with pytest.raises(UserError, match="MJX-JAX cannot give an object another shape in each episode"):
-        JaxPhysics(worlds.physics_model, worlds.cfg.sim, worlds._banks.names)
+        JaxPhysics(worlds.physics_model, worlds.cfg.sim, worlds._parts.fields)
 
 
 def test_object_in_the_place_of_the_cube():
