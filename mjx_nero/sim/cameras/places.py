@@ -60,8 +60,8 @@ def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 75.0) -> CameraCfg:
     """Places a camera on the hand that looks past the fingers.
 
-    Of many places it takes the one that sees most of what is between and ahead of the fingers, open and closed. Of equals it takes
-    the highest at home, which sees the table, then the nearest to the hand.
+    Of many places it takes the one that sees most of what is between and ahead of the fingers, open and closed. Of equals it
+    takes the highest at home, which sees the table, then the nearest to the hand.
     """
     link, pos, quat = _on_hand(robot)
     return CameraCfg(link=link, pos=pos, quat=quat, fovy=fovy, size=size, kinds=kinds)
