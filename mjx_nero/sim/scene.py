@@ -38,7 +38,7 @@ class SceneCfg:
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
         fixtures: things with joints of their own by name, such as a cabinet (``sim.fixtures``).
         self_collision: the robot's links collide with one another; ``sim.touch`` measures those forces, too.
-        hand: ``sim.touch`` measures what the robot presses objects with.
+        hand: ``sim.touch`` measures the force with which the robot presses objects.
         wrist, fingers: ``sim.forces`` measures force and torque between arm and hand, and the forces at the pads.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
@@ -208,7 +208,7 @@ def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
 
 
 def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
-    """Reads and mount the robot. ``whole`` keeps the shapes that meet obstacles only."""
+    """Reads and mounts the robot. ``whole`` keeps the shapes that meet obstacles only."""
     spec = robot_file.model(robot)
     for geom in [] if whole else spec.geoms:
         if geom.conaffinity == touch.OBSTACLE:

@@ -37,7 +37,7 @@ def play(
         watch: (controller's memory, view) -> what to keep of each control step.
 
     Returns:
-        What was watched, [steps, n, ...]; in a try that left the numbers NaN, False or 0 from there on.
+        What was watched, [steps, n, ...]. A try that became non-finite has NaN, False or 0 from there on.
     """
     model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
     command, parts = dataclasses.replace(cfg.command, motion=None), scene.parts(cfg.scene, model)
