@@ -95,7 +95,7 @@ class Hand:
         self._steer(lambda: setattr(self, "pos", self.pos + by))
 
     def turn(self, degrees: float) -> None:
-        """Turns the wanted pose about the vertical [rad]."""
+        """Turns the wanted pose about the vertical, by degrees."""
         by = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.radians(degrees))
         self._steer(lambda: setattr(self, "quat", np.array(math.quat_mul(by, jnp.asarray(self.quat, jnp.float32)), float)))
 
