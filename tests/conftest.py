@@ -1,5 +1,6 @@
 """Shared by all tests: type checks at run time, a compilation cache, and the few compiled functions that cost time."""
 
+import collections
 import functools
 import getpass
 import os
@@ -62,7 +63,9 @@ jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def pytest_collection_modifyitems(items):
-    """GPU tests skip themselves where there is none."""
+    """Files with most slow tests come first, so that no worker is left with one at the end. GPU tests skip themselves."""
+    slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
     if any(item.get_closest_marker("gpu") for item in items) and jax.default_backend() != "gpu":
         for item in items:
             if item.get_closest_marker("gpu"):

@@ -43,32 +43,72 @@ def test_numbers_of_flags(kind, text, value):
     assert kind(text) == value and type(kind(text)) is type(value)
 
 
-@pytest.mark.parametrize(
-    ("kind", "text", "message"),
-    [
-        (cli.positive, "many", "takes a whole number, got 'many'"),
-        (cli.positive, "0", "must be at least 1, got '0'"),
-        (cli.positive, "2.5", "takes a whole number, got '2.5'"),
-        (cli.positive, "1_000", "takes a whole number, got '1_000'"),
-        (cli.positive, "inf", "takes a whole number, got 'inf'"),
-        (cli.positive, "1e999", "takes a whole number, got '1e999'"),
-        (cli.positive, "9" * 400, "takes a whole number, got '9{20,30}\\.\\.\\.9{20,30}'"),
-        (cli.positive, "", "takes a whole number, got ''"),
-        (cli.seed, "4294967296", "must be at least 0 and at most 4294967295, got '4294967296'"),
-        (cli.seed, "-1", "must be at least 0 and at most 4294967295, got '-1'"),
-        (cli.seed, "18446744073709551616", "takes a whole number, got '18446744073709551616'"),
-        (cli.non_negative, "nan", "takes a finite number, got 'nan'"),
-        (cli.non_negative, "-0.1", "must be at least 0, got '-0.1'"),
-        (cli.positive_float, "inf", "takes a finite number, got 'inf'"),
-        (cli.positive_float, "0", "must be above 0, got '0'"),
-        (cli.share, "0", "must be above 0 and at most 1, got '0'"),
-        (cli.at_most(1_000), "1e12", "must be at least 1 and at most 1000, got '1e12'"),
-        (cli.path(), "x" * 300, "takes a path with names of at most 255 bytes, got 'x{20,30}\\.\\.\\.x{20,30}'"),
-        (cli.path(), "a\0b", "takes a path with names of at most 255 bytes"),
-        (cli.path(), "", "takes a path"),
-        (cli.path(".mp4"), "v.zzz", "takes a name that ends in .mp4, got 'v.zzz'"),
-    ],
-)
+REFUSED = [
+    (
+        cli.positive,
+        {
+            "many": "takes a whole number, got 'many'",
+            "0": "must be at least 1, got '0'",
+            "2.5": "takes a whole number, got '2.5'",
+            "1_000": "takes a whole number, got '1_000'",
+            "inf": "takes a whole number, got 'inf'",
+            "1e999": "takes a whole number, got '1e999'",
+            "9" * 400: "takes a whole number, got '9{20,30}\\.\\.\\.9{20,30}'",
+            "": "takes a whole number, got ''",
+        },
+    ),
+    (
+        cli.seed,
+        {
+            "4294967296": "must be at least 0 and at most 4294967295, got '4294967296'",
+            "-1": "must be at least 0 and at most 4294967295, got '-1'",
+            "18446744073709551616": "takes a whole number, got '18446744073709551616'",
+        },
+    ),
+    (
+        cli.non_negative,
+        {
+            "nan": "takes a finite number, got 'nan'",
+            "-0.1": "must be at least 0, got '-0.1'",
+        },
+    ),
+    (
+        cli.positive_float,
+        {
+            "inf": "takes a finite number, got 'inf'",
+            "0": "must be above 0, got '0'",
+        },
+    ),
+    (
+        cli.share,
+        {
+            "0": "must be above 0 and at most 1, got '0'",
+        },
+    ),
+    (
+        cli.at_most(1_000),
+        {
+            "1e12": "must be at least 1 and at most 1000, got '1e12'",
+        },
+    ),
+    (
+        cli.path(),
+        {
+            "x" * 300: "takes a path with names of at most 255 bytes, got 'x{20,30}\\.\\.\\.x{20,30}'",
+            "a\0b": "takes a path with names of at most 255 bytes",
+            "": "takes a path",
+        },
+    ),
+    (
+        cli.path(".mp4"),
+        {
+            "v.zzz": "takes a name that ends in .mp4, got 'v.zzz'",
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize(("kind", "text", "message"), [(kind, *each) for kind, said in REFUSED for each in said.items()])
 def test_what_flags_refuse(kind, text, message):
     with pytest.raises(argparse.ArgumentTypeError, match=message) as error:
         kind(text)

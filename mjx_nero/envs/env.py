@@ -27,18 +27,15 @@ from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
-from mjx_nero.sim import cameras, fixtures, forces, linkage, obstacles, scene, touch
+from mjx_nero.sim import cameras, forces, linkage, scene, touch
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
-from mjx_nero.sim.objects import bank
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
 from mjx_nero.types import (
     LEVEL,
     LOOK,
     PHASE,
     SHAPE,
-    TARGET,
-    Appearance,
     Bank,
     Carry,
     Key,
@@ -53,8 +50,7 @@ from mjx_nero.types import (
 _MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key, so that one part's draws leave all others unchanged.
-_FIELDS, _MEMORY, _SENSORS, _OBSTACLES, _FOLLOWING, _VISITED = 0xF1E1D5, 0x3E3087, 0x5E4504, 0x0B57AC, 0xF0110E, 0x715173D
-_LOOK = 0x1004
+_FIELDS, _MEMORY, _SENSORS, _FOLLOWING, _VISITED, _LOOK = 0xF1E1D5, 0x3E3087, 0x5E4504, 0xF0110E, 0x715173D, 0x1004
 
 Starts = tuple[Bank, Float[Array, " phases"]]  # visited states, and the probabilities of their phases
 
@@ -103,21 +99,11 @@ class ManipulationEnv(Env):
             raise UserError(f"episode_length_s must be a control step ({self.dt:g} s) or more, got {cfg.episode_length_s:g}")
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
-        self._obstacles = obstacles.Obstacles(model, cfg.scene.obstacles)
-        self._fixtures = fixtures.Fixtures(model, cfg.scene.fixtures)
-        self._banks = bank.Banks(model, cfg.scene.objects)
-        sees = self._pictures if cfg.scene.cameras else None
-        self._viewer = Viewer(
-            model,
-            cfg.robot,
-            cfg.scene.objects,
-            self.episode_length,
-            self.dt,
-            cfg.command,
-            self._obstacles,
-            self._fixtures,
-            sees,
+        self._parts = scene.parts(
+            cfg.scene, model, cfg.command.targets, cfg.obstacles, lambda: self.mj_model, lambda: self._randomization.names
         )
+        sees = self._pictures if cfg.scene.cameras else None
+        self._viewer = Viewer(model, cfg.robot, self._parts, self.episode_length, self.dt, cfg.command, sees)
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
         self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
@@ -145,9 +131,8 @@ class ManipulationEnv(Env):
     def physics(self) -> Physics:
         """The physics backend, created at the first step."""
         with jax.ensure_compile_time_eval():  # the first step may run under a trace
-            drawn = self._randomization.names + self._banks.names + (obstacles.FIELDS if self.cfg.obstacles else ())
-            drawn += fixtures.FIELDS if self.cfg.scene.fixtures else ()
-            return make_physics(self.physics_model, self.cfg.sim, self.impl, tuple(dict.fromkeys(drawn)))
+            differ = tuple(dict.fromkeys((*self._randomization.names, *self._parts.fields)))
+            return make_physics(self.physics_model, self.cfg.sim, self.impl, differ)
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -158,11 +143,9 @@ class ManipulationEnv(Env):
     def cameras(self) -> cameras.Cameras:
         """The scene's cameras; made when something is first drawn."""
         with jax.ensure_compile_time_eval():
-            where, differ = self.cfg.scene, tuple(self._differing())
+            where, seen = self.cfg.scene, (*self._parts.seen, *self._look.names)
             kind = cameras.renderer(where.renderer, self.impl)
-            seen = (*self._look.names, *(("geom_rgba",) if self._banks.counts else ()))
-            seen += fixtures.FIELDS if where.fixtures else ()
-            return cameras.Cameras(self.mj_model, where.cameras, kind, differ, tuple(where.obstacles), tuple(dict.fromkeys(seen)))
+            return cameras.Cameras(self.mj_model, where.cameras, kind, tuple(dict.fromkeys(seen)))
 
     @functools.cached_property
     def _look(self) -> Look:
@@ -217,7 +200,7 @@ class ManipulationEnv(Env):
         names = [f"reward/{name}" for name in self.cfg.rewards]
         names += ["success", "distance", "final_distance", "dropped", "nan", "overflow", *self.cfg.metrics]
         names += [LEVEL] if level is not None else []
-        names += [f"shape/{name}" for name in self._banks.counts]
+        names += [f"shape/{name}" for name in carry.memory.get(SHAPE, {})]
         zero = jnp.zeros(())
         info = {"carry": carry, "count": jnp.zeros((), jnp.int32), "truncation": zero, "steps": zero}
         return State(sim, obs, zero, zero, dict.fromkeys(names, zero), info)
@@ -235,8 +218,7 @@ class ManipulationEnv(Env):
         if starts:
             start = events.visited(k_visited, start, bank=starts[0], chances=starts[1])
             command = jnp.where(start.phase > 0, start.goal_pos_w - base, command)
-        fields = self._randomization(k_fields, level, self._banks(start.shape))
-        fields = self._fixtures.fields(fields, start.fixtures)
+        fields = self._randomization(k_fields, level, self._parts.given(start))
         qpos, nv = self._qpos(start, fields), self.physics_model.nv
         sim = Sim(
             qpos=qpos,
@@ -257,9 +239,8 @@ class ManipulationEnv(Env):
             command=command,
             command_quat=start.goal_quat_w,
             memory={
-                **({TARGET: start.target} if self.cfg.command.targets else {}),
+                **self._parts.memory(start),
                 **({} if level is None else {LEVEL: level}),
-                **({SHAPE: start.shape} if self._banks.counts else {}),
             },
         )
         if starts:  # as if the previous action had asked for these targets
@@ -269,37 +250,22 @@ class ManipulationEnv(Env):
         if self.cfg.look:
             look = self._look(jax.random.fold_in(rng, _LOOK), level)
             carry = dataclasses.replace(carry, memory={**carry.memory, LOOK: look})
-        if self.cfg.obstacles:  # drawn last, between the start and the goal
-            boxes = self.cfg.obstacles(jax.random.fold_in(carry.rng, _OBSTACLES), self._viewer(sim, carry, carry.action))
-            sim = dataclasses.replace(sim, fields=self._obstacles.placed(fields, boxes))
+        fields = self._parts.late(rng, functools.partial(self._viewer, sim, carry, carry.action), fields)
+        sim = dataclasses.replace(sim, fields=fields)
         return sim, dataclasses.replace(carry, memory=self._memory(k_memory, sim, carry))
 
     def blank(self) -> Bank:
-        """Returns one row of a bank: joints at home, objects as in the scene, no goal."""
-        poses = {name: self._qpos0[at : at + 7] for name, (at, _) in self._viewer.objects.items()}
-        start = Start(
-            joint_pos=jnp.asarray(self.cfg.robot.home),
-            object_pos_w={name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
-            object_quat_w={name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
-            pull=jnp.zeros(len(self.cfg.robot.home)),
-            fixtures=self._fixtures.blank(),
-            shape=dict.fromkeys(self._banks.counts, jnp.zeros((), jnp.int32)),
-        )
-        return Bank(start, jnp.zeros((), bool))
+        """Returns one row of a bank: joints at home, everything else as in the scene, no goal."""
+        home = jnp.asarray(self.cfg.robot.home)
+        return Bank(Start(joint_pos=home, pull=jnp.zeros(len(home)), **self._parts.blank()), jnp.zeros((), bool))
 
     def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
-        """Builds qpos: joints within their ranges, linkages closed, objects in place, rescaled ones on the table."""
+        """Builds qpos: joints within their ranges, everything else in its place, linkages closed."""
         joints = jnp.clip(start.joint_pos, *self._range)
         qpos = jnp.asarray(self._qpos0).at[self._viewer.qpos_ids].set(joints)
-        qpos = self._fixtures.qpos(qpos, start.fixtures, fields)
+        qpos = self._parts.qpos(qpos, start, fields)
         for coupling in self._coupled:
             qpos = qpos.at[coupling.follower].set(coupling.position(qpos))
-        for name, (at, _) in self._viewer.objects.items():
-            qpos = qpos.at[at : at + 7].set(jnp.concatenate([start.object_pos_w[name], start.object_quat_w[name]]))
-            if "geom_size" in fields and self.cfg.scene.objects[name].shape != "mesh":
-                geom = self.physics_model.geom(name).id
-                factor = fields["geom_size"][geom, 0] / self.physics_model.geom_size[geom, 0]
-                qpos = qpos.at[at + 2].add((factor - 1) * self.cfg.scene.objects[name].rest_height)
         return qpos
 
     def _memory(self, key: Key, sim: Sim, carry: Carry) -> dict[str, Any]:
@@ -342,13 +308,7 @@ class ManipulationEnv(Env):
 
     def _scenery(self, sim: Sim, carry: Carry) -> Scenery:
         goal, _ = self._viewer.goal(carry)
-        boxes, look = self._obstacles.views(sim.fields), dict(carry.memory.get(LOOK, {}))
-        if SHAPE in carry.memory:
-            colors = look.get("geom_rgba", jnp.asarray(self.mj_model.geom_rgba, jnp.float32))
-            look |= bank.look(self.mj_model, self._banks.counts, carry.memory[SHAPE], colors)
-        if self.cfg.scene.fixtures:
-            look |= self._fixtures.drawn(self.mj_model, sim.fields)
-        return Scenery(goal, carry.command_quat, boxes, self._appearances(sim, carry), look)
+        return Scenery(goal, carry.command_quat, **self._parts.scenery(sim, carry, dict(carry.memory.get(LOOK, {}))))
 
     def _pictures(self, sim: Sim, carry: Carry, *due: Mapping[str, Bool[Array, ""]]) -> dict[str, Picture]:
         return self.cameras(sim, self._scenery(sim, carry), *due)
@@ -358,27 +318,6 @@ class ManipulationEnv(Env):
         lenses = {f"sensors.{name}": term.made for name, term in self.cfg.sensors.items()}
         rare = {name: lens for name, lens in lenses.items() if isinstance(lens, Lens) and lens.every > 1}
         return {lens.camera: lens.due(carry.memory[name]) for name, lens in rare.items()}
-
-    def _differing(self) -> Mapping[str, Any]:
-        """The objects whose drawn size or colour differs from episode to episode."""
-        drawn = {"geom_size", "geom_rgba"} & {*self._randomization.names, *(obstacles.FIELDS if self.cfg.obstacles else ())}
-        return self.cfg.scene.objects if drawn or self.cfg.command.targets else {}
-
-    def _appearances(self, sim: Sim, carry: Carry) -> dict[str, Appearance]:
-        """Collects drawn sizes and colours of objects; the commanded one of the targets gets the goal's green."""
-        fields, model, targets = sim.fields, self.physics_model, self.cfg.command.targets
-        colors = carry.memory.get(LOOK, {}).get("geom_rgba")
-        out = {}
-        for name in self._differing():
-            geom = model.geom(name).id
-            size, rgba = (jnp.asarray(fields.get(f, getattr(model, f)), jnp.float32)[geom] for f in ("geom_size", "geom_rgba"))
-            if colors is not None:
-                rgba = colors[self.mj_model.geom(name).id]
-            if name in targets:
-                commanded = carry.memory[TARGET] == targets.index(name)
-                rgba = jnp.where(commanded, jnp.array(scene.COMMANDED), rgba)
-            out[name] = Appearance(size, rgba)
-        return out
 
     @_precise
     def observe(self, sim: Sim, carry: Carry, key: Key) -> tuple[dict[str, Any], Carry]:
@@ -471,7 +410,7 @@ class ManipulationEnv(Env):
             return sim, memory
         recall, view, qvel = terms.Recall(memory), self._viewer(sim, carry, carry.action), sim.qvel
         for name, term in self.cfg.pushes.items():
-            dof = self._viewer.objects[term.params["object"]][1]
+            dof = int(self.physics_model.joint(term.params["object"]).dofadr[0])
             qvel = qvel.at[dof : dof + 3].add(toward(memory.get(LEVEL), jnp.zeros(3), recall(f"pushes.{name}", term, view)))
         return dataclasses.replace(sim, qvel=qvel), recall.memory
 

@@ -1,6 +1,6 @@
 """Terms about the joints of fixtures, such as drawers and doors: reset events, observations, rewards, success and a metric.
 
-A way is the distance that a joint has still to go, as the handle moves: in metres for slides and hinges alike.
+A way is a distance that the handle has to go: in metres for slides and hinges alike.
 """
 
 import dataclasses
@@ -106,7 +106,7 @@ def turn_to_handle(view: View, *, handle: Handle) -> Float[Array, "3"]:
 
 
 def joint(view: View, *, handle: Handle) -> Float[Array, "2"]:
-    """Position of the joint, and what it lacks to its target, signed [rad or m]."""
+    """Position of the joint, and its signed distance to the target [rad or m]."""
     at = _fixture(view, handle).joint_pos[handle.joint]
     return jnp.stack([at, target(view, handle) - at])
 
@@ -120,12 +120,12 @@ def joint_velocity(view: View, *, handle: Handle) -> Float[Array, "1"]:
 
 
 def opening_way(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Way that is left until the joint is as far as its target, or farther: ``lever * max(0, target - position)`` [m]."""
+    """Distance that the handle has still to go to the target, 0 beyond it: ``lever * max(0, target - position)`` [m]."""
     return handle.lever * jnp.maximum(0.0, target(view, handle) - _fixture(view, handle).joint_pos[handle.joint])
 
 
 def turning_way(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Way from the joint to its target, on either side: ``lever * |target - position|`` [m]."""
+    """Distance of the handle from the target, on either side: ``lever * |target - position|`` [m]."""
     return handle.lever * jnp.abs(target(view, handle) - _fixture(view, handle).joint_pos[handle.joint])
 
 
@@ -174,7 +174,7 @@ def opening(view: View, *, handle: Handle) -> Float[Array, ""]:
 
 
 def turning(view: View, *, handle: Handle, std: Positive) -> Float[Array, ""]:
-    """1 - tanh(d / std), where d is what the joint lacks to its target [rad or m]."""
+    """1 - tanh(d / std), where d is the joint's distance from its target [rad or m]."""
     return 1.0 - jnp.tanh(turning_way(view, handle=handle) / handle.lever / std)
 
 

@@ -71,7 +71,7 @@ class Lens:
     hold: Share = 1.0
 
     def due(self, memory: tuple) -> Bool[Array, ""]:
-        """Whether the next ``step`` looks at the picture; otherwise none has to be drawn for it."""
+        """True if the next ``step`` looks at the picture. Otherwise nobody has to draw it."""
         return memory[3][0] % self.every == 0 if self.every > 1 else jnp.ones((), bool)
 
     def init(self, key: Key, view: View) -> tuple:

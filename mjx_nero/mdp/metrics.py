@@ -108,7 +108,7 @@ def grasping(**held: Any) -> dict[str, MetricTerm]:
         held: parameters of ``rewards.held``.
     """
     return {
-        "grasped": MetricTerm(Grasped, params=held, over="rate", figure="grasp"),
+        "grasped": MetricTerm(Grasped, params=held, over="rate", figure="grasp", milestone=True),
         "grasp_time": MetricTerm(GraspTime, params=held, where="grasped", figure="time_to_grasp"),
     }
 

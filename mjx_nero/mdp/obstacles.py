@@ -15,7 +15,7 @@ from mjx_nero.config.bounds import Positive, PositiveRange, Range
 from mjx_nero.types import Key, ObstacleView, UserError, View
 
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
-_PARKED, _SMALL = np.array([0.0, 0.0, -0.5], np.float32), np.full(3, 0.05, np.float32)  # the values of ``scene.ObstacleCfg``
+_PARKED, _SMALL = np.array([0.0, 0.0, -0.5], np.float32), np.full(3, 0.05, np.float32)  # as ``ObstacleCfg`` has them
 _BELOW, _ABOUT = (0.06, 0.1), (-0.03, 0.02)  # [m] a shelf's board is this far below the goal, its end's top this far above
 _DEEP = 0.05  # [m] a shelf's board reaches this much farther behind the goal than in front of it
 Box = tuple[Float[Array, "3"], Float[Array, "3"]]  # centre; edges along the path, across it and up [m]

@@ -134,12 +134,15 @@ class MetricTerm(Term):
         over: how episodes combine: their ``mean``, or the ``rate`` of episodes whose number is above 0.
         where: another metric; the mean covers only episodes where that metric is above 0. Empty: all episodes.
         figure: name of the result, before the suffix ``_mean`` or ``_rate``. Empty: the metric's own name.
+        milestone: the hard part of the task is done once it is true, as a grasp is. Its memory is true from then on, and expert
+            starts lie around that moment (``learn.runs.starts``).
     """
 
     at_end: bool = dataclasses.field(default=True, kw_only=True)
     over: Annotated[str, OneOf("mean", "rate")] = dataclasses.field(default="mean", kw_only=True)
     where: str = dataclasses.field(default="", kw_only=True)
     figure: str = dataclasses.field(default="", kw_only=True)
+    milestone: bool = dataclasses.field(default=False, kw_only=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -105,7 +105,7 @@ class Randomization:
 
 
 def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:
-    """Undos decisions of MuJoCo's compiler that would make it ignore a drawn field.
+    """Undoes decisions of MuJoCo's compiler that would make it ignore a drawn field.
 
     Raises:
         UserError: a decision cannot be undone.

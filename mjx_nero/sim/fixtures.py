@@ -6,7 +6,7 @@ A fixture's joints are part of ``qpos``. Where it stands differs from episode to
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import mujoco
@@ -17,8 +17,9 @@ from mjx_nero import math
 from mjx_nero.config.values import hint, short
 from mjx_nero.sim import linkage, model_file
 from mjx_nero.sim.kinematics import Chain
+from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.sim.robot import ASSETS
-from mjx_nero.types import FixtureStart, FixtureView, UserError
+from mjx_nero.types import Carry, FixtureStart, FixtureView, Sim, Start, UserError
 
 FOLDER, MODEL = ASSETS / "fixtures", "model.xml"
 FIELDS = ("body_pos", "body_quat")
@@ -121,68 +122,74 @@ def add(spec: mujoco.MjSpec, fixtures: Mapping[str, FixtureCfg], visuals: bool =
         spec.attach(model, prefix=f"{name}/", frame=body.add_frame())
 
 
-class Fixtures:
-    """Converts the fixtures of one world between views, starts and what the physics knows.
+class Fixtures(Part):
+    """The fixtures of a scene.
 
     Args:
         model: compiled scene.
         cfg: the scene's fixtures by name.
+        drawn: makes the scene's model for pictures.
     """
 
-    def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, FixtureCfg]):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        cfg: Mapping[str, FixtureCfg],
+        drawn: Callable[[], mujoco.MjModel] | None = None,
+    ):
+        self._drawn = drawn
+        self.fields = self.seen = FIELDS if cfg else ()
         self._rows = {name: int(model.body(name).id) for name in cfg}
         self._chains = {name: chain(each.file) for name, each in cfg.items()}
         self._joints = {name: [model.joint(f"{name}/{j}") for j in self._chains[name].joints] for name in cfg}
         self._nominal = {field: np.array(getattr(model, field), np.float32) for field in (*FIELDS, "jnt_range")}
         self._qpos0 = np.array(model.qpos0, np.float32)
 
-    def blank(self) -> dict[str, FixtureStart]:
+    def blank(self) -> dict[str, dict[str, FixtureStart]]:
         """Returns where the fixtures are before any reset event."""
+        return {"fixtures": {name: self._start(name, row) for name, row in self._rows.items()}}
+
+    def _start(self, name: str, row: int) -> FixtureStart:
         pos, quat = (self._nominal[field] for field in FIELDS)
-        return {
-            name: FixtureStart(
-                pos_w=jnp.asarray(pos[row]),
-                quat_w=jnp.asarray(quat[row]),
-                joint_pos={
-                    joint: jnp.asarray(self._qpos0[int(at.qposadr[0])])
-                    for joint, at in zip(self._chains[name].joints, self._joints[name], strict=True)
-                },
-            )
-            for name, row in self._rows.items()
-        }
+        return FixtureStart(
+            pos_w=jnp.asarray(pos[row]),
+            quat_w=jnp.asarray(quat[row]),
+            joint_pos={
+                joint: jnp.asarray(self._qpos0[int(at.qposadr[0])])
+                for joint, at in zip(self._chains[name].joints, self._joints[name], strict=True)
+            },
+        )
 
-    def fields(self, fields: Mapping[str, Array], start: Mapping[str, FixtureStart]) -> dict[str, Array]:
-        """Returns ``fields`` with the fixtures where they stand."""
-        if not start:
-            return dict(fields)
-        pos, quat = (jnp.asarray(fields.get(field, self._nominal[field])) for field in FIELDS)
+    def given(self, start: Start) -> Fields:
+        """Returns the fields that say where the fixtures stand."""
+        pos, quat = (jnp.asarray(self._nominal[field]) for field in FIELDS)
         for name, row in self._rows.items():
-            pos, quat = pos.at[row].set(start[name].pos_w), quat.at[row].set(start[name].quat_w)
-        return {**fields, **dict(zip(FIELDS, (pos, quat), strict=True))}
+            seen = start.fixtures[name]
+            pos, quat = pos.at[row].set(seen.pos_w), quat.at[row].set(seen.quat_w)
+        return dict(zip(FIELDS, (pos, quat), strict=True)) if self._rows else {}
 
-    def qpos(
-        self, qpos: Float[Array, " nq"], start: Mapping[str, FixtureStart], fields: Mapping[str, Array]
-    ) -> Float[Array, " nq"]:
-        """Returns ``qpos`` with the fixtures' joints where they begin, within their ranges."""
+    def qpos(self, qpos: Float[Array, " nq"], start: Start, fields: Fields) -> Float[Array, " nq"]:
+        """Puts the fixtures' joints where they begin, within their ranges."""
         for name, joints in self._joints.items():
             ranges = self._ranges(name, fields)
             for joint, at in zip(self._chains[name].joints, joints, strict=True):
-                qpos = qpos.at[int(at.qposadr[0])].set(jnp.clip(start[name].joint_pos[joint], *ranges[joint]))
+                qpos = qpos.at[int(at.qposadr[0])].set(jnp.clip(start.fixtures[name].joint_pos[joint], *ranges[joint]))
         return qpos
 
-    def views(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], fields: Mapping[str, Array]) -> dict[str, FixtureView]:
-        """Returns the fixtures by name."""
-        return {name: self._view(name, qpos, qvel, fields) for name in self._rows}
+    def view(self, sim: Sim, carry: Carry) -> dict[str, dict[str, FixtureView]]:
+        """Returns ``fixtures`` of a view."""
+        return {"fixtures": {name: self._view(name, sim.qpos, sim.qvel, sim.fields) for name in self._rows}}
 
-    def drawn(self, model: mujoco.MjModel, fields: Mapping[str, Array]) -> dict[str, Array]:
-        """Returns the fields of another model of the scene, the drawn one, with the fixtures where they stand."""
-        out = {}
-        for field in FIELDS if self._rows else ():
-            values = jnp.asarray(getattr(model, field), jnp.float32)
+    def scenery(self, sim: Sim, carry: Carry, look: Fields) -> dict[str, Fields]:
+        """Returns the fields of the drawn model with the fixtures where they stand."""
+        if not self._rows or not self._drawn:
+            return {}
+        model, out = self._drawn(), dict(look)
+        for field in FIELDS:
+            out[field] = jnp.asarray(getattr(model, field), jnp.float32)
             for name, row in self._rows.items():
-                values = values.at[model.body(name).id].set(fields[field][row])
-            out[field] = values
-        return out
+                out[field] = out[field].at[model.body(name).id].set(sim.fields[field][row])
+        return {"look": out}
 
     def _view(self, name: str, qpos: Array, qvel: Array, fields: Mapping[str, Array]) -> FixtureView:
         found, joints, row = self._chains[name], self._joints[name], self._rows[name]

@@ -16,6 +16,7 @@ import numpy as np
 
 from mjx_nero import files
 from mjx_nero.errors import UserError
+from mjx_nero.sim.cameras.look import rows
 from mjx_nero.types import Scenery
 
 NO_GL = (
@@ -131,12 +132,8 @@ class Renderer:
     def _forward(self, qpos: np.ndarray, scenery: Scenery) -> None:
         for name, values in scenery.look.items():
             getattr(self._model, name)[:] = values
-        for name, look in scenery.objects.items():
-            geom = self._model.geom(name)
-            geom.size[:], geom.rgba[:] = look.size, look.rgba
-        for name, box in scenery.obstacles.items():
-            geom = self._model.geom(name)
-            geom.pos[:], geom.quat[:], geom.size[:] = box.pos_w, box.quat_w, np.asarray(box.size) / 2
+        for field, row, value in rows(self._model, scenery):
+            getattr(self._model, field)[row] = value
         self._data.qpos[:] = qpos
         self._data.mocap_pos[0], self._data.mocap_quat[0] = scenery.goal_pos_w, scenery.goal_quat_w
         mujoco.mj_forward(self._model, self._data)

@@ -1,5 +1,4 @@
-"""Contacts of the robot: unwanted ones, with obstacles or with itself, and those with objects. Puts obstacles into the model and
-reads the contact forces.
+"""Contacts of the robot: unwanted ones, with obstacles or with itself, and those with objects. Adds their sensors and reads them.
 
 The force is the strongest contact of each obstacle and each pair of links, from MuJoCo's contact sensors: all three backends have
 them with the same meaning. A net force on a link would hide a link that is squeezed. Distances between all shapes would cost time
@@ -11,7 +10,7 @@ import copy
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -25,58 +24,20 @@ OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes wit
 COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
 NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
 # Shapes that every backend can collide with a box.
-_MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
+MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
 _SAMPLES = 1000  # postures in which links are tested
 _ALWAYS = 0.9  # links that touch in this share of the postures are built that way
-_ANYWHERE = 10.0  # [m] half the edge of the bounding box of an obstacle, which may stand anywhere
 
 Pair = tuple[int, int]  # geoms
 Depths = dict[Pair, float]
 
 
-def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, Any], objects: tuple[str, ...], pairs) -> None:
-    """Adds obstacles to a scene, lets robot and objects collide with them, and adds sensors for their contacts.
-
-    Args:
-        spec: robot and objects.
-        base: the robot's base link.
-        obstacles: ``scene.ObstacleCfg`` by name.
-        objects: names of objects; body and geom share a name.
-        pairs: names of the robot's geoms that can collide.
-
-    Raises:
-        UserError: a name is taken, or a shape cannot collide with a box on every backend.
-    """
-    shapes = [*_collision_shapes(spec, base), *(spec.geom(name) for name in objects)]
-    if obstacles:
-        # Under a body that can be moved (though nobody does): MuJoCo Warp takes what is fixed to the world to be where it was.
-        body = spec.worldbody.add_body(name="obstacles", mocap=True)
-        for geom in shapes:
-            if geom.type not in _MEETS_BOX:
-                kind = mujoco.mjtGeom(geom.type).name.removeprefix("mjGEOM_").lower()
-                raise UserError(
-                    f"scene.obstacles cannot meet {geom.name or geom.parent.name!r}, a {kind}: only spheres, capsules, boxes and "
-                    "meshes meet boxes on every backend"
-                )
-            geom.conaffinity |= OBSTACLE
-    for name, item in obstacles.items():
-        if spec.geom(name):
-            raise UserError(f"scene.obstacles.{name} needs another name: the robot or the scene has one that is called so")
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[edge / 2 for edge in item.size],
-            pos=item.pos,
-            quat=item.quat,
-            contype=OBSTACLE,
-            conaffinity=0,
-            mass=0,
-            rgba=item.rgba,
-        )
-        _add_sensor(spec, name, None)
-    for first, second in pairs:
+def add_pairs(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
+    """Lets shapes of the robot collide with one another (``self_pairs``), and adds sensors for their contacts."""
+    collision_shapes(spec, robot.base_link)  # names them
+    for first, second in self_pairs(robot):
         spec.add_pair(geomname1=first, geomname2=second)
-        _add_sensor(spec, first, second)
+        add_sensor(spec, first, second)
 
 
 def add_hand(spec: mujoco.MjSpec, base: str, objects: tuple[str, ...]) -> None:
@@ -87,12 +48,12 @@ def add_hand(spec: mujoco.MjSpec, base: str, objects: tuple[str, ...]) -> None:
         base: the robot's base link.
         objects: names of objects; body and geom share a name.
     """
-    for shape in _collision_shapes(spec, base):
+    for shape in collision_shapes(spec, base):
         for name in objects if shape.contype or shape.conaffinity else ():
-            _add_sensor(spec, name, shape.name, HAND)
+            add_sensor(spec, name, shape.name, HAND)
 
 
-def _collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
+def collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     """Lists the robot's collision shapes and names those without a name."""
     geoms = [geom for geom in spec.body(base).find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.conaffinity or geom.group == COLLISION]
     for i, geom in enumerate(geoms):
@@ -100,7 +61,8 @@ def _collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     return geoms
 
 
-def _add_sensor(spec: mujoco.MjSpec, first: str, second: str | None, reading: str = NAME) -> None:
+def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, reading: str = NAME) -> None:
+    """Adds a sensor of the strongest contact of a geom: with another one, or with anything."""
     data, strongest = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2
     spec.add_sensor(
         name=":".join(filter(None, (reading, first, second))),
@@ -110,16 +72,6 @@ def _add_sensor(spec: mujoco.MjSpec, first: str, second: str | None, reading: st
         **({"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": second} if second else {}),
         intprm=[data, strongest, 1],
     )
-
-
-def unbounded(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Makes the model ready for obstacles anywhere: MuJoCo derives bounds from their first poses, and these must hold for all."""
-    for geom in np.flatnonzero(model.geom_contype & OBSTACLE):
-        body = model.geom_bodyid[geom]
-        model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        model.geom_aabb[geom, 3:] = _ANYWHERE
-        model.bvh_aabb[model.body_bvhadr[body] : model.body_bvhadr[body] + model.body_bvhnum[body], 3:] = _ANYWHERE
-    return model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +118,7 @@ def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
     found = [pair for pair in _now_and_then(home, others) if pair not in home]
     for a, b in found:
         kinds = {mujoco.mjtGeom(model.geom_type[g]) for g in (a, b)}
-        if not kinds <= _MEETS_BOX:
+        if not kinds <= MEETS_BOX:
             names = " and ".join(repr(model.geom(g).name) for g in (a, b))
             raise UserError(f"scene.self_collision: {names} of {robot.name} are shapes that not every backend brings together")
     return tuple((model.geom(a).name, model.geom(b).name) for a, b in found)
@@ -205,7 +157,7 @@ def _depths(robot: RobotCfg) -> tuple[mujoco.MjModel, list[Depths]]:
     """The robot with shapes that all meet, and how deep those of links that do not follow one another lie within one another
     [m], in each of ``_postures``."""
     spec = robot_file.model(robot)
-    shapes = _collision_shapes(spec, robot.base_link)
+    shapes = collision_shapes(spec, robot.base_link)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     for geom in shapes:

@@ -1,4 +1,4 @@
-"""The table of public robots: each of a list imported, its self-test included. See --help."""
+"""The table of public robots: imports each robot of a list and runs its self-test. See --help."""
 
 import pathlib
 import re
@@ -31,7 +31,7 @@ class Public:
     file: str
     """Path in the repository."""
     flags: str = ""
-    """What import-urdf takes besides."""
+    """Further flags of import-urdf."""
     packages: tuple[str, ...] = ()
     """Folders OWNER+NAME/... of packages that it mentions; NAME=OWNER+NAME/... of one that it calls by another name."""
 
@@ -118,7 +118,7 @@ def _below(folder: pathlib.Path, package: str) -> str:
 
 
 def _failure(command: str, *words: object) -> str:
-    """The line in which a command ends that fails, else nothing."""
+    """Returns the last line of a command that fails; empty if it succeeds."""
     line = [sys.executable, "-m", "mjx_nero", command, *map(str, words)]
     try:
         done = subprocess.run(line, capture_output=True, text=True, timeout=_LONGEST, check=False)
@@ -140,7 +140,7 @@ def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
 
 
 def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Mapping[str, dict[str, Any]]) -> str:
-    """The table as Markdown, a row a robot that was tried."""
+    """Returns the table as Markdown, one row for each robot that was tried."""
     tested = [row["self_test"] for row in held.values() if "failed" not in row]
     good, placed = (sum(row["script"] == "pick_place" and row[name] >= ENOUGH for row in tested) for name in ("good", "placed"))
     lines = [_COLUMNS, tuple("---" for _ in _COLUMNS)]

@@ -38,7 +38,7 @@ class Run:
     predicted: np.ndarray
 
     def errors(self) -> np.ndarray:
-        """Root mean square of their differences [n] [rad or m]."""
+        """Root mean square difference of measured and predicted positions, by joint [n] [rad or m]."""
         return np.sqrt(np.mean((self.predicted - self.measured) ** 2, axis=0))
 
 
@@ -99,7 +99,7 @@ class Picture:
         self.show(0.0)
 
     def show(self, time: float) -> None:
-        """Poses both as they were then [s]."""
+        """Poses both robots as they were at a time [s]."""
         k = min(int(np.searchsorted(self._run.times, time)), len(self._run.times) - 1)
         poses = []
         for positions in (self._run.measured, self._run.predicted):
@@ -113,7 +113,7 @@ class Picture:
                 handle.position, handle.wxyz = position + [0.0, which * _APART, 0.0], quaternion
 
     def step(self) -> None:
-        """The next picture: on in time, where it plays."""
+        """Shows the next picture; while playing, time goes on."""
         if self.playing.value:
             self.slider.value = (self.slider.value + 1 / _RATE) % float(self._run.times[-1])
         self.show(self.slider.value)

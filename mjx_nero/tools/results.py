@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def learnable() -> list[str]:
-    """Environments with a robot of their own, and with actions that are made to be learnt."""
+    """Lists the environments that have a robot of their own and actions for policies."""
     cfgs = {name: registry.env_cfg(name) for name in registry.list_envs() if registry.robot_of(name) is not None}
     return [name for name, cfg in cfgs.items() if for_controllers(cfg) is not cfg]
 
@@ -134,7 +134,7 @@ def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 
 def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
-    """Cells of the table, a row an environment."""
+    """Returns the table's cells, one row for each environment."""
     for env, kinds in held.items():
         learnt, native, warp = (kinds.get(name) for name in ("learning", "native", "warp"))
         of = dict.fromkeys(f"{row['version']}, {row['machine']}" for row in (learnt, native, warp) if row)
@@ -150,7 +150,7 @@ def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
 
 
 def page(cells: Sequence[tuple[str, ...]], json_name: str, page_name: str) -> str:
-    """A page of Markdown: what the columns mean, then a table a task."""
+    """Returns a page of Markdown: the meaning of the columns, then one table for each task."""
     tasks: dict[str, list[tuple[str, ...]]] = {}
     for line in cells:
         tasks.setdefault(task_of(line[0]), []).append(line)

@@ -6,6 +6,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import views
 
 from mjx_nero import UserError, control
 from mjx_nero.control import pick_up
@@ -28,25 +29,14 @@ def seen(index: int, quat=(1.0, 0.0, 0.0, 0.0), others=(), height=0.05) -> View:
     still = {"linvel_w": jnp.zeros(3), "angvel_local": jnp.zeros(3)}
     target = ObjectView(pos_w=jnp.array([0.5, 0.1, height]), quat_w=jnp.array(quat), **still)
     away = {f"other{i}": dataclasses.replace(target, pos_w=target.pos_w + jnp.array([*xy, 0.0])) for i, xy in enumerate(others)}
-    joints = jnp.array(COBOTTA_PRO_900.home)
-    zero, still_4 = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-    return View(
-        joint_pos=joints,
+    joints = dict.fromkeys(("joint_pos", "default_joint_pos", "ctrl"), jnp.array(COBOTTA_PRO_900.home))
+    return views.blank(
+        **joints,
         joint_vel=jnp.zeros(8),
-        default_joint_pos=joints,
-        ctrl=joints,
         ee_pos_w=jnp.array([0.5, 0.0, 0.28]),
         ee_quat_w=jnp.array(COBOTTA_PRO_900.down),
         objects={"itself": target, **away, "target": target},
-        root_pos_w=zero,
-        command=zero,
         goal_pos_w=jnp.array([0.5, 0.0, 0.3]),
-        goal_quat_w=still_4,
-        goal_linvel_w=zero,
-        action=zero,
-        last_action=zero,
-        step=jnp.zeros((), jnp.int32),
-        time=jnp.zeros(()),
         target=jnp.array(index),
     )
 

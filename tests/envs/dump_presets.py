@@ -1,10 +1,11 @@
 """Dumps what every environment and preset does for 100 random actions in MuJoCo's C library, and compares two such dumps.
 
-    python tests/envs/dump_presets.py dump FOLDER [NAME ...]
+    python tests/envs/dump_presets.py dump FOLDER [NAME ...] [--bare]
     python tests/envs/dump_presets.py compare FOLDER OTHER
 
 No test: it tells whether a change of the code left the tasks as they were, bit for bit. Run ``dump`` before and after the change,
-each with the package of its own checkout on ``PYTHONPATH``. Environments for any robot are dumped for two of them.
+each with the package of its own checkout on ``PYTHONPATH``. Environments for any robot are dumped for two of them. ``--bare``
+leaves out what version 0.5.0 cannot tell: the named observations and what a picture shows.
 """
 
 import os
@@ -37,13 +38,14 @@ def cases() -> list[tuple[str, str, str | None]]:
     return found
 
 
-def played(env_name: str, preset: str, robot: str | None) -> dict[str, np.ndarray]:
+def played(env_name: str, preset: str, robot: str | None, bare: bool = False) -> dict[str, np.ndarray]:
     """Name -> array [steps, environments, ...] of all that a learner sees of an environment, and of what its drives do."""
     env = mjx_nero.make(env_name, preset, impl="native", num_envs=NUM_ENVS, robot=robot, episode_length_s=EPISODE_S)
     train_env = wrappers.for_training(env)
 
     def seen(state):
         sim = state.pipeline_state
+        more = {} if bare else {"scenery": jax.vmap(env.scenery)(state), "exact": env.named_observations(state)}
         return {
             "obs": state.obs,
             "reward": state.reward,
@@ -54,8 +56,7 @@ def played(env_name: str, preset: str, robot: str | None) -> dict[str, np.ndarra
             "qpos": sim.qpos,
             "qvel": sim.qvel,
             "fields": sim.fields,
-            "scenery": jax.vmap(env.scenery)(state),
-            "exact": env.named_observations(state),
+            **more,
         }
 
     step = jax.jit(train_env.step)
@@ -71,7 +72,7 @@ def played(env_name: str, preset: str, robot: str | None) -> dict[str, np.ndarra
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def dump(folder: pathlib.Path, names: list[str]) -> None:
+def dump(folder: pathlib.Path, names: list[str], bare: bool = False) -> None:
     """Writes a file a case, of all cases or those whose name contains one of ``names``; those that exist are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for env, preset, robot in cases():
@@ -81,7 +82,7 @@ def dump(folder: pathlib.Path, names: list[str]) -> None:
             continue
         begun = time.monotonic()
         try:
-            arrays = played(env, preset, robot)
+            arrays = played(env, preset, robot, bare)
         except mjx_nero.UserError as error:
             arrays = {"error": np.array(str(error))}
         np.savez(path.with_suffix(".part.npz"), **arrays)
@@ -118,12 +119,13 @@ def main() -> None:
     dumps = commands.add_parser("dump")
     dumps.add_argument("folder", type=pathlib.Path)
     dumps.add_argument("names", nargs="*")
+    dumps.add_argument("--bare", action="store_true")
     compares = commands.add_parser("compare")
     compares.add_argument("folder", type=pathlib.Path)
     compares.add_argument("other", type=pathlib.Path)
     args = parser.parse_args()
     if args.command == "dump":
-        dump(args.folder, args.names)
+        dump(args.folder, args.names, args.bare)
     else:
         sys.exit(bool(compare(args.folder, args.other)))
 

@@ -280,11 +280,11 @@ def test_grasp_time_is_the_first(env, finish, start):
 
 def test_curriculum_follows_the_count_of_steps():
     recipe = make("nero_lift", "isaac", impl="native")
-    state = recipe.reset(jax.random.PRNGKey(0))
+    state, finish = jax.jit(recipe.reset)(jax.random.PRNGKey(0)), jax.jit(recipe.finish)
     assert float(state.info["count"]) == 0
     for count, weight in [(9_999, -1e-4), (10_000, -1e-1)]:
         state.info["count"] = jnp.asarray(count, jnp.int32)
-        after = recipe.finish(state, jnp.ones(8), state.pipeline_state, jnp.zeros(()))
+        after = finish(state, jnp.ones(8), state.pipeline_state, jnp.zeros(()))
         assert float(after.metrics["reward/action_rate"]) == pytest.approx(0.02 * weight * 8)
         assert int(after.info["count"]) == count + 1
 
@@ -308,7 +308,7 @@ def test_goal_is_drawn_anew_every_resample_time(finish, start):
 
 
 def test_lost_contacts_are_counted(env, start):
-    after = env.finish(start, jnp.zeros(8), start.pipeline_state, jnp.ones(()))
+    after = jax.jit(env.finish)(start, jnp.zeros(8), start.pipeline_state, jnp.ones(()))
     assert float(after.metrics["overflow"]) == 1
 
 
@@ -478,7 +478,7 @@ def follow():
 
 
 def test_goal_runs_round_its_circle(follow):
-    state = follow.reset(jax.random.PRNGKey(0))
+    state, scenery = follow.reset(jax.random.PRNGKey(0)), jax.jit(follow.env.scenery)
     center, sim, dt, rounds = np.asarray(state.info["carry"].command), state.pipeline_state, follow.env.dt, []
     for step in range(0, 201, 10):  # four seconds
         view = follow.view(at_step(state, step))
@@ -488,7 +488,7 @@ def test_goal_runs_round_its_circle(follow):
         np.testing.assert_allclose(view.goal_linvel_w, velocity, atol=1e-6)
         np.testing.assert_array_equal(view.goal_quat_w, [0, 0, 1, 0])
         np.testing.assert_array_equal(view.command, center)  # as drawn
-        np.testing.assert_allclose(follow.env.scenery(at_step(state, step)).goal_pos_w, view.goal_pos_w, atol=1e-7)
+        np.testing.assert_allclose(scenery(at_step(state, step)).goal_pos_w, view.goal_pos_w, atol=1e-7)
         rounds.append(np.asarray(view.goal_pos_w))
     np.testing.assert_allclose(rounds[0], rounds[-1], atol=1e-6)
     after = follow.finish(state, sim.ctrl, sim, jnp.zeros(()))  # and with the steps of the episode
@@ -505,7 +505,7 @@ def test_velocity_of_the_goal_is_that_of_its_positions(follow):
 
 def test_a_goal_without_motion_stays(env, start):
     for step in (0, 100):
-        view = env.view(at_step(start, step))
+        view = jax.jit(env.view)(at_step(start, step))
         np.testing.assert_array_equal(view.goal_pos_w, view.command)
         np.testing.assert_array_equal(view.goal_linvel_w, [0, 0, 0])
         np.testing.assert_array_equal(view.goal_quat_w, [1, 0, 0, 0])
@@ -570,7 +570,7 @@ def test_a_linkage_starts_closed(offset):
 
 def test_observations_by_name(follow):
     state = follow.reset(jax.random.PRNGKey(0))
-    named = follow.env.named_observations(state)
+    named = jax.jit(follow.env.named_observations)(state)
     assert list(named) == ["state"] and list(named["state"]) == list(follow.env.cfg.observations["state"].terms)
     np.testing.assert_array_equal(jnp.concatenate(list(named["state"].values())), state.obs["state"])
     np.testing.assert_array_equal(named["state"]["target_orientation"], [0, 0, 1, 0])

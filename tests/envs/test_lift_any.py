@@ -1,6 +1,7 @@
 """Lift any: which shapes come, how they lie, what their worlds weigh, what counts as held, and the expert that lifts them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from mjx_nero.mdp import observations, rewards
 from mjx_nero.sim import grasp, objects, scene
 from mjx_nero.sim.objects import bank, body, events, grasps, rests, shapes
 from mjx_nero.sim.physics.mjx import JaxPhysics
-from mjx_nero.types import ObjectView, ShapeView, Start
+from mjx_nero.types import SHAPE, ObjectView, ShapeView, Start
 
 WORLDS = 64
 
@@ -32,10 +33,18 @@ def starts(worlds):
     return jax.jit(jax.vmap(worlds.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
 
 
+@pytest.fixture(scope="module")
+def see(worlds):
+    """The thing in the views of a batch."""
+    return jax.jit(jax.vmap(lambda state: worlds.view(state).objects[THING]))
+
+
 def test_a_drawn_colour_stays_and_the_other_shapes_are_hidden(worlds):
     model, count = worlds.mj_model, len(SEEN)
     drawn = jnp.full((model.ngeom, 4), 0.5)
-    rgba = bank.look(model, {THING: count}, {THING: jnp.array(2)}, drawn)["geom_rgba"]
+    banks = bank.Banks(worlds.physics_model, worlds.cfg.scene.objects, lambda: model)
+    third = SimpleNamespace(memory={SHAPE: {THING: jnp.array(2)}})
+    rgba = banks.scenery(None, third, {"geom_rgba": drawn})["look"]["geom_rgba"]
     rows = np.array([model.geom(body.drawn_name(THING, k)).id for k in range(count)])
     assert rgba[rows, 3].tolist() == [float(k == 2) for k in range(count)]
     np.testing.assert_array_equal(rgba[:, :3], drawn[:, :3])
@@ -49,10 +58,10 @@ def test_a_quarter_is_held_out():
         assert (item.file, *item.bank) == files
 
 
-def test_every_world_has_the_masses_of_its_shape(worlds, starts):
+def test_every_world_has_the_masses_of_its_shape(worlds, starts, see):
     """What MuJoCo's compiler computes of a scene with that one shape."""
     fields, index = starts.pipeline_state.fields, np.asarray(starts.pipeline_state.fields["geom_dataid"])
-    which = np.asarray(jax.vmap(worlds.view)(starts).objects[THING].shape.index)
+    which = np.asarray(see(starts).shape.index)
     assert set(which) == set(range(len(SEEN)))
     for k, name in enumerate(SEEN):
         (world, *_) = np.flatnonzero(which == k)
@@ -73,10 +82,10 @@ def one(worlds, name):
     return dataclasses.replace(worlds.cfg.scene, objects={THING: lift_any.thing((name,))})
 
 
-def test_a_world_steps_as_a_scene_of_its_shape_alone(worlds, starts):
+def test_a_world_steps_as_a_scene_of_its_shape_alone(worlds, starts, see):
     """Ten control steps of each shape, the thing 2 cm above the table and turned, against MuJoCo itself."""
-    which = np.asarray(jax.vmap(worlds.view)(starts).objects[THING].shape.index)
-    at = worlds._viewer.objects[THING][0]
+    which = np.asarray(see(starts).shape.index)
+    at = int(worlds.physics_model.joint(THING).qposadr[0])
     state = starts.pipeline_state
     lifted = dataclasses.replace(state, qpos=state.qpos.at[:, at + 2].add(0.02).at[:, at + 1].add(1.0))
     step, after = jax.jit(jax.vmap(worlds.physics.step)), lifted
@@ -92,12 +101,12 @@ def test_a_world_steps_as_a_scene_of_its_shape_alone(worlds, starts):
         assert np.asarray(after.qpos)[world, at:][:3] == pytest.approx(data.qpos[at:][:3], abs=2e-4), name
 
 
-def test_things_lie_as_they_rest(worlds, starts):
+def test_things_lie_as_they_rest(worlds, starts, see):
     """After a second with the arm at home no thing has moved by more than 2 mm, or turned."""
     step, state = jax.jit(jax.vmap(worlds.step)), starts
     for _ in range(25):
         state = step(state, jnp.tile(worlds.home_action, (WORLDS, 1)))
-    before, after = (jax.vmap(worlds.view)(s).objects[THING] for s in (starts, state))
+    before, after = see(starts), see(state)
     assert np.linalg.norm(after.pos_w - before.pos_w, axis=1).max() < 2e-3
     for a, b in zip(np.asarray(before.quat_w), np.asarray(after.quat_w), strict=True):
         assert rests.up(a) @ rests.up(b) > np.cos(0.03)
@@ -108,7 +117,8 @@ def test_rests_are_drawn_as_often_as_they_come():
     """Of a mug alone, 4,000 times; and a full turn about the vertical."""
     pos = {"cube": jnp.array([0.1, 0.2, 0.0])}
     blank = Start(joint_pos=jnp.zeros(1), object_pos_w=pos, object_quat_w={"cube": jnp.array([1.0, 0, 0, 0])})
-    drawn = jax.vmap(lambda key: events.at_rest(key, blank, files=("mug",)))(jax.random.split(jax.random.PRNGKey(1), 4000))
+    draw = jax.jit(jax.vmap(lambda key: events.at_rest(key, blank, files=("mug",))))
+    drawn = draw(jax.random.split(jax.random.PRNGKey(1), 4000))
     mug = objects.find("mug")
     ups = np.array([rests.up(quat) for quat in np.asarray(drawn.object_quat_w["cube"])])
     own = np.array([rests.up(quat) for quat in mug.rest_quat])
@@ -185,7 +195,7 @@ def test_hands_can_grasp_every_object(robot):
 
 def test_jax_says_what_it_cannot(worlds):
     with pytest.raises(UserError, match="MJX-JAX cannot give an object another shape in each episode"):
-        JaxPhysics(worlds.physics_model, worlds.cfg.sim, worlds._banks.names)
+        JaxPhysics(worlds.physics_model, worlds.cfg.sim, worlds._parts.fields)
 
 
 def test_object_in_the_place_of_the_cube():
@@ -221,9 +231,10 @@ def test_expert_lifts_things():
 
 @pytest.mark.slow
 def test_training_runs(call):
-    """A few updates on a CPU."""
+    """A few updates on a CPU, of small networks in short episodes."""
     flags = ("--num-envs", 8, "--num-timesteps", 400, "--impl", "native", "--no-video", "--out", "run")
-    code, out, err = call("train", "--env", "nero_lift_any", *flags)
+    small = ("--ppo.network.actor", "(8,)", "--ppo.network.critic", "(8,)", "--env.episode_length_s", 0.2)
+    code, out, err = call("train", "--env", "nero_lift_any", *flags, *small)
     assert code == 0, (out, err)
 
 

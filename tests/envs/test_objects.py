@@ -195,7 +195,7 @@ def test_observations_come_late_and_begin_anew_with_the_episode():
     for _ in range(7):
         now = step(now, jnp.zeros((2, 8)))
         seen.append((np.asarray(now.obs["state"][0, 3:]) / 0.02).round().astype(int).tolist())
-        named = env.named_observations(now)["state"]  # of a batch, as it is now
+        named = jax.jit(env.named_observations)(now)["state"]  # of a batch, as it is now
         np.testing.assert_allclose(named["time"][:, 0], now.info["carry"].step * 0.02, atol=1e-6)
     # The third step ends the episode: from there on, time begins at 0.
     assert seen[2:] == [[0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 1, 2, 0, 1], [1, 1, 2, 3, 1, 2], [2, 2, 3, 4, 2, 3]]

@@ -21,7 +21,7 @@ def env():
 
 def placed(env, state, off=(0.0, 0.0, 0.0), degrees=0.0):
     """The state with the box at its goal but for an offset and a turn."""
-    shown, at = env.scenery(state), env.physics_model.joint("box").qposadr[0]
+    shown, at = jax.jit(env.scenery)(state), env.physics_model.joint("box").qposadr[0]
     goal = jnp.concatenate([shown.goal_pos_w, shown.goal_quat_w])
     turn = jnp.array([math.cos(math.radians(degrees) / 2), 0.0, 0.0, math.sin(math.radians(degrees) / 2)])
     w, z = goal[3] * turn[0] - goal[6] * turn[3], goal[3] * turn[3] + goal[6] * turn[0]

@@ -62,7 +62,7 @@ def test_the_arm_alone_acts():
     env = make("nero_reach", impl="native", **{"actions.delay.params.steps": (0, 0)})
     assert env.action_size == 7
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    targets = env.targets(state, jnp.full(7, 100.0))
+    targets = jax.jit(env.targets)(state, jnp.full(7, 100.0))
     np.testing.assert_allclose(targets[7:], NERO.gripper.home, atol=1e-7)
     assert (targets[:7] > state.pipeline_state.ctrl[:7]).all()
 
@@ -76,7 +76,7 @@ def test_joints_start_at_scaled_home(env):
 
 def test_success_needs_position_and_orientation_for_half_a_second(env, finish):
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    view = env.view(state)
+    view = jax.jit(env.view)(state)
     at, turn = view.ee_pos_w, view.ee_quat_w
     carry = state.info["carry"]
     off = jnp.array([0.015, 0.0, 0.0])

@@ -119,7 +119,7 @@ def test_critic_reads_the_privileged_group_where_there_is_one(env, trained, obs)
     recipe = make("nero_lift", "isaac", impl="native")
     nets = networks.make_networks(recipe.observation_size, recipe.action_size, CFG)
     normalizer, params = networks.init_params(nets, recipe.observation_size, jax.random.PRNGKey(0))
-    assert nets.value_network.apply(normalizer, params.value, recipe.reset(jax.random.PRNGKey(0)).obs).shape == ()
+    assert nets.value_network.apply(normalizer, params.value, jax.jit(recipe.reset)(jax.random.PRNGKey(0)).obs).shape == ()
 
 
 def test_policy_of_another_environment(env, trained, tmp_path):

@@ -60,7 +60,7 @@ def test_a_record_has_what_the_policy_saw_and_what_came_of_it(env, played):
 def test_targets_are_what_the_drives_were_told(env, played):
     steps, keep = played
     (state, action, _), first = steps[0], keep.episodes()[0]
-    want = jax.vmap(env.targets)(state, action)
+    want = jax.jit(jax.vmap(env.targets))(state, action)
     np.testing.assert_allclose(first.targets[0], want[0], atol=1e-6)
 
 

@@ -6,22 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import views
+from views import STILL
 
 from mjx_nero.mdp import commands, fixtures, randomization
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.mdp.randomization import Model
 from mjx_nero.types import FixtureStart, FixtureView, Start, View
 
-STILL = jnp.array([1.0, 0.0, 0.0, 0.0])
 DOOR = Handle("cabinet", "door", "bar", target=1.0, lever=0.2)
 KNOB = Handle("cabinet", "door", "bar", lever=0.2)  # where the command says
 
 
 def seen(at=0.5, ee=(0.4, 0.0, 0.3), turn=STILL, command=0.0, fingers=(0.0, 0.0), upper=2.0, speed=0.0) -> View:
     """A handle at (0.4, 0.3, 0.3), its joint at ``at``, and a hand with two fingers that close from 0.04 to 0."""
-    zero = jnp.zeros(3)
     fixture = FixtureView(
-        pos_w=zero,
+        pos_w=jnp.zeros(3),
         quat_w=STILL,
         joint_pos={"door": jnp.array(at)},
         joint_vel={"door": jnp.array(speed)},
@@ -29,23 +29,11 @@ def seen(at=0.5, ee=(0.4, 0.0, 0.3), turn=STILL, command=0.0, fingers=(0.0, 0.0)
         site_pos_w={"bar": jnp.array([0.4, 0.3, 0.3])},
         site_quat_w={"bar": STILL},
     )
-    return View(
-        joint_pos=zero,
-        joint_vel=zero,
-        default_joint_pos=zero,
+    return views.blank(
         ctrl=jnp.array([0.7, *fingers]),
         ee_pos_w=jnp.array(ee),
         ee_quat_w=jnp.asarray(turn),
-        objects={},
-        root_pos_w=zero,
         command=jnp.array([command, 0.0, 0.0]),
-        goal_pos_w=zero,
-        goal_quat_w=STILL,
-        goal_linvel_w=zero,
-        action=zero,
-        last_action=zero,
-        step=jnp.zeros((), jnp.int32),
-        time=jnp.zeros(()),
         fixtures={"cabinet": fixture},
     )
 

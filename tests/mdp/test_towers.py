@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import views
 
 from mjx_nero import UserError
 from mjx_nero.mdp import commands, events, towers
@@ -27,24 +28,16 @@ def view(
     """Cubes of 4 cm, by position or whole; the goal is at (0.3, 0, 0.02). Fingers are where they are told to be, or ``told``."""
     given = {"blue": blue, "red": red, "top": top}
     objects = {name: at if isinstance(at, ObjectView) else thing(at) for name, at in given.items()}
-    zero, joints = jnp.zeros(3), jnp.array([0.7, *fingers])
-    return View(
+    joints = jnp.array([0.7, *fingers])
+    return views.blank(
         joint_pos=joints,
-        joint_vel=jnp.zeros(3),
         default_joint_pos=joints,
         ctrl=joints if told is None else jnp.array([0.7, *told]),
         ee_pos_w=jnp.array(hand, jnp.float32),
         ee_quat_w=jnp.array([0.0, 1.0, 0.0, 0.0]),
         objects=objects,
-        root_pos_w=zero,
-        command=zero,
         goal_pos_w=jnp.array([0.3, 0.0, 0.02]),
         goal_quat_w=jnp.array(goal, jnp.float32),
-        goal_linvel_w=zero,
-        action=zero,
-        last_action=zero,
-        step=jnp.zeros((), jnp.int32),
-        time=jnp.zeros(()),
     )
 
 

@@ -9,32 +9,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import slides
 
 from mjx_nero import UserError
 from mjx_nero.sim import fixtures, scene
 from mjx_nero.sim.fixtures import FIELDS, FixtureCfg, Fixtures
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
-from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
-from mjx_nero.types import FixtureStart, Sim
+from mjx_nero.types import FixtureStart, Sim, Start
 
 # A ball on a slide along x, which pushes what stands in its way.
-PUSHER = """
-<mujoco>
-  <worldbody>
-    <body name="base_link">
-      <body name="ball">
-        <joint name="x" type="slide" axis="1 0 0" range="-1 1"/>
-        <geom name="ball" size="0.05" mass="1" contype="0" conaffinity="2"/>
-        <site name="ee"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-DRIVE = DriveCfg(("x",), (400.0,), (40.0,), (100.0,), (1.0,), (0.0,))
-ROBOT = RobotCfg(name="pusher", mjcf=PUSHER, arm=DRIVE, base_pos=(0.0, 0.0, 0.5))
+PUSHER = '<geom name="ball" size="0.05" mass="1" contype="0" conaffinity="2"/><site name="ee"/>'
+ROBOT = slides.robot("ball", "x", PUSHER, 400.0, 40.0, 100.0)
 # A sled of 2 kg on a slide along the fixture's y with 4 N of friction, and a flap at its end. Nothing else moves them.
 SLED = """
 <mujoco>
@@ -71,11 +58,11 @@ def model(where) -> mujoco.MjModel:
     return scene.build(ROBOT, where, CFG, visuals=False, fuse=True)
 
 
-def stands(x, y, degrees, sled=0.0, flap=0.0) -> dict[str, FixtureStart]:
+def stands(x, y, degrees, sled=0.0, flap=0.0) -> Start:
     half = math.radians(degrees) / 2
     joints = {"sled": jnp.array(sled), "flap": jnp.array(flap)}
     quat = jnp.array([math.cos(half), 0.0, 0.0, math.sin(half)])
-    return {"sled": FixtureStart(jnp.array([x, y, 0.0]), quat, joints)}
+    return Start(jnp.zeros(1), {}, {}, fixtures={"sled": FixtureStart(jnp.array([x, y, 0.0]), quat, joints)})
 
 
 def test_joints_sites_and_contacts_of_the_file(model):
@@ -92,10 +79,11 @@ def test_a_view_is_where_mujoco_has_it(model, where):
     """Turned by a quarter at (1, 2): 10 cm out along its y, which is the world's -x; the flap at 30 degrees."""
     found = Fixtures(model, where.fixtures)
     start = stands(1.0, 2.0, 90, sled=0.1, flap=math.radians(30))
-    fields = found.fields({}, start)
+    fields = found.given(start)
     qpos = found.qpos(jnp.zeros(3), start, fields)
     np.testing.assert_allclose(qpos, [0.0, 0.1, math.radians(30)], atol=1e-6)
-    seen = found.views(qpos, jnp.array([0.0, 0.5, -1.0]), fields)["sled"]
+    sim = Sim(qpos, jnp.array([0.0, 0.5, -1.0]), jnp.zeros(1), jnp.zeros(3), jnp.zeros(()), fields)
+    seen = found.view(sim, None)["fixtures"]["sled"]
     assert float(seen.joint_pos["sled"]) == pytest.approx(0.1) and float(seen.joint_vel["flap"]) == -1.0
     np.testing.assert_allclose(seen.joint_range["sled"], [-0.3, 0.3], atol=1e-6)
     np.testing.assert_allclose(seen.site_pos_w["front"], [0.8, 2.0, 0.5], atol=1e-6)
@@ -122,7 +110,7 @@ def test_starts_keep_to_the_joints_ranges(model, where):
 def play(physics, found, steps=10) -> Sim:
     """Three worlds: the sled slides freely at 1 m/s; the ball runs into it, its rail along the way; the sled stands aside."""
     starts = [stands(2.0, 0.0, 0), stands(0.4, 0.0, -90), stands(0.4, 2.0, -90)]
-    fields = [found.fields({}, start) for start in starts]
+    fields = [found.given(start) for start in starts]
     qpos = jnp.stack([found.qpos(jnp.zeros(3), s, f) for s, f in zip(starts, fields, strict=True)])
     qvel = jnp.zeros((3, 3)).at[0, 1].set(1.0)
     ctrl = jnp.array([[0.0], [0.5], [0.5]])

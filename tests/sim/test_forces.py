@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import slides
 
 from mjx_nero import UserError
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
@@ -13,29 +14,18 @@ from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import forces, scene
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
-from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.types import Sim
 
 # A plate of half a kilogram on a lift. Its flange is turned by a quarter about x, so that its y points up.
 LIFT = """
-<mujoco>
-  <worldbody>
-    <body name="base_link">
-      <body name="lift">
-        <joint name="z" type="slide" axis="0 0 1" range="-1 1"/>
-        <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
-        <body name="flange" pos="0 0 0.1" quat="0.70710678 0.70710678 0 0">
-          <geom name="pad" type="box" size="0.1 0.01 0.1" pos="0 0.04 0" mass="0.5" contype="0" conaffinity="2" condim="4"/>
-          <site name="ee"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
+<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+<body name="flange" pos="0 0 0.1" quat="0.70710678 0.70710678 0 0">
+  <geom name="pad" type="box" size="0.1 0.01 0.1" pos="0 0.04 0" mass="0.5" contype="0" conaffinity="2" condim="4"/>
+  <site name="ee"/>
+</body>
 """
-DRIVE = DriveCfg(("z",), (5000.0,), (200.0,), (500.0,), (1.0,), (0.0,))
-ROBOT = RobotCfg(name="lift", mjcf=LIFT, arm=DRIVE, base_pos=(0.0, 0.0, 0.5))
+ROBOT = slides.robot("lift", "z", LIFT, 5000.0, 200.0, 500.0)
 BALL = ObjectCfg(shape="sphere", size=(0.02,), mass=0.2, condim=6, friction=(1.0, 0.01, 0.01))
 SCENE = SceneCfg(objects={"ball": BALL}, table=False, goal="none", wrist=True, fingers=True)
 CFG = SimCfg(dt=0.002, decimation=5, iterations=50)
@@ -125,6 +115,6 @@ def test_a_scene_without_them_has_none():
 
 
 def test_a_robot_without_pads_is_told():
-    bare = RobotCfg(name="bare", mjcf=LIFT.replace('name="pad"', 'name="plate"'), arm=DRIVE)
+    bare = dataclasses.replace(ROBOT, name="bare", mjcf=ROBOT.mjcf.replace('name="pad"', 'name="plate"'))
     with pytest.raises(UserError, match="scene.fingers measures at shapes with 'pad' in their names, and bare has none"):
         scene.build(bare, SceneCfg(fingers=True), SimCfg(), visuals=False)

@@ -99,11 +99,11 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
     warp = WarpPhysics(env.physics_model, env.cfg.sim)
     warp.prepare(n)
     loaded = dict(warp._made)
-    warp_step = jax.jit(jax.vmap(warp.step))
+    warp_step, targets = jax.jit(jax.vmap(warp.step)), jax.jit(jax.vmap(env.targets))
     for t in range(100):
         action = trained.act(state.obs)
         if t % 33 == 32:  # not at the start, where cubes touch the table to the last digit, and rounding decides whether they do
-            sim, ctrl = state.pipeline_state, jax.vmap(env.targets)(state, action)
+            sim, ctrl = state.pipeline_state, targets(state, action)
             (ours, lost), (reference, _) = warp_step(sim, ctrl), env.physics.step(sim, ctrl)
             assert not lost.any()
             np.testing.assert_allclose(ours.qpos[:, :12], reference.qpos[:, :12], rtol=0, atol=1e-5)
@@ -141,11 +141,11 @@ def test_the_engines_own_solver_steps_alike(name):
     solvers = ("newton", "mujoco_warp")
     cfgs = {solver: dataclasses.replace(env.cfg.sim, solver=solver, iterations=50) for solver in solvers}
     steps = {solver: jax.jit(jax.vmap(WarpPhysics(env.physics_model, cfg, fields).step)) for solver, cfg in cfgs.items()}
-    moved = 0.0
+    targets, moved = jax.jit(jax.vmap(env.targets)), 0.0
     for t, key in enumerate(jax.random.split(jax.random.PRNGKey(1), 40)):
         action = jax.random.normal(key, (n, env.action_size))
         if t % 13 == 12:
-            sim, ctrl = state.pipeline_state, jax.vmap(env.targets)(state, action)
+            sim, ctrl = state.pipeline_state, targets(state, action)
             (ours, lost), (theirs, _) = (steps[solver](sim, ctrl) for solver in solvers)
             assert not lost.any()
             np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=0, atol=2e-5)

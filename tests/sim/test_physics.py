@@ -119,7 +119,7 @@ def test_saturated_drives_agree_where_nothing_touches():
 
 def pushed(env, n):
     """States of resting arms over cubes on the table, and drive targets that differ."""
-    sim = jax.vmap(lambda key: env.sample(key)[0])(jax.random.split(jax.random.PRNGKey(0), n))
+    sim = jax.jit(jax.vmap(lambda key: env.sample(key)[0]))(jax.random.split(jax.random.PRNGKey(0), n))
     return sim, sim.ctrl.at[:, :7].add(jnp.linspace(-0.02, 0.02, n)[:, None])
 
 

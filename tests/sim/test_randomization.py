@@ -122,7 +122,7 @@ def test_a_cube_of_another_size_meets_the_table_like_one_compiled_so():
     """Dropped from 5 mm, in MuJoCo's C library; the compiled one's density is such that its mass is the same."""
     env = make("nero_lift", impl="native", randomization={"size": REST["size"]})
     field = drawn(env, 8)
-    sim = jax.vmap(lambda key: env.sample(key)[0])(jax.random.split(jax.random.PRNGKey(0), 8))
+    sim = jax.jit(jax.vmap(lambda key: env.sample(key)[0]))(jax.random.split(jax.random.PRNGKey(0), 8))
     sim = sim.replace(fields=field, qpos=sim.qpos.at[:, -5].add(0.005))
     ctrl, edge = sim.ctrl, 2 * float(field["geom_size"][3, env.physics_model.geom("cube").id, 0])
     other = make("nero_lift", impl="native", **{"scene.objects.cube.size": (edge,) * 3})
@@ -158,7 +158,7 @@ def test_gains_change_stiffness_and_damping_of_some_drives():
 
 def test_without_terms_there_are_no_fields():
     env = make("nero_lift", impl="native")
-    assert env.sample(jax.random.PRNGKey(0))[0].fields == {}
+    assert jax.eval_shape(env.sample, jax.random.PRNGKey(0))[0].fields == {}
 
 
 def test_an_episode_keeps_its_fields_and_the_next_draws_anew(env):
@@ -201,7 +201,7 @@ def gripped():
         state = step(state, trained.act(state.obs))
     sim = state.pipeline_state
     assert (sim.qpos[:, 11] > 0.05).sum() >= 4
-    return env.physics, sim, jax.vmap(env.targets)(state, trained.act(state.obs))
+    return env.physics, sim, jax.jit(jax.vmap(env.targets))(state, trained.act(state.obs))
 
 
 @pytest.mark.slow

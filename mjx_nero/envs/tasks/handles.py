@@ -184,7 +184,7 @@ class Task:
             actions=velocity_actions(hysteresis=0.5),
             command=CommandTerm(command.func, params=command.params, resample_s=ONCE),
             success=success,
-            metrics={"grasped": MetricTerm(fixtures.Moved, params=near, over="rate", figure="moved")},
+            metrics={"moved": MetricTerm(fixtures.Moved, params=near, over="rate", milestone=True)},
             observations=self.observations(),
             events={"stand": Term(fixtures.stand_uniform, params={"fixture": self.file, **OFF})},
             randomization={

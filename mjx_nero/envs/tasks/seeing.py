@@ -11,7 +11,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg
 from mjx_nero.mdp import images, looks, observations
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, Term
-from mjx_nero.sim import scene as scenes
+from mjx_nero.sim import drawn
 from mjx_nero.sim.cameras import places
 from mjx_nero.sim.robot import Box
 from mjx_nero.types import UserError
@@ -65,7 +65,7 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
     (``--env.look.lights.params.brightness "(0.3, 2)"``, ``--env.sensors.front.params.noise 8``)."""
     scene = dataclasses.replace(cfg.scene, distractors=DISTRACTORS, backdrop=True)
     names, objects, there = (
-        scenes.distractors(scene),
+        drawn.distractors(scene),
         tuple(scene.objects),
         regions.box(cfg.robot, "pick", "where on the table it can grasp"),
     )

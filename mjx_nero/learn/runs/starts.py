@@ -34,7 +34,7 @@ EPISODES = 64
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
-_GRASPED, _HOLD = "metrics.grasped", "success.hold"
+_HOLD = "success.hold"
 
 Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` beside its key
 
@@ -131,7 +131,7 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
         UserError: the task has no expert.
     """
     cfg, name = own.cfg, next(iter(own.cfg.controllers), None)
-    if name is None or "grasped" not in cfg.metrics:
+    if name is None or _milestone(cfg) is None:
         raise UserError("the task has no script that grasps")
     count = min(most, EPISODES)
     env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
@@ -149,6 +149,11 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
     return play
 
 
+def _milestone(cfg: EnvCfg) -> str | None:
+    """Name of the metric that says when the hard part is done; None: no metric does."""
+    return next((name for name, term in cfg.metrics.items() if term.milestone), None)
+
+
 def _processor() -> jax.Device | None:
     """Returns JAX's CPU device; None if JAX was told to do without."""
     try:
@@ -159,6 +164,7 @@ def _processor() -> jax.Device | None:
 
 def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
     """Plays one episode per key; returns the arguments of ``way``, and the steps as second."""
+    grasp = f"metrics.{_milestone(env.cfg)}"
     noise = NOISE["JointVelocity" in env.action_kinds] * jnp.arange(len(keys))[:, None] / len(keys)
 
     def step(carry: tuple, key: Array) -> tuple:
@@ -168,7 +174,7 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
         wanted = jax.vmap(env.actions.invert)(targets, view.joint_pos, view.ctrl)
         after = jax.vmap(env.step)(state, wanted + noise * jax.random.normal(key, wanted.shape))
         seen = jax.vmap(lambda s: _at_rest(env, s))(after), after.metrics["distance"]
-        grasped = after.info["carry"].memory[_GRASPED] & (alive > 0)
+        grasped = after.info["carry"].memory[grasp] & (alive > 0)
         return (after, memory, alive * (1 - after.done)), (*seen, grasped, alive, Shown(state.obs, wanted))
 
     first = jax.vmap(env.reset)(keys)

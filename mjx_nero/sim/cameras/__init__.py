@@ -14,7 +14,7 @@ import mujoco
 from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import CameraCfg
-from mjx_nero.sim.cameras.look import nominal
+from mjx_nero.sim.cameras.look import nominal, rows
 from mjx_nero.types import Picture, Scenery, Sim
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
@@ -52,29 +52,17 @@ class Cameras:
         model: the scene with visual shapes, from ``scene.build``.
         cfg: the cameras by name.
         renderer: ``mujoco`` (OpenGL) or ``warp`` (MuJoCo Warp's ray tracer).
-        objects, obstacles: names of objects and obstacles whose size, place or colour differs from world to world.
-        fields: further fields of the model that differ (``Scenery.look``).
+        fields: names of the model's fields that differ from world to world.
 
     Raises:
         UserError: this machine cannot draw them.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        cfg: Mapping[str, CameraCfg],
-        renderer: str,
-        objects: Sequence[str] = (),
-        obstacles: Sequence[str] = (),
-        fields: Sequence[str] = (),
-    ):
+    def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], renderer: str, fields: Sequence[str] = ()):
         model = copy.copy(model)
         model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
-        self._objects = {name: int(model.geom(name).id) for name in objects}
-        self._obstacles = {name: int(model.geom(name).id) for name in obstacles}
-        names = [*(("geom_size", "geom_rgba") if objects else ()), *(("geom_pos", "geom_quat", "geom_size") if obstacles else ())]
-        self._nominal = {name: nominal(model, name) for name in dict.fromkeys((*names, *fields))}
-        self._names = tuple(cfg)
+        self._model, self._names = model, tuple(cfg)
+        self._nominal = {name: nominal(model, name) for name in fields}
         module, kind = _DRAWERS[renderer]
         self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
 
@@ -85,14 +73,8 @@ class Cameras:
             due: by camera, False where nobody looks at the picture, which then may be anything.
         """
         now = {name: jnp.asarray(scenery.look.get(name, value)) for name, value in self._nominal.items()}
-        for name, geom in self._objects.items():
-            look = scenery.objects[name]
-            now["geom_size"] = now["geom_size"].at[geom].set(look.size)
-            now["geom_rgba"] = now["geom_rgba"].at[geom].set(look.rgba)
-        for name, geom in self._obstacles.items():
-            box = scenery.obstacles[name]
-            for field, value in (("geom_pos", box.pos_w), ("geom_quat", box.quat_w), ("geom_size", box.size / 2)):
-                now[field] = now[field].at[geom].set(value)
+        for field, row, value in rows(self._model, scenery):
+            now[field] = now[field].at[row].set(value)
         if not due:
             return self.draw(sim.qpos, now)
         return self.draw(sim.qpos, now, jnp.stack([due.get(name, jnp.ones((), bool)) for name in self._names]))

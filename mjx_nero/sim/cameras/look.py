@@ -1,6 +1,7 @@
 """Fields of the drawn model that differ from episode to episode, as ``mdp.looks`` draws them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.randomization import Drawn, Model
 from mjx_nero.sim.cameras.cfg import MARK
-from mjx_nero.types import Key, UserError
+from mjx_nero.types import Key, Scenery, UserError
 
 DRAWABLE = (
     "cam_pos",
@@ -73,6 +74,16 @@ class Look:
 
     def _model(self, drawn: Mapping[str, Array]) -> Model:
         return Model({**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}, self._index)
+
+
+def rows(model: mujoco.MjModel, scenery: Scenery) -> Iterator[tuple[str, int, Any]]:
+    """Yields what a scenery says of objects and obstacles, as fields of the drawn model: name, row and value."""
+    for name, look in scenery.objects.items():
+        row = int(model.geom(name).id)
+        yield from (("geom_size", row, look.size), ("geom_rgba", row, look.rgba))
+    for name, box in scenery.obstacles.items():
+        row = int(model.geom(name).id)
+        yield from (("geom_pos", row, box.pos_w), ("geom_quat", row, box.quat_w), ("geom_size", row, box.size / 2))
 
 
 def nominal(model: mujoco.MjModel, field: str) -> np.ndarray:

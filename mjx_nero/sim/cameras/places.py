@@ -57,10 +57,19 @@ def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
     return CameraCfg(pos=_tuple(pos), quat=_tuple(quat), fovy=fovy, size=size, kinds=kinds)
 
 
-@functools.cache
 def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 75.0) -> CameraCfg:
-    """A camera on the hand that looks past the fingers: of many places the one that sees most of what is between and ahead of
-    them, with the fingers open and closed; of equals the highest at home, as it sees the table, then the nearest to the hand."""
+    """Places a camera on the hand that looks past the fingers.
+
+    Of many places it takes the one that sees most of what is between and ahead of the fingers, open and closed. Of equals it
+    takes the highest at home, which sees the table, then the nearest to the hand.
+    """
+    link, pos, quat = _on_hand(robot)
+    return CameraCfg(link=link, pos=pos, quat=quat, fovy=fovy, size=size, kinds=kinds)
+
+
+@functools.cache
+def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
+    """Link, position and orientation of the wrist's camera, whatever its pictures are."""
     model = scenes.robot_model(robot, whole=True)
     site = model.site(robot.ee_site).id
     body = int(model.site_bodyid[site])
@@ -79,7 +88,7 @@ def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
         found.append((-(seen // _EQUAL), -round(float(out @ up), 1), aside + behind, float(angle), tuple(pos), tuple(out)))
     *_, pos, out = min(found)
     quat = look_at(np.array(pos), grasp - _AHEAD * back, up=out)
-    return CameraCfg(link=model.body(body).name, pos=_tuple(pos), quat=_tuple(quat), fovy=fovy, size=size, kinds=kinds)
+    return model.body(body).name, _tuple(pos), _tuple(quat)
 
 
 def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:

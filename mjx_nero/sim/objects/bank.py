@@ -5,66 +5,75 @@ lies in the body, its bounds, and the mass. A part that a shape lacks has no mes
 library, which does not know of meshes that are not there). What touches is one body's, so nothing is parked or hidden elsewhere.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.parts import Fields, Part
+from mjx_nero.types import SHAPE, Carry, Sim, Start
 
 _GEOMS = ("geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
 _OF_C = ("geom_contype", "geom_conaffinity")  # which MuJoCo Warp keeps once for all worlds
 _BODIES = ("body_mass", "body_inertia", "body_iquat", "body_subtreemass", "body_invweight0")
 _DOFS = ("dof_invweight0", "dof_M0")
 FIELDS = ("geom_dataid", *_GEOMS, *_OF_C, *_BODIES, *_DOFS)
-Fields = dict[str, Array]
 
 
-class Banks:
+class Banks(Part):
     """The banks of a scene's objects.
 
     Args:
         model: the compiled scene; its bounds are widened, so that every shape is inside.
         objects: configs of the scene's objects.
+        drawn: makes the scene's model for pictures.
 
     Attributes:
         counts: how many shapes each object with a bank may have.
-        names: the model's fields that differ.
     """
 
-    def __init__(self, model: mujoco.MjModel, objects: Mapping[str, Any]):
-        self._model = model
+    def __init__(self, model: mujoco.MjModel, objects: Mapping[str, Any], drawn: Callable[[], mujoco.MjModel] | None = None):
+        self._drawn = drawn
         with_bank = {name: item for name, item in objects.items() if item.shape == "mesh" and item.bank}
         self.counts = {name: 1 + len(item.bank) for name, item in with_bank.items()}
-        self.names = FIELDS if with_bank else ()
+        self.fields, self.seen = (FIELDS, ("geom_rgba",)) if with_bank else ((), ())
         self._tables = {name: _table(model, name, item.solids, item.masses) for name, item in with_bank.items()}
-        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in self.names}
+        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in self.fields}
         for name in with_bank:
             _widen(model, name, self._tables[name])
 
-    def __call__(self, shapes: Mapping[str, Int[Array, ""]]) -> Fields:
-        """The fields of a world whose objects have the given shapes."""
+    def blank(self) -> dict[str, Any]:
+        """Returns the first shape of each."""
+        return {"shape": dict.fromkeys(self.counts, jnp.zeros((), jnp.int32))}
+
+    def given(self, start: Start) -> Fields:
+        """Returns the fields of a world whose objects have the start's shapes."""
         out: Fields = {name: jnp.asarray(value) for name, value in self._nominal.items()}
         for thing, table in self._tables.items():
             for name, (rows, values) in table.items():
-                out[name] = out[name].at[rows].set(jnp.asarray(values)[shapes[thing]])
+                out[name] = out[name].at[rows].set(jnp.asarray(values)[start.shape[thing]])
         if out:
             out["body_subtreemass"] = out["body_subtreemass"].at[0].set(jnp.sum(out["body_mass"]))
         return out
 
+    def memory(self, start: Start) -> dict[str, Any]:
+        """Remembers the shapes."""
+        return {SHAPE: start.shape} if self.counts else {}
 
-def look(
-    model: mujoco.MjModel, counts: Mapping[str, int], shapes: Mapping[str, Int[Array, ""]], rgba: Float[Array, "n 4"]
-) -> Fields:
-    """Colours of a drawn model's geoms, of ``rgba``, when objects have the given shapes: the other shapes cannot be seen."""
-    for name, count in counts.items():
-        rows = np.array([model.geom(bodies.drawn_name(name, k)).id for k in range(count)])
-        rgba = rgba.at[rows, 3].set((jnp.arange(count) == shapes[name]).astype(jnp.float32))
-    return {"geom_rgba": rgba}
+    def scenery(self, sim: Sim, carry: Carry, look: Fields) -> dict[str, Fields]:
+        """Returns colours of the drawn geoms by which all but the episode's shapes cannot be seen."""
+        if SHAPE not in carry.memory or not self._drawn:
+            return {}
+        model = self._drawn()
+        rgba = look.get("geom_rgba", jnp.asarray(model.geom_rgba, jnp.float32))
+        for name, count in self.counts.items():
+            rows = np.array([model.geom(bodies.drawn_name(name, k)).id for k in range(count)])
+            rgba = rgba.at[rows, 3].set((jnp.arange(count) == carry.memory[SHAPE][name]).astype(jnp.float32))
+        return {"look": {**look, "geom_rgba": rgba}}
 
 
 def _table(

@@ -52,7 +52,7 @@ def add_limits(parser: cli.Parser) -> None:
 
 
 def check(parser: cli.Parser, args: argparse.Namespace) -> None:
-    """Whether the flags of an arm go together."""
+    """Refuses flags of an arm that contradict one another."""
     if args.arm == "sim" and args.emulate:
         parser.error("--emulate is for real arms' protocols: --arm sim is simulated already")
     if args.arm == "lerobot" and args.emulate:

@@ -29,7 +29,7 @@ class Bench:
 
     Args:
         cfg: the task that the policy was trained on, of that preset.
-        path: the policy; None: the one that ships.
+        path: the policy; None: the bundled one.
         episodes: of a setting.
     """
 

@@ -30,14 +30,14 @@ class Look:
 
 
 def lenses(cfg: EnvCfg) -> dict[str, Term]:
-    """The lenses of a task by name; each only delays, by as much as is said at the start."""
+    """Returns the task's lenses by name. Each only delays, by an amount that is given at the start."""
     plain = {name: term.made.camera for name, term in cfg.sensors.items() if isinstance(term.made, Lens)}
     cameras = plain or {f"lens_{camera}": camera for camera in cfg.scene.cameras}
     return {name: Term(images.Lens, params={"camera": camera, "delay": (0, LATEST)}) for name, camera in cameras.items()}
 
 
 def prepared(cfg: EnvCfg) -> EnvCfg:
-    """A task whose every episode looks alike, with all that sweeps show."""
+    """Returns the task with one look for all episodes, and with everything that sweeps can show."""
     whole = seeing.randomized(cfg)
     scene = dataclasses.replace(whole.scene, patterns=seeing.PATTERNS)
     sensors = {name: term for name, term in cfg.sensors.items() if not isinstance(term.made, Lens)}

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from mjx_nero.control.controller import Controller
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
-from mjx_nero.sim import fixtures, linkage, obstacles, scene
+from mjx_nero.sim import linkage, scene
 from mjx_nero.sim.physics.native import quiet
 from mjx_nero.types import Carry, Sim, View
 
@@ -37,12 +37,11 @@ def play(
         watch: (controller's memory, view) -> what to keep of each control step.
 
     Returns:
-        What was watched, [steps, n, ...]; in a try that left the numbers NaN, False or 0 from there on.
+        What was watched, [steps, n, ...]. A try that became non-finite has NaN, False or 0 from there on.
     """
     model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
-    command, boxes = dataclasses.replace(cfg.command, motion=None), obstacles.Obstacles(model, cfg.scene.obstacles)
-    things = fixtures.Fixtures(model, cfg.scene.fixtures)
-    viewer = Viewer(model, cfg.robot, cfg.scene.objects, steps, cfg.sim.dt * cfg.sim.decimation, command, boxes, things)
+    command, parts = dataclasses.replace(cfg.command, motion=None), scene.parts(cfg.scene, model)
+    viewer = Viewer(model, cfg.robot, parts, steps, cfg.sim.dt * cfg.sim.decimation, command)
     n, still = len(goals), jnp.zeros(model.nu)
     data = [_start(model, cfg, {name: at[i] for name, at in places.items()}) for i in range(n)]
     carry = Carry(

@@ -32,12 +32,12 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """True if nothing is left to look at."""
+        """True if no check found a fault."""
         return not (self.gripper or self.home or self.reason)
 
     @property
     def line(self) -> str:
-        """All of it, for people."""
+        """Returns all results as one line."""
         parts = [self.gripper or "the gripper opens and closes"] if self.has_gripper else []
         parts.append(self.home or "home touches nothing")
         if self.script == "pick_place":

@@ -20,7 +20,7 @@ Make = Callable[[], rollout.Agent]
 
 
 def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
-    """Name -> how to make it: policy files and the policy that ships, controllers, sliders, and who knows nothing."""
+    """Lists all agents, each with a function that makes it: policies from files, the bundled one, controllers and sliders."""
     found: dict[str, Make] = {}
     shipped = policy.shipped(env_name, preset)
     for path in [*policies, *([shipped] if shipped.is_file() else [])]:

@@ -1,4 +1,4 @@
-"""A gamepad in the browser that steers the hand: a script in the page tells what it holds, and here that becomes motion."""
+"""A gamepad in the browser that steers the hand: a script in the page reports its state, which becomes motion here."""
 
 import functools
 import gzip
@@ -46,7 +46,7 @@ _DECODER = msgspec.json.Decoder(_Said)
 
 
 class Gamepad:
-    """Steers a hand by what pages say of their gamepads.
+    """Steers a hand by the gamepads that pages report.
 
     Args:
         orders: where it is done.
@@ -58,7 +58,7 @@ class Gamepad:
         self._held: set[int] = set()
 
     def hear(self, raw: bytes) -> None:
-        """Takes a page's message; ignores what is none."""
+        """Takes a page's message; ignores everything else."""
         try:
             said = _DECODER.decode(raw)
         except (msgspec.MsgspecError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""A hand on the arm: the user drags or steers the hand, and what comes of it becomes demonstrations."""
+"""A hand on the arm: the user drags or steers the hand, and the session records demonstrations."""
 
 import pathlib
 import threading
@@ -64,7 +64,7 @@ class Hand:
         self.here()
 
     def here(self) -> None:
-        """Wants it where it is."""
+        """Makes the present pose the wanted one."""
         pos, quat = self._pose(jnp.asarray(self._session.frame.qpos[0], jnp.float32))
         with self._lock:
             self.pos, self.quat = np.array(pos, float), np.array(quat, float)
@@ -78,7 +78,7 @@ class Hand:
 
     @property
     def asked(self) -> dict[str, jax.Array]:
-        """Parameters of the agent."""
+        """Returns the agent's parameters."""
         with self._lock:
             return {
                 "pos": jnp.asarray(self.pos, jnp.float32),
@@ -87,24 +87,24 @@ class Hand:
             }
 
     def move(self, to: np.ndarray) -> None:
-        """Wants it at a point of the world [m]."""
+        """Moves the wanted pose to a point in the world [m]."""
         self._steer(lambda: setattr(self, "pos", np.asarray(to, float)))
 
     def shift(self, by: tuple[float, float, float]) -> None:
-        """Wants it so much farther in the world [m]."""
+        """Moves the wanted pose by a vector in the world [m]."""
         self._steer(lambda: setattr(self, "pos", self.pos + by))
 
     def turn(self, degrees: float) -> None:
-        """Wants it turned about the vertical."""
+        """Turns the wanted pose about the vertical, by degrees."""
         by = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.radians(degrees))
         self._steer(lambda: setattr(self, "quat", np.array(math.quat_mul(by, jnp.asarray(self.quat, jnp.float32)), float)))
 
     def grip(self, share: float) -> None:
-        """Wants the gripper so far open, from 0 to 1."""
+        """Sets how far the gripper is to open, from 0 to 1."""
         self._steer(lambda: setattr(self, "open", float(np.clip(share, 0.0, 1.0))))
 
     def put(self, pos: np.ndarray, quat: np.ndarray, share: float) -> None:
-        """Wants it at a pose of the world, and the gripper so far open."""
+        """Sets the wanted pose in the world, and how far the gripper is to open."""
         wanted = {"pos": np.asarray(pos, float), "quat": np.asarray(quat, float), "open": float(np.clip(share, 0.0, 1.0))}
         self._steer(lambda: self.__dict__.update(wanted))
 
@@ -175,15 +175,15 @@ class Recording:
         return tape.frames(self._session.frame, [qpos.astype(float) for qpos, _ in self._steps], np.array(goals))
 
     def begin(self) -> None:
-        """Records from now on."""
+        """Starts to record."""
         self._steps, self.on = [], True
 
     def discard(self) -> None:
-        """Forgets what was recorded."""
+        """Discards the recording."""
         self._steps, self.on = [], False
 
     def save(self) -> str:
-        """Adds what was recorded to the data set; a line says so. The user's word is that it succeeded.
+        """Adds the recording to the data set as a success, as the user says, and prints a line.
 
         Raises:
             UserError: nothing was recorded, or it cannot be written.

@@ -80,7 +80,7 @@ class HandPanel:
         )
 
     def take_over(self, name: str = NAME) -> bool:
-        """Lets the hand act, or another agent of the user's; True if somebody else acted till now."""
+        """Lets the hand, or another of the user's agents, act. True if another agent acted until now."""
         if self._panel.agent.value == name:
             return False
         if self._panel.agent.value not in OWN:
@@ -91,7 +91,7 @@ class HandPanel:
         return True
 
     def give_back(self) -> None:
-        """Whoever acted before does so again, as after a policy's error that the user has mended."""
+        """Lets the agent that acted before act again, for example after the user has corrected a policy."""
         if self._panel.agent.value in OWN and self._before not in OWN:
             self._panel.agent.value = self._before
             if self._of_corrections:
@@ -99,7 +99,7 @@ class HandPanel:
 
     @property
     def _of_corrections(self) -> Recording | None:
-        """The recorder, if it takes what the user mends and nothing else."""
+        """The recorder, if it records only the user's corrections."""
         return self._recording if self._recording is not None and self._when.value == WHEN[1] else None
 
     def _grip(self) -> None:

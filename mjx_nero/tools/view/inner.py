@@ -64,7 +64,7 @@ class Inner:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _read(self, raw: bytes) -> bytes | None:
-        """A message for viser; None: there is nothing in it that it may see."""
+        """Returns the message for viser; None if it holds nothing that viser may see."""
         try:
             return messages.checked(raw, self.server)
         except ValueError as error:
@@ -77,7 +77,7 @@ class Inner:
 
 
 def tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Logs an event loop's errors that nobody waits for, one line now and then."""
+    """Logs errors of an event loop that no caller would see, at most one line now and then."""
     LOG.warning("a connection failed: %s", context.get("exception") or context["message"])
 
 

@@ -66,7 +66,7 @@ def at(port: str, calibration: pathlib.Path | None) -> Readable:
 
 
 def same_joints(env: ManipulationEnv) -> bool:
-    """Whether the robot has the leader's joints."""
+    """True if the robot has the leader's joints."""
     return env.cfg.robot.name in LEROBOT
 
 
