@@ -9,7 +9,7 @@ from mjx_nero import UserError, config, control, env_cfg, list_envs, list_preset
 from mjx_nero.config import bounds
 from mjx_nero.envs import registry
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.task import CALM, QUIET, CurriculumCfg, EnvCfg
+from mjx_nero.envs.task import CALM, SHOWN, CurriculumCfg, EnvCfg
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import PRESETS
 from mjx_nero.mdp import actions
@@ -394,11 +394,13 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, for velocities, for placing, and for the recipes' presets, whose runners differ."""
+    """But for how long it takes, for velocities, for what an expert shows, and for the recipes' presets, whose runners differ."""
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
-        calm = CALM if moves else QUIET if env.endswith("place") and not env.endswith("pick_place") else {}
+        taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles"))
+        shown = taught and not env.endswith("pick_place")
+        calm = SHOWN if shown else CALM if moves else {}
         assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env
     assert registry.env_cfg("nero_reach", "isaac").training["num_epochs"] == 8
 

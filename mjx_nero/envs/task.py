@@ -66,9 +66,8 @@ def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:
     }
 
 
-# Learner settings. Quiet: noise of at most half an action. Calm, for velocities: changing the action costs, too.
-QUIET = {"network.init_std": 0.5, "max_std": 0.5}
-CALM = {**QUIET, "change_cost": 0.03}
+# Learner settings. Calm, for velocities: noise of at most half an action, and changing the action costs.
+CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
 # The policy begins as a clone of the task's scripted expert, and waits for its critic before it goes its own way.
 SHOWN = {**CALM, "imitation": 1.0, "critic_first": 20}
 
