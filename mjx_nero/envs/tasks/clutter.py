@@ -162,7 +162,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         scene=scene,
         # At lift's step of 10 ms, light round objects jump out of small pads. Nero's scripted expert lost 30 of 64 objects at
         # 10 ms, 5 at 5 ms with slower motions, and 2 at 2.5 ms.
-        # With MuJoCo's softer friction what is round creeps out of the fingers within seconds; jerks of stiff drives shake it out.
+        # With MuJoCo's softer friction what is round creeps out of the fingers within seconds; jerks of stiff drives shake it.
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4, impratio=30.0, ramp=setup.robot.max_step > 0)),
         episode_length_s=8.0,
         actions=velocity_actions(hysteresis=0.5),
