@@ -142,7 +142,7 @@ class GraspThing(PickUp):
         """Computes the place of the grasp point with the pads' middle there, but not too near the table."""
         height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         aside = jnp.interp(gap, self._opened, self._aside)
-        return middle.at[2].set(height) - math.rotate(self._hand(yaw), self._grip + aside * self._opening)
+        return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _local(self, view: View, place: Float[Array, "3"]) -> Float[Array, "3"]:
         seen = view.objects[self.cfg.object]

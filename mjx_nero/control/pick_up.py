@@ -214,7 +214,7 @@ class PickUp:
         seen = view.objects[self.cfg.object].pos_w
         height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
-        return seen.at[2].set(height) - math.rotate(self._hand(yaw), self._grip + aside * self._opening)
+        return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
         """Distance from the open fingers to the nearest of the other objects' centres [m], at most the hand's width."""

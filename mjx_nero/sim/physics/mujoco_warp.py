@@ -51,8 +51,8 @@ class WarpPhysics:
         lead = sim.qpos.shape[:-1]
         drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
         targets = [ctrl, sim.ctrl] if self._cfg.ramp else [ctrl]
-        given = [jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in (*targets, *drawn)]
-        given = jnp.concatenate(given, axis=-1) if len(given) > 1 else ctrl
+        parts = [jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in (*targets, *drawn)]
+        given = jnp.concatenate(parts, axis=-1) if len(parts) > 1 else ctrl
         qpos, qvel, warmstart, overflow, force = self._batched(sim.qpos, sim.qvel, given, sim.warmstart)
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
