@@ -122,14 +122,14 @@ class Detour:
         memory, targets = self._follow(memory, view, jnp.zeros(3), None)
         return memory, jnp.concatenate([targets, view.ctrl[self._n :]])
 
-    def _follow(self, way: Way, view: View, offset, orientation) -> tuple[Way, Float[Array, " nj"]]:
+    def _follow(self, way: Way, view: View, offset, orientation, weight=1.0) -> tuple[Way, Float[Array, " nj"]]:
         """Takes one step along a way; ``offset`` leads from the way to the end effector's place [m]."""
         position = way.target()
         goes = jnp.linalg.norm(position + offset - view.ee_pos_w) < self.cfg.lead
         # Under a constant acceleration up to ``ramp``; at a corner a tenth of the speed, or it would stay there.
         speed = self.cfg.speed * jnp.clip(jnp.sqrt(way.to_corner() / self.cfg.ramp), 0.1, 1.0)
         after = way.on(jnp.where(goes, speed * self.dt, 0.0))
-        target = Target(position + offset, orientation, (after.target() - position) / self.dt)
+        target = Target(position + offset, orientation, (after.target() - position) / self.dt, weight)
         if self._rmpflow:
             return after, self._rmpflow.arm(view, target)
         assert self._ik is not None and way.setpoint is not None
@@ -215,9 +215,8 @@ class CarryPast(Detour):
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)
         grip = memory.grip + jnp.where(holds, GRIP_FILTER, 0.0) * (slip - memory.grip)
-        # Asking for its present orientation leaves the hand free to turn.
-        turn = jnp.where(holds, view.ee_quat_w, jnp.asarray(self._down))
-        way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), turn)
+        # A hand that holds may turn as it has to.
+        way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), jnp.asarray(self._down), jnp.where(holds, 0.0, 1.0))
         there = memory.there + (arrived | (memory.there > 0))
         fingers = self._gripper.forward(
             there > self._settled, view.joint_pos[self._n :], view.ctrl[self._n :], self._pace * self.dt

@@ -18,6 +18,7 @@ from mjx_nero.sim.objects import kept_grasps
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
+_GAPS = 9  # at which the place of the pads' middle is known
 _COST_COUNTS = 1.5  # [rad] a grasp that is dearer by 1 is worth so much motion of the joints
 
 
@@ -62,13 +63,15 @@ class GraspThing(PickUp):
         self._ups, self._middles, self._across, self._gaps, self._costs = (np.asarray(x, np.float32) for x in table)
         formulas = grasp.formulas(robot)
         self._positions = formulas[1] if formulas else None
+        self._opened = np.linspace(robot.closed, robot.opening, _GAPS)
+        self._aside = np.array([grasp.aside(robot, gap) for gap in self._opened])
 
     def init(self, view: View) -> GraspThingMemory:
         """Chooses a grasp and starts the first phase."""
         q = view.joint_pos[: self._n]
         middles, angles, gaps, costs = self._ways(view)
         quats = jax.vmap(self._hand)(angles)
-        picks = jax.vmap(self._over, (None, 0, 0))(view, middles, angles)
+        picks = jax.vmap(self._over, (None, 0, 0, 0))(view, middles, angles, gaps)
         starts = jnp.broadcast_to(q, (len(angles), self._n))
         over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
         low = jax.vmap(self._ik.local)(picks, quats, over.q)
@@ -110,7 +113,7 @@ class GraspThing(PickUp):
         off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
         best = jnp.argmin(jnp.abs(off) + _COST_COUNTS * costs)
         yaw = memory.yaw + off[best]
-        pick = self._over(view, middles[best], yaw)
+        pick = self._over(view, middles[best], yaw, gaps[best])
         above = self._ik.local(pick + self._up, self._hand(yaw), memory.above).q
         new = {"pick": pick, "yaw": yaw, "above": above, "opened": self._open(gaps[best])}
         new["middle"] = self._local(view, middles[best])
@@ -135,10 +138,11 @@ class GraspThing(PickUp):
             jnp.concatenate([costs, costs]),
         )
 
-    def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
+    def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""], gap: Float[Array, ""]) -> Float[Array, "3"]:
         """Computes the place of the grasp point with the pads' middle there, but not too near the table."""
         height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
-        return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
+        aside = jnp.interp(gap, self._opened, self._aside)
+        return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _local(self, view: View, place: Float[Array, "3"]) -> Float[Array, "3"]:
         seen = view.objects[self.cfg.object]

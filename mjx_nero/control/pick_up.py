@@ -14,6 +14,7 @@ from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
@@ -23,6 +24,7 @@ UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
+PRESS = 0.15  # [s] the fingers press so long before the hand lifts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,17 +36,19 @@ class PickUpCfg:
         heading: of each object that may be it (``View.target``), which of its axes lies across the opening of the hand when the
             fingers fit: 0, 1 or 2.
         turns: likewise, how many turns about the vertical in a full one look the same; 0: it is round.
+        aside: likewise, how far the pads' middle is from its usual place along the opening (``grasp.aside``); empty: not at all.
         lowest: height of the pads' middle above the robot's table, at least.
         beyond: the grasp point: from there the pads' middle is so much further down.
         above: the hand comes down from so high over the object, and lifts it so high before it carries it away.
         speed: of the grasp point [m/s].
-        closing: how long the fingers take [s].
+        closing: how long the fingers take [s], beside the lag of their drives.
         ik: of the arm's motion. Orientation weighs little: where a goal cannot be reached with the hand pointing down, it tilts.
     """
 
     object: str = "cube"
     heading: tuple[int, ...] = (0,)
     turns: tuple[int, ...] = (4,)
+    aside: tuple[float, ...] = ()
     lowest: float = 0.0
     beyond: float = 0.0
     above: Positive = 0.08
@@ -86,19 +90,26 @@ class PickUp:
         cfg: see ``PickUpCfg``.
 
     Raises:
-        UserError: ``heading`` and ``turns`` differ in length, or name no axis.
+        UserError: ``heading``, ``turns`` or ``aside`` differ in length, or name no axis.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: PickUpCfg = PickUpCfg()):
         if len(cfg.heading) != len(cfg.turns) or not set(cfg.heading) <= {0, 1, 2} or min(cfg.turns, default=-1) < 0:
             raise UserError(f"heading and turns are an axis (0, 1, 2) and a number an object, got {cfg.heading} and {cfg.turns}")
+        if cfg.aside and len(cfg.aside) != len(cfg.turns):
+            raise UserError(f"aside takes one value an object, got {cfg.aside} for {len(cfg.turns)}")
         self.dt, self.cfg = dt, cfg
         self.gripper, self._ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
         self._n = len(robot.arm.joints)
         self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
+        self._opening = np.array(grasp.opening(robot), np.float32)
         self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
+        self._gentle = setpoint.gentle(robot.arm.lead)
         travel = np.abs(self.gripper.opened - self.gripper.closed)
-        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / cfg.closing).astype(np.float32) * dt
+        # Drives that lag are slow to press, and their heavy rotors throw what they meet at speed.
+        lag = float(np.max(robot.gripper.lead, initial=0.0))
+        self._closed = cfg.closing + 2 * lag + PRESS
+        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
         self._lost = float(np.linalg.norm(robot.grip)) + _LOST
         self._reach = robot.opening / 2  # of a finger from the grasp point
         # From an object's heading; a round one has none.
@@ -134,7 +145,8 @@ class PickUp:
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
         found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
-        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt)
+        fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self._gentle)
+        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
@@ -170,7 +182,7 @@ class PickUp:
             [
                 still & (error < 0.01) | (time > 2.5),
                 arrived & still & (error < 0.004) | (time > 0.8),
-                time > self.cfg.closing + 0.15,
+                time > self._closed,
                 arrived | (time > 1.0),
             ],
             False,
@@ -201,7 +213,8 @@ class PickUp:
         """Computes where the grasp point must be."""
         seen = view.objects[self.cfg.object].pos_w
         height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
-        return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip))
+        aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
+        return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
         """Distance from the open fingers to the nearest of the other objects' centres [m], at most the hand's width."""

@@ -89,6 +89,7 @@ class Target:
     position: Float[Array, "3"] | None = None  # [m]
     orientation: Float[Array, "4"] | None = None  # wxyz
     velocity: Float[Array, "3"] | None = None  # [m/s]
+    weight: Float[Array, ""] | float = 1.0  # of the orientation; 0: it is free
 
 
 class RmpFlow:
@@ -249,7 +250,8 @@ class RmpFlow:
             nodes[0] = jax.tree.map(lambda a, b: (a + b)[None], pull, drag)
         if target.orientation is not None:
             errors = rotation_matrix(target.orientation).T - x[1:]
-            nodes[1] = jax.vmap(lambda e, v: rmp.axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
+            pulls = jax.vmap(lambda e, v: rmp.axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
+            nodes[1] = jax.tree.map(lambda x: target.weight * x, pulls)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
 
     def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> rmp.Rmp:

@@ -13,6 +13,7 @@ from mjx_nero import files
 from mjx_nero.config.bounds import NonNegative, Positive, Share
 from mjx_nero.config.values import read, unknown
 from mjx_nero.errors import UserError
+from mjx_nero.sim.robot import ASSETS
 
 Cfg = TypeVar("Cfg")
 Gain = NonNegative
@@ -212,16 +213,26 @@ class DescriptorCfg:
 
 
 def load(cls: type[Cfg], path: pathlib.Path) -> Cfg:
-    """Reads a YAML file as a ``cls``.
+    """Reads a YAML file as a ``cls``. The key ``like`` names one of the package's robots, whose file has what this one lacks.
 
     Raises:
-        UserError: no such file, no YAML, or an entry that is missing, unknown or of another type.
+        UserError: no such file or robot, no YAML, or an entry that is missing, unknown or of another type.
     """
     node = files.read_yaml(path)
     try:
-        return read(cls, node, "")
+        return read(cls, _completed(node, path.name), "")
     except UserError as e:
         raise UserError(f"{path}: {e}") from None
+
+
+def _completed(node: Any, name: str) -> Any:
+    if not isinstance(node, dict) or "like" not in node:
+        return node
+    other = read(str, node["like"], "like")
+    able = {file.parts[-3]: file for file in sorted(ASSETS.glob(f"*/rmpflow/{name}"))}
+    if other not in able:
+        raise UserError(f"like: {unknown('robot', other, able)}")
+    return {**files.read_yaml(able[other]), **{key: value for key, value in node.items() if key != "like"}}
 
 
 def load_pair(descriptor: pathlib.Path, config: pathlib.Path, arm: Iterable[str]) -> tuple[DescriptorCfg, RmpFlowCfg]:

@@ -20,6 +20,7 @@ LARGEST = 0.06  # [m]
 STROKE = 5e-3  # [m] pads that part by less do not open
 GRIPPED = 0.01  # [m] a cube is this much larger than the closed gripper's gap
 CLEAR = 0.005  # [m] the pads stay this far above the table
+BESIDE = 0.004  # [m] and this far beside what they are going to close on
 DENSITY = 1000.0  # [kg/m3] 30 g at an edge of 31 mm
 Pad = tuple[float, float, float]
 
@@ -65,6 +66,23 @@ def beyond(robot: RobotCfg, gap: float) -> float:
     centres = [hand.data.geom(i).xpos for i in hand.pads]
     off = (np.mean(centres, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if centres else np.zeros(3)
     return round(max(0.0, float(off @ approach)), 4)
+
+
+def opening(robot: RobotCfg) -> np.ndarray:
+    """The direction in which the fingers open, in the frame of ``ee_site``."""
+    return np.asarray(math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 1.0, 0.0])))
+
+
+def aside(robot: RobotCfg, gap: float) -> float:
+    """How far the pads' middle is, along the opening, from where it is when they go around the robot's cube [m].
+
+    0 if both sides move alike. If one side stands still, its pad comes down as near to a small object as to the cube.
+
+    Args:
+        gap: between the pads [m].
+    """
+    hand, cube = _Hand(robot), cube_for(robot).size[0] + 2 * BESIDE
+    return round(hand.middle(hand.share(gap)) - hand.middle(hand.share(cube)), 3) + 0.0
 
 
 def formulas(robot: RobotCfg) -> tuple[Callable, Callable] | None:
@@ -165,7 +183,7 @@ class _Hand:
         self._robot, model = robot.gripper, robot_model(robot)
         self._couplings, self.data = linkage.couplings(model), mujoco.MjData(model)
         self.model, self.pads = model, [model.geom(name).id for name in pads(model)]
-        self._site, self._down = robot.ee_site, robot.down
+        self._site, self._opening = robot.ee_site, opening(robot)
         self._sides = self._side() if len(self.pads) > 2 else {i: k > 0 for k, i in enumerate(self.pads)}
 
     def positions(self, share: float) -> np.ndarray:
@@ -206,14 +224,23 @@ class _Hand:
         opposed = [(a, b) for a, b in pairs if self._sides[a] != self._sides[b]]
         return min((mujoco.mj_geomDistance(self.model, self.data, a, b, far, ends) for a, b in opposed or pairs), default=0.0)
 
-    def _side(self) -> dict[int, bool]:
-        """Finds the side of the opening on which each pad is when the hand is open."""
-        self.move(1.0)
+    def middle(self, share: float) -> float:
+        """Place of the pads' middle along the opening, from the grasp point [m]."""
+        along = self._along(share)
+        sides = [[at for i, at in along.items() if self._sides[i] == side] for side in (False, True)]
+        return float(np.mean([np.mean(side) for side in sides if side])) if along else 0.0
+
+    def _along(self, share: float) -> dict[int, float]:
+        """Place of each pad along the opening, from the grasp point [m]."""
+        self.move(share)
         sites = [self.model.site(i).name for i in range(self.model.nsite)]
         frame = self.data.site(self._site) if self._site in sites else self.data.body(self._site)
-        local = math.rotate(math.quat_conj(jnp.array(self._down)), jnp.array([0.0, 1.0, 0.0]))
-        opening = frame.xmat.reshape(3, 3) @ np.array(local)
-        along = {i: float(self.data.geom(i).xpos @ opening) for i in self.pads}
+        direction = frame.xmat.reshape(3, 3) @ self._opening
+        return {i: float((self.data.geom(i).xpos - frame.xpos) @ direction) for i in self.pads}
+
+    def _side(self) -> dict[int, bool]:
+        """Finds the side of the opening on which each pad is when the hand is open."""
+        along = self._along(1.0)
         middle = (min(along.values(), default=0.0) + max(along.values(), default=0.0)) / 2
         return {i: at > middle for i, at in along.items()}
 

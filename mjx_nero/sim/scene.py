@@ -92,6 +92,7 @@ class SimCfg:
     decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps a control step
     iterations: Iterations = 10  # of the constraint solver, at most
     ls_iterations: Iterations = 50  # of its line search, at most (MJX-JAX 20); at 20, MuJoCo's C library throws a cube at times
+    ramp: bool = False  # drives' targets go evenly to the new ones in a control step, not at once: stiff drives would jerk
     impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
     elliptic: bool = True  # friction cones; else pyramids
     contacts_per_env: Slots = 24  # Warp: contact slots, times the number of environments

@@ -13,6 +13,7 @@ from mjx_nero.control import pick_up
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
+from mjx_nero.envs.arms.so_arm100 import SO_ARM100
 from mjx_nero.sim import grasp
 from mjx_nero.types import ObjectView, View
 
@@ -78,6 +79,27 @@ def test_how_far_beyond_the_grasp_point_the_pads_are_by_hand():
     assert grasp.beyond(COBOTTA_PRO_900, 0.06) == 0
 
 
+def test_a_jaw_that_turns_goes_beside_a_small_object_as_it_goes_beside_the_cube():
+    """The fixed face stays where it is, so the pads' middle moves by half of what the gap does, and a little as the jaw turns."""
+    cube = grasp.cube_for(SO_ARM100).size[0] + 2 * grasp.BESIDE
+    for gap in (0.02, 0.03):
+        assert grasp.aside(SO_ARM100, gap) == pytest.approx((cube - gap) / 2, abs=0.002)
+    assert grasp.aside(SO_ARM100, cube) == grasp.aside(NERO, 0.02) == grasp.aside(COBOTTA_PRO_900, 0.03) == 0
+    aside = PickUp(COBOTTA_PRO_900, 0.02, dataclasses.replace(CFG, aside=(0.0, 0.0, 0.006)))
+    for index, wanted in ((0, [0.5, 0.1, 0.05]), (2, [0.5 + 0.006, 0.1, 0.05])):  # turned by a quarter, the fingers open along -x
+        np.testing.assert_allclose(aside._pick(seen(index), jnp.array(math.pi / 2)), wanted, atol=1e-6)
+
+
+def test_fingers_whose_drives_lag_get_time_to_press():
+    """A third of a second, the jaw's damping over its stiffness: its targets take as much longer, and the hand waits as long."""
+    slow, quick = (PickUp(robot, 0.02, PickUpCfg(closing=0.4)) for robot in (SO_ARM100, NERO))
+    assert slow._closed == pytest.approx(0.4 + 2 / 3 + pick_up.PRESS) and quick._closed == pytest.approx(
+        0.4 + 0.05 + pick_up.PRESS
+    )
+    np.testing.assert_allclose(slow._finger_step, 0.5 * 0.02 / (0.4 + 1 / 3), rtol=1e-5)
+    assert slow._gentle == 6.0 and quick._gentle == 1.5  # [rad/s2]: the SO-ARM's own drives hardly lag, Nero's by half a second
+
+
 def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
     zero, q = jnp.zeros((), jnp.int32), jnp.zeros(6)
     memory = pick_up.PickUpMemory(zero, zero, q, q, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3), zero)
@@ -89,7 +111,7 @@ def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
     assert ends(pick_up.ABOVE, error=0.009) and not ends(pick_up.ABOVE, error=0.011) and not ends(pick_up.ABOVE, qd=0.2)
     assert ends(pick_up.ABOVE, error=1.0, count=125)
     assert ends(pick_up.DOWN, error=0.003) and not ends(pick_up.DOWN, error=0.005) and not ends(pick_up.DOWN, arrived=False)
-    assert not ends(pick_up.CLOSE, count=20) and ends(pick_up.CLOSE, count=23)  # 0.3 s of closing and 0.15 s
+    assert not ends(pick_up.CLOSE, count=26) and ends(pick_up.CLOSE, count=27)  # 0.3 s of closing, 0.1 s of lag and 0.15 s
     assert ends(pick_up.UP) and not ends(pick_up.UP, arrived=False) and not ends(pick_up.CARRY, count=10_000)
 
 
@@ -97,3 +119,5 @@ def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
 def test_what_does_not_say_how_objects_lie_is_refused(fields):
     with pytest.raises(UserError, match="heading and turns are an axis .0, 1, 2. and a number an object, got"):
         control.make("pick_up", COBOTTA_PRO_900, 0.02, fields)
+    with pytest.raises(UserError, match="aside takes one value an object, got .0.01, 0.02. for 1"):
+        control.make("pick_up", COBOTTA_PRO_900, 0.02, {"aside": (0.01, 0.02)})

@@ -13,6 +13,7 @@ import yaml
 from mjx_nero.control import rmp, rmpflow_config
 from mjx_nero.control.rmp import Rmp
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
+from mjx_nero.envs import registry
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import scene
@@ -423,6 +424,39 @@ def test_tutorials_own_files(tmp_path):
 
 
 # Files
+
+
+@pytest.mark.parametrize("arm", ["piper", "so_arm100", "so_arm101"])
+def test_spheres_cover_what_can_touch_an_obstacle(arm):
+    """To 10 mm: ends and sides of the shapes that meet obstacles, in the preferred posture with closed fingers."""
+    robot = registry.robot(arm)
+    flow, model = RmpFlow(robot), scene.robot_model(robot)
+    centres, radii = (np.asarray(x) for x in flow.spheres(jnp.asarray(flow.default_q)))
+    data = mujoco.MjData(model)
+    data.qpos[[model.joint(name).qposadr[0] for name in robot.arm.joints]] = flow.default_q
+    mujoco.mj_kinematics(model, data)
+    shapes = [i for i in range(model.ngeom) if model.geom_conaffinity[i] & 9]
+    assert len(shapes) > 4
+    for i in shapes:
+        size, kind = model.geom_size[i], model.geom_type[i]
+        half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+        for along in np.linspace(-half, half, 5):
+            for side in size[0] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
+                point = data.geom_xpos[i] + data.geom_xmat[i].reshape(3, 3) @ (side + [0, 0, along])
+                off = (np.linalg.norm(centres - point, axis=1) - radii).min()
+                assert off < 0.01, (model.geom(i).name, along, off)
+
+
+def test_parameters_of_another_robot(tmp_path):
+    """Nero's are the Cobotta's, but for what its own file says."""
+    nero = rmpflow_config.load(rmpflow_config.RmpFlowCfg, ASSETS / "nero" / "rmpflow" / "rmpflow_common.yaml")
+    assert nero.rmp_params == PARAMS and len(nero.joint_limit_buffers) == 7
+    assert [each.name for each in nero.body_collision_controllers] == ["gripper_base", "ee"]
+    for other in ("../nero", "panda"):
+        path = tmp_path / "rmpflow_common.yaml"
+        path.write_text(f"like: {other}")
+        with pytest.raises(UserError, match=f"rmpflow_common.yaml: like: no robot '{other}'"):
+            rmpflow_config.load(rmpflow_config.RmpFlowCfg, path)
 
 
 def test_tutorials_numbers_are_read():

@@ -1,5 +1,6 @@
 """The physics of the scene, on MJX and in MuJoCo's C library."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -135,6 +136,22 @@ def test_native_step_is_mujocos_own(env, native):
         np.testing.assert_allclose(after.qpos[i], data.qpos, rtol=0, atol=1e-6)
         np.testing.assert_allclose(after.qvel[i], data.qvel, rtol=0, atol=1e-5)
         assert float(after.time[i]) == pytest.approx(0.02)
+
+
+def test_targets_go_evenly_within_a_control_step(env):
+    """With ``ramp`` the second of two physics steps has the new targets, and the first half of the way to them."""
+    sim, ctrl = pushed(env, 3)
+    ramped = NativePhysics(env.physics_model, dataclasses.replace(env.cfg.sim, ramp=True))
+    after = jax.jit(ramped.step)(sim, ctrl)[0]
+    np.testing.assert_array_equal(after.ctrl, ctrl)
+    for i in range(3):
+        data = mujoco.MjData(env.physics_model)
+        data.qpos[:] = sim.qpos[i]
+        for share in (0.5, 1.0):
+            data.ctrl[:] = sim.ctrl[i] + share * (ctrl[i] - sim.ctrl[i])
+            mujoco.mj_step(env.physics_model, data)
+        np.testing.assert_allclose(after.qpos[i], data.qpos, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(after.qvel[i], data.qvel, rtol=0, atol=1e-5)
 
 
 def test_native_takes_any_batch(env):
@@ -343,8 +360,10 @@ def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
 
 
 @pytest.mark.gpu
-def test_warp_and_c_agree_without_contacts(native):
-    env = make("nero_lift", impl="warp", num_envs=8)
+@pytest.mark.parametrize("ramp", [False, True])
+def test_warp_and_c_agree_without_contacts(ramp):
+    env = make("nero_lift", impl="warp", num_envs=8, **{"sim.ramp": ramp})
+    native = jax.jit(NativePhysics(env.physics_model, env.cfg.sim).step)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), 8))
     sim = state.pipeline_state
     sim = sim.replace(qpos=sim.qpos.at[:, CUBE].add(jnp.array([0.0, 0.0, 2.0])))
@@ -352,7 +371,7 @@ def test_warp_and_c_agree_without_contacts(native):
     reference, ctrl = sim, sim.ctrl.at[:, :7].add(0.02)
     for _ in range(20):
         sim, lost = step(sim, ctrl)
-        reference = native(reference, ctrl)
+        reference, _ = native(reference, ctrl)
         assert not lost.any()
         np.testing.assert_allclose(sim.qpos, reference.qpos, rtol=0, atol=1e-4)
         np.testing.assert_allclose(sim.qvel, reference.qvel, rtol=0, atol=2e-3)

@@ -52,7 +52,7 @@ class ClutterSetup:
         robot: the robot, with a hand that opens as far as the objects need.
         there: its regions for grasping and holding.
         pitch, jitter: spacing of the objects (``events.scatter``).
-        grasp: settings of the pick-up controller (``PickUpCfg``): ``lowest``, ``beyond`` and ``closing``.
+        grasp: settings of the pick-up controller (``PickUpCfg``): ``lowest``, ``beyond``, ``aside`` and ``closing``.
         grasp_radius: greatest distance of a held object from the grasp point.
     """
 
@@ -61,7 +61,7 @@ class ClutterSetup:
     there: regions.Regions
     pitch: float
     jitter: float
-    grasp: dict[str, float]
+    grasp: dict[str, Any]
     grasp_radius: float
 
 
@@ -118,6 +118,7 @@ def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> ClutterSetup:
         grasp={
             "lowest": grasp.lowest(robot.pad),
             "beyond": grasp.beyond(robot, edge),
+            "aside": tuple(grasp.aside(robot, SIZES[1] * across(item) + 2 * grasp.BESIDE) for item in objects.values()),
             "closing": round(max(QUICK, grasp.closing_time(robot, thinnest)), 3),
         },
         grasp_radius=regions.near(there),
@@ -161,8 +162,8 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         scene=scene,
         # At lift's step of 10 ms, light round objects jump out of small pads. Nero's scripted expert lost 30 of 64 objects at
         # 10 ms, 5 at 5 ms with slower motions, and 2 at 2.5 ms.
-        # With MuJoCo's softer friction what is round creeps out of the fingers within seconds.
-        sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4, impratio=30.0)),
+        # With MuJoCo's softer friction what is round creeps out of the fingers within seconds; jerks of stiff drives shake it.
+        sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4, impratio=30.0, ramp=setup.robot.max_step > 0)),
         episode_length_s=8.0,
         actions=velocity_actions(hysteresis=0.5),
         controllers={"pick_up": {"object": TARGET, **_fits(scene), **setup.grasp, **regions.ik(setup.robot, "ik.")}},

@@ -179,7 +179,7 @@ class Task:
         return EnvCfg(
             robot=self.builder,
             scene=self.scene,
-            sim=contacts.sized(self.builder, self.scene, SimCfg()),
+            sim=contacts.sized(self.builder, self.scene, SimCfg(ramp=self.robot.max_step > 0)),
             episode_length_s=8.0,
             actions=velocity_actions(hysteresis=0.5),
             command=CommandTerm(command.func, params=command.params, resample_s=ONCE),

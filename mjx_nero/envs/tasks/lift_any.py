@@ -77,7 +77,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
     return EnvCfg(
         robot=dataclasses.replace(robot, gravity_compensation=True),  # a robot's own controller does this
         scene=scene,
-        sim=contacts.crowded(robot, scene, SimCfg(dt=0.005, decimation=4)),
+        sim=contacts.crowded(robot, scene, SimCfg(dt=0.005, decimation=4, ramp=robot.max_step > 0)),
         episode_length_s=7.0,
         actions=velocity_actions(hysteresis=0.5),
         controllers=expert(robot, THING, item),

@@ -26,7 +26,7 @@ class JaxPhysics:
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         if "geom_dataid" in fields:
             raise UserError("MJX-JAX cannot give an object another shape in each episode (bank): use --impl native or warp")
-        self.model, self.decimation = model, cfg.decimation
+        self.model, self.decimation, self._ramp = model, cfg.decimation, cfg.ramp
         own = copy.copy(model)
         own.opt.ls_iterations = min(model.opt.ls_iterations, LINE_SEARCH)
         with possible("MJX-JAX"):
@@ -41,8 +41,11 @@ class JaxPhysics:
         """Computes one control step of one environment; vmap it for many."""
         mx = self._mx.replace(**sim.fields)
 
-        def physics_step(_, sim: Sim) -> Sim:
-            data = self._template.replace(qpos=sim.qpos, qvel=sim.qvel, ctrl=ctrl, qacc_warmstart=sim.warmstart, time=sim.time)
+        before = sim.ctrl
+
+        def physics_step(i, sim: Sim) -> Sim:
+            now = before + (i + 1) / self.decimation * (ctrl - before) if self._ramp else ctrl
+            data = self._template.replace(qpos=sim.qpos, qvel=sim.qvel, ctrl=now, qacc_warmstart=sim.warmstart, time=sim.time)
             data = mjx.step(mx if self._touches else self._saturated(mx, data), data)
             readings = {name: jnp.maximum(sim.readings[name], read(data.sensordata)) for name, read in self._readers.items()}
             readings |= {name: gauge(data.sensordata) for name, gauge in self._gauges.items()}

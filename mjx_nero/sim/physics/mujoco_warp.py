@@ -42,7 +42,7 @@ class WarpPhysics:
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name not in _OF_C}
         self._readers, self._gauges = touch.readers(model), forces.gauges(model)
         self._numbers = len(self._readers) + sum(gauge.size for gauge in self._gauges.values())  # of all readings
-        self._made: dict[tuple[str, int], tuple[Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
+        self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
         self._batched = self._as_jax()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
@@ -50,7 +50,9 @@ class WarpPhysics:
         # The drawn fields travel with the targets: without any these go alone.
         lead = sim.qpos.shape[:-1]
         drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
-        given = jnp.concatenate([jnp.broadcast_to(ctrl, (*lead, ctrl.shape[-1])), *drawn], axis=-1) if drawn else ctrl
+        targets = [ctrl, sim.ctrl] if self._cfg.ramp else [ctrl]
+        parts = [jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in (*targets, *drawn)]
+        given = jnp.concatenate(parts, axis=-1) if len(parts) > 1 else ctrl
         qpos, qvel, warmstart, overflow, force = self._batched(sim.qpos, sim.qvel, given, sim.warmstart)
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
@@ -67,14 +69,14 @@ class WarpPhysics:
         # Called by XLA on the stream that it computes on. No graph mode of Warp's: it would capture these copies for every set of
         # addresses that XLA comes up with, where one graph of the steps between them does.
         def control_step(qpos, qvel, given, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out, force_out):
-            data, drawn, run, strongest, _ = self._get(qpos.shape[0])
+            data, wanted, drawn, run, strongest, _ = self._get(qpos.shape[0])
             wp.copy(data.qpos, qpos)
             wp.copy(data.qvel, qvel)
-            if drawn is None:
-                wp.copy(data.ctrl, given)
-            else:
-                wp.copy(data.ctrl, given[:, : data.ctrl.shape[1]])
-                wp.copy(drawn, given[:, data.ctrl.shape[1] :])
+            at = 0  # ``given`` as it is, or its parts, in order
+            for target in (wanted, data.ctrl, drawn):
+                if target is not None:
+                    wp.copy(target, given if target.shape == given.shape else given[:, at : at + target.shape[1]])
+                    at += target.shape[1]
             wp.copy(data.qacc_warmstart, warmstart)
             run()
             wp.copy(qpos_out, data.qpos)
@@ -146,7 +148,7 @@ class WarpPhysics:
                 self._get(num_envs)
                 wp.synchronize_device(device)
 
-    def _get(self, n: int) -> tuple[Any, Any, Callable[[], None], Any, Any]:
+    def _get(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any, Any]:
         import warp as wp
 
         key = (str(wp.get_device()), n)
@@ -154,12 +156,12 @@ class WarpPhysics:
             self._made[key] = self._make(n)
         return self._made[key]
 
-    def _make(self, n: int) -> tuple[Any, Any, Callable[[], None], Any, Any]:
+    def _make(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any, Any]:
         """Makes what ``n`` environments need on the current device.
 
         Returns:
-            MuJoCo Warp's data, the drawn fields as one array, the function that steps, the readings (None if there are none), and
-            objects that must stay alive.
+            MuJoCo Warp's data, the targets that it goes to, the drawn fields as one array, the function that steps, the readings
+            (each None if there are none), and objects that must stay alive.
         """
         import warp as wp
         from mujoco.mjx.third_party import mujoco_warp
@@ -172,6 +174,7 @@ class WarpPhysics:
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
         data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
         step, strongest = self._stepper(model, data)
+        wanted, go = ramp(data.ctrl) if cfg.ramp else (None, lambda left: None)
 
         def run():
             data.overflow.zero_()
@@ -179,15 +182,16 @@ class WarpPhysics:
             if strongest is not None:
                 strongest.zero_()
             for i in range(self.decimation):
+                go(self.decimation - i)
                 step(i == self.decimation - 1)
 
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
-            return data, drawn, run, strongest, run
+            return data, wanted, drawn, run, strongest, run
         kernels.load(run)
         run()  # makes what kernels keep between launches, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
-        return data, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
+        return data, wanted, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
 
     def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
         """Makes the function of one physics step, which is told if it is the last one, and the array of readings."""
@@ -272,6 +276,24 @@ class WarpPhysics:
                     wp.atomic_max(strongest, world, k, wp.length(wp.spatial_top(force)))
 
         return readings, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs), measure
+
+
+def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
+    """Makes an array of targets, and the function that moves ``ctrl`` towards them by one of so many equal steps."""
+    import warp as wp
+
+    wanted: Any = wp.zeros_like(ctrl)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def towards(
+        ctrl: wp.array2d(dtype=float),  # type: ignore
+        wanted: wp.array2d(dtype=float),  # type: ignore
+        left: int,
+    ):
+        i, j = wp.tid()  # type: ignore
+        ctrl[i, j] += (wanted[i, j] - ctrl[i, j]) / float(left)
+
+    return wanted, lambda left: wp.launch(towards, dim=ctrl.shape, inputs=[ctrl, wanted, left])
 
 
 def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:

@@ -46,9 +46,9 @@ class NativePhysics:
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation = model, cfg.decimation
-        self._period = cfg.decimation * cfg.dt
+        self._period, self._ramp = cfg.decimation * cfg.dt, cfg.ramp
         self._fields = {name: getattr(model, name).shape for name in fields}
-        self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu])
+        self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu * (1 + cfg.ramp)])
         self._readers, self._gauges = touch.readers(model), forces.gauges(model)
         self._ends = np.cumsum([self._sizes[2] + len(self._readers), *(gauge.size for gauge in self._gauges.values())])
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -58,7 +58,8 @@ class NativePhysics:
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step; leading axes are environments. The state becomes NaN where MuJoCo gives up."""
         drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
-        packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, ctrl, *drawn], axis=-1)
+        targets = [sim.ctrl, ctrl] if self._ramp else [ctrl]
+        packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, *targets, *drawn], axis=-1)
         shape = jax.ShapeDtypeStruct((*packed.shape[:-1], int(self._ends[-1])), jnp.float32)
         if jax.default_backend() == "cpu":
             found = host.call(self._key, self._step, shape, packed)
@@ -76,7 +77,7 @@ class NativePhysics:
         """Identifies what this physics computes, by a number that is the same in every process."""
         model = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, model)
-        told = hashlib.sha256(model.tobytes() + repr((self.decimation, tuple(self._fields))).encode()).digest()
+        told = hashlib.sha256(model.tobytes() + repr((self.decimation, self._ramp, tuple(self._fields))).encode()).digest()
         return int.from_bytes(told[:8], "little", signed=True)
 
     def _called_back(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
@@ -85,7 +86,7 @@ class NativePhysics:
         return after
 
     def _step(self, packed: Float32[np.ndarray, "*batch m"], result: Float32[np.ndarray, "*batch n"]) -> None:
-        """(qpos, qvel, warmstart, ctrl, fields) -> the first three after the step, and the readings.
+        """(qpos, qvel, warmstart, targets, fields) -> the first three after the step, and the readings.
 
         JAX's program calls this function, so calling JAX in here would deadlock.
         """
@@ -95,7 +96,10 @@ class NativePhysics:
         with _lock, quiet():
             models, present, start, warmstart, ctrl, states, sensors = self._work_arrays(n)
             self._set(models, present, fields)
-            start[:, 1:], warmstart[:], ctrl[:] = given[:, :nqv], given[:, nqv:nqvv], given[:, None, nqvv:]
+            start[:, 1:], warmstart[:], ctrl[:] = given[:, :nqv], given[:, nqv:nqvv], given[:, None, -self.model.nu :]
+            if self._ramp:
+                left = 1 - np.arange(1, self.decimation + 1)[:, None] / self.decimation
+                ctrl -= left * (ctrl - given[:, None, nqvv : -self.model.nu])
             self._rollout(
                 models,
                 self._data,
