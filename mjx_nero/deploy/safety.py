@@ -139,7 +139,8 @@ class Safety:
         self._seen: Feedback | None = None
         self._since = {what: _Since(len(self.position)) for what in ("behind", "load")}
         self._passed = self.position  # where joints were last seen to move, or to need little torque
-        self._rest: np.ndarray | None = None  # where a stalled arm holds
+        self._pressing = np.zeros(len(self.position), bool)  # which joints push at something, and hold where they are
+        self._met = self.position  # where they were read then
         self._clear: np.ndarray | None = None  # clearances at the last command
 
     def begin(self, feedback: Feedback, now: float, anywhere: bool = False) -> None:
@@ -156,7 +157,7 @@ class Safety:
         self._seen = None
         if fault := self._fault(feedback, now):
             raise UserError(f"the arm cannot start: {fault.text}")
-        self.position, self.velocity = np.clip(at, limits.lower, limits.upper), np.zeros(len(at))
+        self.position, self.velocity = at.copy(), np.zeros(len(at))  # beyond a range it may only go back
         self._clear = None
         far = np.abs(at - limits.home)[limits.arm]
         if not anywhere and far.max() > self.cfg.start:
@@ -171,9 +172,7 @@ class Safety:
         """Looks at a feedback; a fault makes the arm hold, for good."""
         if self.fault is None and (fault := self._fault(feedback, now)):
             self.hold(fault)
-            if fault.kind == "stall":  # press no further
-                near = self.cfg.behind / 4
-                self._rest = np.clip(self.position, feedback.position - near, feedback.position + near)
+            self._met = np.asarray(feedback.position, float)
         if np.all(np.isfinite(feedback.position)):
             self._seen = feedback
         return self.fault
@@ -194,7 +193,11 @@ class Safety:
             self.hold(Fault("nan", "the policy's targets are not finite"))
         if self.fault is None:
             return self._move(target)
-        return self._brake(()) if self._rest is None else self._move(self._rest)
+        if not np.any(self._pressing):
+            return self._brake(())
+        back = np.where(self._pressing, self._met - self.position, 0.0)  # a drive that goes on to press burns
+        way = _stoppable(np.abs(back), self.limits.acceleration * self.limits.dt**2)
+        return self._move(self.position + np.sign(back) * way)
 
     @property
     def at_rest(self) -> bool:
@@ -252,7 +255,8 @@ class Safety:
     def _go(self, velocity: np.ndarray, acted: tuple[str, ...], clear: np.ndarray | None = None) -> Command:
         self._before = before = self.position
         self._clear = clear
-        self.position = np.clip(before + velocity * self.limits.dt, self.limits.lower, self.limits.upper)
+        low, high = np.minimum(self.limits.lower, before), np.maximum(self.limits.upper, before)
+        self.position = np.clip(before + velocity * self.limits.dt, low, high)
         self.velocity = (self.position - before) / self.limits.dt
         self.counts.update(acted)
         return Command(self.position.copy(), self.velocity.copy(), acted)
@@ -277,14 +281,16 @@ class Safety:
             return Fault("temperature", f"{self._name(feedback.temperature)} has {np.max(feedback.temperature):.0f} degrees C")
         if self._seen is not None:
             behind = np.where(limits.arm, np.abs(at - self.position), 0.0)
-            if self._since["behind"].lasts(behind > cfg.behind, now, cfg.behind_s):
+            if np.any(lasting := self._since["behind"].lasts(behind > cfg.behind, now, cfg.behind_s)):
+                self._pressing = lasting
                 return Fault("stall", f"{self._name(behind)} does not follow its commands")
         if feedback.load is not None:
             load = np.where(limits.arm, np.abs(feedback.load), 0.0)
             moving = np.abs(at - self._passed) > _SLOW * limits.speed / cfg.share * cfg.load_s
             pushing = ~(load <= cfg.load) & ~moving
             self._passed = np.where(pushing, self._passed, at)
-            if self._since["load"].lasts(pushing, now, cfg.load_s):
+            if np.any(lasting := self._since["load"].lasts(pushing, now, cfg.load_s)):
+                self._pressing = lasting
                 return Fault("load", f"{self._name(np.where(pushing, load, 0.0))} is blocked: its drive gives all it has")
         return None
 
@@ -299,10 +305,10 @@ class _Since:
     def __init__(self, count: int):
         self._begun = np.full(count, np.nan)
 
-    def lasts(self, so: np.ndarray, now: float, seconds: float) -> bool:
-        """True if it has held for ``seconds``, for any of them."""
+    def lasts(self, so: np.ndarray, now: float, seconds: float) -> np.ndarray:
+        """True for those for which it has held for ``seconds``."""
         self._begun = np.where(so, np.where(np.isnan(self._begun), now, self._begun), np.nan)
-        return bool(np.any(now - self._begun >= seconds))
+        return np.asarray(now - self._begun >= seconds)
 
 
 def _stoppable(room: np.ndarray, unit: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy import drivers, setup
+from mjx_nero.deploy.alone import alone
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.deploy.fence import FenceCfg
 from mjx_nero.deploy.guard import Dry, Guard, WallClock, urgent
@@ -70,6 +71,7 @@ class Server:
         if any(spec.offsets):
             arm = Offset(arm, np.array(spec.offsets))
         self._arm = Dry(arm) if spec.dry else arm
+        self._taken = [alone(name) for name in (*drivers.ports(spec.kind, spec.options), spec.log) if name]
         self._arm.connect()
         safety = setup.safety_of(spec.metadata, self.cfg, FenceCfg(**spec.fence), self._arm.ranges())
         self.guard, self.running, self.heard = Guard(self._arm, safety, self.clock), False, 0.0
@@ -90,9 +92,10 @@ class Server:
         return {**found, "fault": self.guard.fault and dataclasses.astuple(self.guard.fault)}
 
     def _start(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        if not self.running:
-            self._arm.engage()
         feedback = self.guard.start(bool(request["anywhere"]))
+        if not self.running:  # what refuses to start gets no torque
+            self._arm.engage()
+            feedback = self.guard.start(bool(request["anywhere"]))
         if self.spec.log and self.guard.log is None:
             told, actions = self.guard.safety.position, int(request["actions"])
             path, joints = pathlib.Path(self.spec.log), self._arm.joints

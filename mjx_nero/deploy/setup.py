@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.body import Body
+from mjx_nero.deploy.executor import Joints
 from mjx_nero.deploy.fence import Box, Fence, FenceCfg
 from mjx_nero.deploy.safety import Limits, Safety, SafetyCfg
 from mjx_nero.errors import UserError
 
 Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
+_FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: more is a mistake, or somebody's trick
 NEEDED = ("joints", "gripper", "body", "command", "objects")
 
 
@@ -20,10 +22,18 @@ def check(metadata: Mapping[str, Any]) -> None:
     """Checks that a file says all that an arm needs.
 
     Raises:
-        UserError: an older version exported it.
+        UserError: an older version exported it, or its limits are no arm's.
     """
     if missing := [name for name in NEEDED if name not in metadata]:
         raise UserError(f"the file does not say {', '.join(missing)}: export the policy again with this version")
+    own = Joints.of(metadata)
+    right = (-_FAR <= own.lower) & (own.lower <= own.home) & (own.home <= own.upper) & (own.upper <= _FAR) & (own.speed <= _FAST)
+    if not right.all() or own.dt > _SLOW:
+        name = own.names[int(np.argmin(right))]
+        raise UserError(
+            f"the file's limits of {name} are no arm's: home within its range, this within {_FAR:g} rad or m, a speed of at most "
+            f"{_FAST:g} rad/s or m/s, and a target at least every {_SLOW:g} s"
+        )
 
 
 def body_of(metadata: Mapping[str, Any]) -> Body:

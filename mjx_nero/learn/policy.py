@@ -131,7 +131,7 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
     if not any_robot and there.get("fingerprint", here["fingerprint"]) != here["fingerprint"]:
         return (
             f"is a {kind} for another model of {robot} (other links, masses, joints or drives): pass the --robot that "
-            "it was trained with, train one for this robot, or pass --any-robot to play it all the same"
+            "it was trained with, or the --env.identified, train one for this robot, or pass --any-robot to play it all the same"
         )
     if there["observations"]["state"] != here["observations"]["state"]:
         return f"was trained on other observations (preset {there['preset']}): pass --preset {there['preset']}"

@@ -1,15 +1,28 @@
 """What takes minutes each, and is run by name: pytest -s tests/deploy/long_runs.py"""
 
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+
 import arms
 import episodes
+import numpy as np
 import pytest
+from test_remote import SWING, gone, late, rows, spec, targets, wait_for
 from test_safety import ROBOTS, fuzz, fuzz_feedback
 
+from mjx_nero.deploy import children
 from mjx_nero.deploy.emulators.plant import Faults
 from mjx_nero.tools.deploy import trial
 
 ARMS = {"so101_lift": "so101", "piper_lift": "piper", "nero_lift": "nero"}
 LIKE, OFF = Faults(), Faults(stiffness=0.8, late=0.04)
+
+
+__all__ = ["late", "spec"]
 
 
 def share(folder, name, preset="sim2real", count=100, faults=LIKE, delay=None):
@@ -42,12 +55,41 @@ def test_episodes_from_pixels_succeed(tmp_path):
     assert share(tmp_path, "nero_lift", "rgb", 40) >= 0.8
 
 
+@pytest.mark.parametrize("turn", range(10))
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_million_wild_targets_never_get_beyond_a_limit(name):
-    _, worst = fuzz(arms.metadata(name), 1_000_000 // len(ROBOTS), 1)
-    print(name, worst, flush=True)
+def test_a_million_wild_targets_never_get_beyond_a_limit(name, turn):
+    count = 100_000 // len(ROBOTS)
+    safety, worst = fuzz(arms.metadata(name), count, 100 + turn)
+    print(f"{name} turn {turn}: {count} targets,", dict(safety.counts), worst, flush=True)
     assert max(worst.values()) < 1e-6, worst
 
 
 def test_a_hundred_thousand_feedbacks_are_fuzzed():
     fuzz_feedback(arms.metadata("so_arm101"), 100_000)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_hundred_policies_that_die_or_freeze_leave_an_arm_that_holds(spec, late, tmp_path, number):
+    """Within 100 ms of its last target, and what the machine wakes sleepers late."""
+    rng, took = np.random.default_rng(3), []
+    for i in range(100):
+        own = dataclasses.replace(spec, log=str(tmp_path / f"{i}.csv"))
+        argv = [sys.executable, "-c", SWING, json.dumps(vars(own))]
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=children.environment()) as process:
+            arm = int(process.stdout.readline())
+            time.sleep(rng.uniform(0.1, 0.5))
+            process.send_signal(number)
+            time.sleep(0.3)
+            process.kill()
+            wait_for(lambda arm=arm: gone(arm))
+        table = rows(own)
+        last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
+        took.append(next(float(row["time"]) for row in table if row["held"]) - last)
+        steps = np.abs(np.diff(targets(table)))
+        assert steps.max() <= 1.5 * 0.02 + 1e-4 and steps[-1] < 1e-4
+    took = 1e3 * np.array(took)
+    print(
+        f"{number.name}: held after {np.median(took):.0f} ms (median), {took.max():.0f} at most; {time.monotonic() - begun:.0f} s"
+    )
+    print(f"the machine woke sleepers up to {1e3 * late():.0f} ms late", flush=True)
+    assert took.max() < 100 + 1e3 * late()

@@ -2,6 +2,7 @@
 
 import pathlib
 import threading
+import time
 
 import arms
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.drivers import agilex
+from mjx_nero.deploy.drivers.slcan import Slcan
 from mjx_nero.deploy.emulators import agilex as emulated
 from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
@@ -182,6 +184,19 @@ def test_rubbish_on_the_line_is_survived(adapter):
     for _ in range(300):
         adapter._take(rng.integers(0, 256, rng.integers(0, 40)).astype(np.uint8).tobytes())
         adapter._take(b"t155" + bytes(rng.integers(48, 58, 9).astype(np.uint8)) + b"\r")
+
+
+@pytest.mark.parametrize("line", [b"t1\r", b"T12\r", b"txyz8\r", b"t2A5F00\r", b"\xff\xfe\r"])
+def test_a_damaged_line_of_an_adapter_ends_in_hold(bench, adapter, told, kind, line, monkeypatch):
+    bench.start()
+    slcan = Slcan(adapter.name.partition(":")[2], sleep_after_open=0, timeout=0)
+    adapter._line.write(line)
+    monkeypatch.setattr(bench.arm, "_bus", slcan)
+    time.sleep(0.05)  # the terminal carries it
+    bench.guard.read()
+    assert bench.guard.fault.kind == "bus" and "the CAN bus fails" in bench.guard.fault.text
+    monkeypatch.undo()
+    slcan.shutdown()
 
 
 def test_no_frame_that_drops_the_arm_is_in_the_driver():

@@ -5,6 +5,7 @@ import json
 import time
 
 import arms
+import mujoco
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from mjx_nero.deploy.emulators import timeless
 from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.guard import Guard
+from mjx_nero.deploy.safety import Safety
 from mjx_nero.errors import UserError
 
 
@@ -189,6 +191,33 @@ def test_faults_of_the_bus_end_in_hold_within_a_cycle(bench, fault):
     bench.servos.faults = emulated.BusFaults(turnaround=1e-4)
     bench.play([home + 0.5] * 20)  # nothing resumes
     assert np.abs(bench.guard.safety.position - home).max() < 0.3
+
+
+@pytest.mark.parametrize("fault", [{"cut": True}, {"corrupt": 1.0}, {"errors": {3: 32}}, {"errors": {1: 4}}])
+def test_a_hundred_faults_of_the_bus_end_in_hold_within_a_cycle(told, lift, fault):
+    """At once, in registers and packets; a damaged answer is asked for twice."""
+    rng, clock, home = np.random.default_rng(1), arms.Clock(), np.array(told["joints"]["home"])
+    layer, model = setup.safety_of(told), mujoco.MjModel.from_binary_path(str(lift / "scene.mjb"))
+    for _ in range(100):
+        plant = Plant(model, told["joints"]["names"], home, clock)
+        arm, _ = timeless.engaged("so101", told, plant, clock)
+        servos = arm._bus._port._servos
+        guard = Guard(arm, Safety(layer.limits, layer._fence, layer.cfg), clock)
+        guard.start()
+        goal = rng.uniform(layer.limits.lower, layer.limits.upper)
+        for k in range(count := int(rng.integers(2, 12))):
+            if k == count - 1:
+                assert guard.fault is None
+                servos.faults = emulated.BusFaults(**fault)
+            guard.read()
+            guard.command(goal)
+            clock.sleep_until(clock.now() + 0.02)
+        assert guard.fault.kind == "bus"
+        servos.faults, at = emulated.BusFaults(), guard.safety.position
+        for _ in range(8):  # all is well again, and nothing resumes
+            guard.command(goal)
+        assert np.abs(guard.safety.position - at).max() < 0.06 and guard.safety.at_rest
+        assert servos.eeprom_writes == servos.torque_cuts == 0 and plant.powered.all()
 
 
 def test_hot_servos_end_in_hold(bench):

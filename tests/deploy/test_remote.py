@@ -10,9 +10,11 @@ import sys
 import threading
 import time
 
+import arms
 import numpy as np
 import pytest
 
+from mjx_nero.deploy import server
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.remote import Remote
 from mjx_nero.deploy.safety import Fault
@@ -158,6 +160,21 @@ def test_a_fault_is_told_and_stays(spec):
     assert remote.fault == Fault("stop", "enough")
     np.testing.assert_allclose(remote.command(at + 0.2).position, at, atol=1e-2)
     remote.close()
+
+
+def test_an_arm_that_may_not_start_gets_no_torque(spec, monkeypatch):
+    clock, home = arms.Clock(), np.array(spec.metadata["joints"]["home"])
+    arm, engaged = arms.Ideal(tuple(spec.metadata["joints"]["names"]), home, clock), []
+    arm.engage = lambda: engaged.append(True)
+    monkeypatch.setattr(server.drivers, "make", lambda *_: arm)
+    monkeypatch.setattr(server, "WallClock", lambda: clock)
+    made = server.Server(spec)
+    arm.at = home + np.array([0.4, 0, 0, 0, 0, 0])
+    refused = made.answer({"do": "start", "anywhere": False, "actions": 0})
+    assert "far from home" in refused["error"] and not engaged and not made.running
+    arm.at = home
+    assert "error" not in made.answer({"do": "start", "anywhere": False, "actions": 0}) and engaged == [True]
+    made.guard.close()
 
 
 @pytest.mark.parametrize(

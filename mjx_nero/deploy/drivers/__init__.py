@@ -25,6 +25,20 @@ def check(kind: str, metadata: Mapping[str, Any]) -> None:
         raise UserError(f"the policy is for {metadata['robot']}, and --arm {kind} is a {wanted}")
 
 
+def ports(kind: str, options: Mapping[str, Any]) -> list[str]:
+    """What an arm is reached by, and no other program may use meanwhile; none for the simulated arm.
+
+    Args:
+        options: see ``make``.
+    """
+    told = options.get("port") or ""
+    if kind == "lerobot":  # TYPE:field=value,...
+        told = next((part[5:] for part in told.partition(":")[2].split(",") if part.startswith("port=")), told)
+    elif kind == "cobotta":
+        told = told.removeprefix("udp:").removesuffix(":5007")
+    return [port for port in (told.removeprefix("slcan:"), options.get("gripper")) if port]
+
+
 def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clock: Clock) -> Arm:
     """A driver, not connected yet.
 

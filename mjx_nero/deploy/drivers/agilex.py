@@ -143,6 +143,7 @@ class Agilex:
         model, end = self._model, self._clock.now() + _WAIT
         while not all(frame in self._frames for frame in (STATUS, *model.joints, GRIPPED, *model.fast, *model.slow)):
             if self._clock.now() > end:
+                self.close()
                 raise UserError(f"no {model.name} is heard at {self._port}: {model.hint}")
             self._wait()
 
@@ -160,7 +161,7 @@ class Agilex:
                     return
                 if not message.is_extended_id and not message.is_error_frame and len(message.data) == 8:
                     self._frames[message.arbitration_id] = self._clock.now(), bytes(message.data)
-        except (self._error, OSError, ValueError) as error:
+        except (self._error, OSError, ValueError, LookupError) as error:  # a serial adapter's line that is cut short, too
             raise ArmError(f"the CAN bus fails: {error}") from None
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:

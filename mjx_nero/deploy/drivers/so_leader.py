@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero.deploy.alone import alone
 from mjx_nero.deploy.arm import ArmError, Clock
 from mjx_nero.deploy.drivers.so_arm import SoArm, read_calibration
 
@@ -15,6 +16,7 @@ class SoLeader(SoArm):
 
     def connect(self) -> None:
         """Opens the port, and cuts the servos' torque."""
+        self._taken = alone(self._port)  # that of an arm which another program moves would drop it
         super().connect()
         for servo in self.ids:
             self._bus.write(servo, "torque_enable", 0)

@@ -6,8 +6,9 @@ import dataclasses
 import pathlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
+from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import drivers
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
@@ -48,7 +49,8 @@ def add_limits(parser: cli.Parser) -> None:
     text = "box that no link may leave, m (default: about home and the task's regions, and 0.3 m on all sides)"
     add("--workspace", metavar="X0,X1,Y0,Y1,Z0,Z1", help=text)
     add("--apart", type=cli.non_negative, default=0.0, help="least distance between links, m (default: %(default)s)")
-    add("--hottest", type=cli.positive_float, default=60.0, metavar="CELSIUS", help="of a drive (default: %(default)s)")
+    hottest = cli.number(Annotated[float, Bounds(20.0, 90.0)])
+    add("--hottest", type=hottest, default=60.0, metavar="CELSIUS", help="of a drive, at most 90 (default: %(default)s)")
 
 
 def check(parser: cli.Parser, args: argparse.Namespace) -> None:
