@@ -12,31 +12,14 @@ import sys
 import numpy as np
 import pytest
 from lerobots import lerobot_python
+from written import episode, schema
 
-from mjx_nero.data import Episode, Feature, Schema, open_dataset, writer
+from mjx_nero.data import Episode, Schema, open_dataset, writer
 from mjx_nero.data.episode import picture
 from mjx_nero.errors import UserError
 from mjx_nero.tools.demos import inspection
 
 FORMS = ("lerobot", "arrays")
-
-
-def schema(**about) -> Schema:
-    features = {
-        "observation.state": Feature(("a.pos", "b.pos"), ("rad", "m")),
-        "action": Feature(("a.pos", "b.pos"), ("rad", "m")),
-        "next.reward": Feature(("reward",)),
-        "next.done": Feature(("done",), dtype="bool"),
-    }
-    return Schema(50.0, "nero", "Pick up the cube.", features, {"env": "nero_lift", "seed": 0, **about})
-
-
-def episode(number: int, steps: int = 5) -> Episode:
-    rng = np.random.default_rng(number)
-    arrays = {name: rng.normal(size=(steps, 2)).astype(np.float32) for name in ("observation.state", "action")}
-    done = np.arange(steps)[:, None] == steps - 1
-    arrays["action"] = np.asfortranarray(arrays["action"])  # as a slice of something else may lie in the memory
-    return Episode({**arrays, "next.reward": rng.random((steps, 1), np.float32), "next.done": done}, number % 3 > 0, number)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -181,7 +164,7 @@ def test_what_is_damaged_is_told(form, tmp_path):
 _ENDLESS = """
 import sys, pathlib
 sys.path[:0] = [{here!r}, {package!r}]
-from test_forms import episode, schema
+from written import episode, schema
 from mjx_nero.data import writer
 with writer(pathlib.Path({out!r}), schema(), {form!r}) as out:
     while True:
