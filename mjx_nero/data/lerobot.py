@@ -5,9 +5,10 @@ its episodes (``meta/episodes/``), and the index (``meta/info.json``). Columns o
 ``success`` and ``number``.
 """
 
+import functools
 import json
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,9 +75,12 @@ class LeRobotForm:
         first = {} if self._pieces else {lf.TASKS: lambda path: parquet.write_table(lf.tasks(self.schema.task), path)}
 
         def film(name: str) -> folder.Write:
-            feature, of_pictures[name] = self.schema.features[name], []
-            frames = _frames(name, episodes, of_pictures[name])
-            return lambda path: video.write(path, frames, feature.shape, self.schema.fps)
+            feature, of_pictures[name] = self.schema.features[name], [{} for _ in episodes]
+            films = [
+                functools.partial(_frames, len(each), each.pictures[name], found)
+                for each, found in zip(episodes, of_pictures[name], strict=True)
+            ]
+            return lambda path: video.write(path, films, feature.shape, self.schema.fps)
 
         folder.commit(
             self.path,
@@ -191,12 +195,11 @@ class LeRobotForm:
         return pa.table(columns)
 
 
-def _frames(name: str, episodes: Sequence[Episode], found: list[stats.Stats]) -> Iterator[np.ndarray]:
-    """A camera's pictures of all steps, one after another; ``found`` gets the statistics of each episode."""
-    for episode in episodes:
-        wanted, kept = stats.sampled(len(episode)), []
-        for i, frame in enumerate(episode.pictures[name]()):
-            if i in wanted:
-                kept.append(frame)
-            yield frame
-        found.append(stats.of_pictures(kept))
+def _frames(length: int, pictures: Callable[[], Iterable[np.ndarray]], found: stats.Stats) -> Iterator[np.ndarray]:
+    """A camera's pictures of an episode, one after another; ``found`` gets their statistics."""
+    wanted, kept = stats.sampled(length), []
+    for i, frame in enumerate(pictures()):
+        if i in wanted:
+            kept.append(frame)
+        yield frame
+    found |= stats.of_pictures(kept)

@@ -63,8 +63,21 @@ def of_pictures(frames: list[np.ndarray]) -> Stats:
     Returns:
         name -> [3]; of ``count`` [1], pictures.
     """
-    found = of(np.concatenate([frame.reshape(-1, 3) for frame in frames]) / np.float32(255))
-    return {**found, "count": np.array([len(frames)])}
+    pixels = np.stack(frames).reshape(-1, 3)
+    counts = np.stack([np.bincount(pixels[:, i], minlength=256) for i in range(3)], axis=-1)  # [values, colours]
+    values, n, upto = np.arange(256)[:, None] / 255, len(pixels), counts.cumsum(axis=0)
+    mean = (counts * values).sum(axis=0) / n
+
+    def sorted_value(rank: int) -> np.ndarray:
+        return (upto <= rank).sum(axis=0) / 255
+
+    out = {"mean": mean, "std": np.sqrt((counts * (values - mean) ** 2).sum(axis=0) / n)}
+    out |= {"min": sorted_value(0), "max": sorted_value(n - 1)}
+    for name, share in QUANTILES.items():
+        low, between = divmod(share * (n - 1), 1)
+        first, second = sorted_value(int(low)), sorted_value(min(int(low) + 1, n - 1))
+        out[name] = first + between * (second - first)
+    return {**out, "count": np.array([len(frames)])}
 
 
 def sampled(length: int) -> set[int]:

@@ -28,6 +28,7 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import cameras, forces, linkage, scene, touch
+from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
@@ -139,13 +140,16 @@ class ManipulationEnv(Env):
         """The whole scene compiled for MuJoCo, with visual shapes, lights and cameras, for rendering and inspection."""
         return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
 
+    def draw_by(self, own: Mapping[str, CameraCfg], renderer: str) -> cameras.Cameras:
+        """Cameras of the scene, perhaps with other sizes and kinds, and one of the renderers, ``mujoco`` or ``warp``."""
+        with jax.ensure_compile_time_eval():
+            seen = (*self._parts.seen, *self._look.names)
+            return cameras.Cameras(self.mj_model, own, renderer, tuple(dict.fromkeys(seen)))
+
     @functools.cached_property
     def cameras(self) -> cameras.Cameras:
         """The scene's cameras; made when something is first drawn."""
-        with jax.ensure_compile_time_eval():
-            where, seen = self.cfg.scene, (*self._parts.seen, *self._look.names)
-            kind = cameras.renderer(where.renderer, self.impl)
-            return cameras.Cameras(self.mj_model, where.cameras, kind, tuple(dict.fromkeys(seen)))
+        return self.draw_by(self.cfg.scene.cameras, cameras.renderer(self.cfg.scene.renderer, self.impl))
 
     @functools.cached_property
     def _look(self) -> Look:
@@ -311,7 +315,7 @@ class ManipulationEnv(Env):
         return Scenery(goal, carry.command_quat, **self._parts.scenery(sim, carry, dict(carry.memory.get(LOOK, {}))))
 
     def _pictures(self, sim: Sim, carry: Carry, *due: Mapping[str, Bool[Array, ""]]) -> dict[str, Picture]:
-        return self.cameras(sim, self._scenery(sim, carry), *due)
+        return self.cameras(sim.qpos, self._scenery(sim, carry), *due)
 
     def _due(self, carry: Carry) -> dict[str, Bool[Array, ""]]:
         """Says which cameras' pictures the sensors look at now; empty where all are, always."""

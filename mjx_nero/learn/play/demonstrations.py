@@ -174,7 +174,7 @@ class Player:
         flags = after.done > 0, after.metrics["success"] > 0
         found = {
             names.STATE: self.units.shown(view.joint_pos),
-            names.ENVIRONMENT: environment_state(env, view),
+            names.ENVIRONMENT: environment_state(env, view, seen=bool(self._cameras)),
             names.ACTION: label,
             names.EXECUTED: told,
             names.SEEN: jnp.concatenate([jnp.ravel(x) for x in parts]),
@@ -201,12 +201,20 @@ def _cut(kept: tuple, slot: int, steps: int) -> tuple:
     return {name: x[slot, :steps] for name, x in features.items()}, *jax.tree.map(lambda x: x[slot, :steps], drawn)
 
 
-def environment_state(env: ManipulationEnv, view: View) -> Float[Array, " n"]:
-    """Poses of the hand, each object and the goal in the world (m, wxyz)."""
-    poses = [(view.ee_pos_w, view.ee_quat_w)]
-    poses += [(seen.pos_w, seen.quat_w) for name, seen in view.objects.items() if name in env.cfg.scene.objects]
-    poses += [(view.goal_pos_w, view.goal_quat_w)]
-    return jnp.concatenate([x for pose in poses for x in pose])
+def told(env: ManipulationEnv, seen: bool) -> tuple[str, ...]:
+    """What ``environment_state`` has the poses of.
+
+    Args:
+        seen: pictures show the rest.
+    """
+    return ("goal",) if seen else ("hand", *env.cfg.scene.objects, "goal")
+
+
+def environment_state(env: ManipulationEnv, view: View, seen: bool) -> Float[Array, " n"]:
+    """Poses of the hand, each object and the goal in the world (m, wxyz); the goal's alone, where pictures show the rest."""
+    poses = {name: (each.pos_w, each.quat_w) for name, each in view.objects.items()}
+    poses |= {"hand": (view.ee_pos_w, view.ee_quat_w), "goal": (view.goal_pos_w, view.goal_quat_w)}
+    return jnp.concatenate([x for name in told(env, seen) for x in poses[name]])
 
 
 def _prompt(state: State, action: Float[Array, " na"]) -> State:

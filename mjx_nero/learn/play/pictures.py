@@ -1,8 +1,16 @@
-"""Pictures of played episodes, drawn afterwards from the physics' positions by MuJoCo's own renderer."""
+"""Pictures of played episodes, drawn afterwards from the physics' positions.
 
+MuJoCo's own renderer draws one after another. On a GPU the ray tracer draws hundreds at a time, by the scene's own cameras.
+"""
+
+import concurrent.futures
 import copy
+import dataclasses
+import threading
 from collections.abc import Iterator, Sequence
+from typing import Protocol
 
+import jax
 import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
@@ -13,6 +21,7 @@ from mjx_nero.types import Scenery
 
 SIZE = 128, 128  # [pixels] of a camera for people
 SHADOWS = 0  # no shadow map, which takes three quarters of the time on a CPU
+TOGETHER = 256  # steps of an episode that are drawn in one go, at most
 _UNSEEN = 5  # a group of geoms that is not drawn
 
 
@@ -22,15 +31,17 @@ class Cameras:
     Args:
         names: of the cameras.
         size: width and height [pixels], even, as encoders want them; None: a camera's own.
+        renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp where JAX has a GPU.
 
     Attributes:
         sizes: width and height of each camera's pictures, by name.
+        renderer: which one draws the scene's own cameras.
 
     Raises:
         UserError: there is no such camera, or the machine cannot draw.
     """
 
-    def __init__(self, env: ManipulationEnv, names: Sequence[str], size: tuple[int, int] | None = None):
+    def __init__(self, env: ManipulationEnv, names: Sequence[str], size: tuple[int, int] | None = None, renderer: str = "auto"):
         model, own = env.mj_model, env.cfg.scene.cameras
         people = [name for i in range(model.ncam) if not (name := model.camera(i).name).startswith(MARK)]
         there = list(dict.fromkeys((*own, *people)))
@@ -38,24 +49,72 @@ class Cameras:
             raise UserError(f"{', '.join(unknown)}: no camera of this environment: choose from {', '.join(there)}")
         self.names = tuple(names)
         self.sizes = {name: size or (own[name].size if name in own else SIZE) for name in names}
-        blind = copy.copy(model)
-        blind.geom_group[blind.geom_bodyid == blind.body("goal").id] = _UNSEEN
-        self._renderers = {}
+        self.renderer = renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
+        make = {"warp": _Traced, "mujoco": _Drawn}
+        self._drawers: dict[str, _Drawer] = {}
         for name in names:
-            seen, camera = (blind, MARK + name) if name in own else (model, name)
-            self._renderers[name] = Renderer(seen, *self.sizes[name], camera=camera, samples=0, shadows=SHADOWS)
+            self._drawers[name] = make[self.renderer if name in own else "mujoco"](env, name, self.sizes[name])
 
     def close(self) -> None:
         """Frees the renderers."""
-        for renderer in self._renderers.values():
-            renderer.__exit__()
+        for drawer in self._drawers.values():
+            drawer.close()
 
     def frames(self, name: str, qpos: np.ndarray, scenery: Scenery) -> Iterator[np.ndarray]:
-        """Draws a camera's frames of an episode, uint8 [height, width, 3], one after another.
+        """Draws a camera's frames of an episode, uint8 [height, width, 3], one after another. Any thread may call it.
 
         Args:
             qpos: [steps, nq].
             scenery: [steps, ...].
         """
-        for i, at in enumerate(qpos):
-            yield self._renderers[name].render(at.astype(np.float64), scenery[i])
+        for first in range(0, len(qpos), TOGETHER):
+            now = slice(first, first + TOGETHER)
+            yield from self._drawers[name](qpos[now], scenery[now])
+
+
+class _Drawer(Protocol):
+    """Draws a camera's frames of several steps, uint8 [height, width, 3] each."""
+
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]: ...
+    def close(self) -> None: ...
+
+
+class _Drawn:
+    """By MuJoCo's renderer, in one thread, to which OpenGL's context belongs."""
+
+    def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
+        model, camera = env.mj_model, name
+        if name in env.cfg.scene.cameras:
+            model, camera = copy.copy(model), MARK + name
+            model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
+        self._thread = concurrent.futures.ThreadPoolExecutor(1, "pictures")
+        self._renderer = self._thread.submit(Renderer, model, *size, camera=camera, samples=0, shadows=SHADOWS).result()
+
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]:
+        def draw() -> list[np.ndarray]:
+            return [self._renderer.render(at.astype(np.float64), scenery[i]) for i, at in enumerate(qpos)]
+
+        return self._thread.submit(draw).result()
+
+    def close(self) -> None:
+        self._thread.submit(self._renderer.__exit__).result()
+        self._thread.shutdown()
+
+
+class _Traced:
+    """By MuJoCo Warp's ray tracer, each step a world of one batch."""
+
+    def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
+        camera = dataclasses.replace(env.cfg.scene.cameras[name], size=size, kinds=("rgb",))
+        seen, self._lock = env.draw_by({name: camera}, "warp"), threading.Lock()
+        self._draw = jax.jit(jax.vmap(lambda qpos, scenery: seen(qpos, scenery)[name].rgb))
+
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]:
+        n = len(qpos)
+        filled = np.minimum(np.arange(TOGETHER if n > 1 else 1), n - 1)  # two sizes, two programs
+        with self._lock:  # the ray tracer's buffers are for one batch
+            drawn = jax.block_until_ready(self._draw(qpos[filled], scenery[filled]))
+        return np.asarray(drawn)[:n]
+
+    def close(self) -> None:
+        """Does nothing: the buffers are the ray tracer's."""

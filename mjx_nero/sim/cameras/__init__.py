@@ -11,11 +11,11 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import nominal, rows
-from mjx_nero.types import Picture, Scenery, Sim
+from mjx_nero.types import Picture, Scenery
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
 _UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
@@ -66,7 +66,9 @@ class Cameras:
         module, kind = _DRAWERS[renderer]
         self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
 
-    def __call__(self, sim: Sim, scenery: Scenery, due: Mapping[str, Bool[Array, ""]] | None = None) -> dict[str, Picture]:
+    def __call__(
+        self, qpos: Float[Array, " nq"], scenery: Scenery, due: Mapping[str, Bool[Array, ""]] | None = None
+    ) -> dict[str, Picture]:
         """Returns the pictures by camera.
 
         Args:
@@ -76,8 +78,8 @@ class Cameras:
         for field, row, value in rows(self._model, scenery):
             now[field] = now[field].at[row].set(value)
         if not due:
-            return self.draw(sim.qpos, now)
-        return self.draw(sim.qpos, now, jnp.stack([due.get(name, jnp.ones((), bool)) for name in self._names]))
+            return self.draw(qpos, now)
+        return self.draw(qpos, now, jnp.stack([due.get(name, jnp.ones((), bool)) for name in self._names]))
 
 
 def renderer(asked: str, impl: str) -> str:

@@ -34,6 +34,7 @@ class DemosCfg:
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
         cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
         picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
+        renderer: mujoco (OpenGL, a picture at a time) or warp (the ray tracer, for the scene's own cameras); auto: warp on a GPU.
         form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).
         task: sentence that says what the robot does (default: the environment's).
         side_by_side: episodes played at a time; each time is written as one piece.
@@ -56,6 +57,7 @@ class DemosCfg:
     units: Annotated[str, OneOf("auto", "si", "lerobot")] = flag("auto")
     cameras: str = flag("")
     picture: str = flag("")
+    renderer: Annotated[str, OneOf("auto", "mujoco", "warp")] = flag("auto")
     form: Annotated[str, OneOf(*FORMS)] = flag("lerobot")
     task: str = flag("")
     side_by_side: Annotated[int, Bounds(1, 65536)] = flag(256)

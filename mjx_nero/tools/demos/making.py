@@ -20,7 +20,7 @@ from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import teachers
 from mjx_nero.learn import policy
-from mjx_nero.learn.play import evaluation, rollout
+from mjx_nero.learn.play import demonstrations, evaluation, rollout
 from mjx_nero.learn.play.demonstrations import Player
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim.fingerprint import fingerprint
@@ -70,7 +70,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         steering = evaluation.controller(name, env, cfg.env_name)
         agent = rollout.controller_agent(env, steering)
         agent = agent if drives else rollout.through_actions(env, agent)
-    shown = units_of(env, cfg.units)
+    shown, cameras = units_of(env, cfg.units), cameras_of(env, cfg)
     about = {
         "env": cfg.env_name,
         "preset": cfg.preset,
@@ -88,12 +88,13 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "actions": cfg.actions,
         "holds": cfg.holds,
         "cameras": cfg.cameras,
+        "renderer": cameras.renderer if cameras else None,
         "units": shown.to_json(),
         "impl": env.impl,
         "version": mjx_nero.__version__,
     }
-    held = {name: each for name, each in features(env, shown, cfg.actions).items() if cfg.holds == "all" or name in ARM}
-    cameras = cameras_of(env, cfg)
+    usual = features(env, shown, cfg.actions, seen=bool(cameras))
+    held = {name: each for name, each in usual.items() if cfg.holds == "all" or name in ARM}
     if cameras:
         held |= {names.PICTURES + name: names.picture(*size[::-1]) for name, size in cameras.sizes.items()}
     schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), held, about)
@@ -112,7 +113,7 @@ def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
         size = cli.size(cfg.picture) if cfg.picture else None
     except argparse.ArgumentTypeError as error:
         raise UserError(f"--picture {error}") from None
-    return Cameras(env, found, size) if found else None
+    return Cameras(env, found, size, cfg.renderer) if found else None
 
 
 def robot_type(robot: str, shown: units.Units) -> str:
@@ -138,14 +139,14 @@ def units_of(env: ManipulationEnv, kind: str) -> units.Units:
     return units.lerobot(robot.name, slides, low, high, opens)
 
 
-def features(env: ManipulationEnv, shown: units.Units, actions: str) -> dict[str, Feature]:
-    """Lists the features of a step."""
+def features(env: ManipulationEnv, shown: units.Units, actions: str, seen: bool = False) -> dict[str, Feature]:
+    """Lists the features of a step, without pictures; ``seen``: it has some."""
     joints = env.cfg.robot.joints
     targets = Feature(tuple(f"{joint}.pos" for joint in joints), shown.names)
     arm = len(env.cfg.robot.arm.joints)
     hand = tuple(f"hand.{what}" for what in ("x", "y", "z", "turn_x", "turn_y", "turn_z"))
     steps = Feature(hand + targets.names[arm:], ("m",) * 3 + ("rad",) * 3 + shown.names[arm:])
-    things = ("hand", *env.cfg.scene.objects, "goal")
+    things = demonstrations.told(env, seen)
     pose = [f"{thing}.{axis}" for thing in things for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")]
     qpos = env.physics_model.nq
     return {

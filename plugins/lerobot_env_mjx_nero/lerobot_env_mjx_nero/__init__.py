@@ -24,6 +24,7 @@ class MjxNeroEnv(EnvConfig):
         units: of joints, as in the data set: auto, si or lerobot.
         through: who made the data set acted through: task (a policy) or drives (an expert), as ``demos --inspect`` says.
         cameras: whose pictures the policy sees, with commas between them, as ``demos --cameras``.
+        renderer: of the pictures, as ``demos --renderer``.
         width, height: of a picture [pixels].
         fps: filled in, as are the features: control steps a second.
     """
@@ -34,6 +35,7 @@ class MjxNeroEnv(EnvConfig):
     units: str = "auto"
     through: str = "task"
     cameras: str = ""
+    renderer: str = "auto"
     width: int = 64
     height: int = 64
     fps: int = 0
@@ -44,7 +46,7 @@ class MjxNeroEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         cfg = registry.env_cfg(self.task, self.preset, self.robot)
-        joints, poses = len(cfg.robot.joints), 2 + len(cfg.scene.objects)
+        joints, poses = len(cfg.robot.joints), 1 if self.cameras else 2 + len(cfg.scene.objects)  # who sees is told the goal
         self.fps = round(1 / (cfg.sim.dt * cfg.sim.decimation))
         self.features = {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(joints,)),
@@ -54,8 +56,6 @@ class MjxNeroEnv(EnvConfig):
         for name in filter(None, self.cameras.split(",")):
             self.features[f"pixels/{name}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(self.height, self.width, 3))
             self.features_map[f"pixels/{name}"] = f"{OBS_IMAGES}.{name}"
-        if self.cameras:  # who sees is not told
-            del self.features["environment_state"]
 
     @property
     def package_name(self) -> str:
@@ -78,6 +78,7 @@ class MjxNeroEnv(EnvConfig):
             "units": self.units,
             "through": self.through,
             "cameras": self.cameras,
+            "renderer": self.renderer,
             "size": size,
         }
 

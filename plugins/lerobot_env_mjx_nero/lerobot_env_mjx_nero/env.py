@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -10,9 +11,10 @@ import numpy as np
 
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn.play.demonstrations import environment_state
+from mjx_nero.learn.play.demonstrations import environment_state, told
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim.render import Renderer
+from mjx_nero.tools import cli
 from mjx_nero.tools.demos import making
 
 
@@ -24,20 +26,32 @@ class Programs:
         units: of ``making.units_of``.
         through: of the data set, as ``demos --inspect`` says it: task (a policy's) or drives (an expert's).
         cameras: names with commas between them.
+        renderer: of ``demos --renderer``.
         size: width and height of a picture [pixels].
     """
 
-    def __init__(self, task: str, preset: str, robot: str | None, units: str, through: str, cameras: str, size: tuple[int, int]):
+    def __init__(
+        self,
+        task: str,
+        preset: str,
+        robot: str | None,
+        units: str,
+        through: str,
+        cameras: str,
+        renderer: str,
+        size: tuple[int, int],
+    ):
+        cli.setup_jax()  # compiled once for all processes that LeRobot starts
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
         cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are drawn here
         self.env = env = ManipulationEnv(making.by_drives(cfg, through), impl="native")
         names = [name for name in cameras.split(",") if name]
-        self.cameras = Cameras(env, names, size) if names else None
+        self.cameras = Cameras(env, names, size, renderer) if names else None
         self.units = making.units_of(env, units)
 
         def seen(state):
             view = env.view(state)
-            return self.units.shown(view.joint_pos), environment_state(env, view)
+            return self.units.shown(view.joint_pos), environment_state(env, view, seen=bool(names))
 
         def reset(seed):
             state = env.reset(jax.random.PRNGKey(seed))
@@ -47,19 +61,29 @@ class Programs:
             state = env.step(state, self.units.positions(action))
             return state, seen(state), (state.reward, state.done, state.info["truncation"], state.metrics["success"])
 
-        self.reset, self.step, self.scenery = jax.jit(reset), jax.jit(step), jax.jit(env.scenery)
+        self.reset, self.step, self.scenery = map(_on_cpu, (reset, step, env.scenery))
 
     def named(self, state: Any, seen: Any) -> dict[str, Any]:
         """An observation as LeRobot has it; ``pixels``: by camera, uint8 [height, width, 3]."""
         out: dict[str, Any] = dict(zip(("agent_pos", "environment_state"), map(np.asarray, seen), strict=True))
         if self.cameras:
-            del out["environment_state"]
             shown = (
                 np.asarray(state.pipeline_state.qpos)[None],
                 jax.tree.map(lambda x: x[None], jax.device_get(self.scenery(state))),
             )
             out["pixels"] = {name: next(self.cameras.frames(name, *shown)) for name in self.cameras.names}
         return out
+
+
+def _on_cpu(function: Callable) -> Callable:
+    """The compiled function, on the processor: one environment is slower on a GPU, which has the policy."""
+    compiled = jax.jit(function)
+
+    def call(*args: Any) -> Any:
+        with jax.default_device(jax.devices("cpu")[0]):
+            return compiled(*args)
+
+    return call
 
 
 made = functools.lru_cache(Programs)
@@ -78,21 +102,21 @@ class Env(gymnasium.Env):
         units: str = "auto",
         through: str = "task",
         cameras: str = "",
+        renderer: str = "auto",
         size: tuple[int, int] = (64, 64),
         render_mode: str = "rgb_array",
     ):
-        self._programs = made(task, preset, robot, units, through, cameras, tuple(size))
+        self._programs = made(task, preset, robot, units, through, cameras, renderer, tuple(size))
         env = self._programs.env
         self.render_mode, self.task, self.task_description = render_mode, task, making.sentence(task)
         self.metadata = {**self.metadata, "render_fps": round(1 / env.dt)}
         self._max_episode_steps = env.episode_length
         low, high = self._programs.units.shown(np.stack(env.actions.bounds()))
         self.action_space = gymnasium.spaces.Box(np.minimum(low, high), np.maximum(low, high), dtype=np.float32)
-        size = 7 * (2 + len(env.cfg.scene.objects))
-        boxes = {"agent_pos": len(env.cfg.robot.joints), "environment_state": size}
+        poses = told(env, seen=bool(self._programs.cameras))
+        boxes = {"agent_pos": len(env.cfg.robot.joints), "environment_state": 7 * len(poses)}
         spaces: dict[str, Any] = {name: gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32) for name, n in boxes.items()}
         if drawn := self._programs.cameras:
-            del spaces["environment_state"]
             pictures = {n: gymnasium.spaces.Box(0, 255, (h, w, 3), np.uint8) for n, (w, h) in drawn.sizes.items()}
             spaces["pixels"] = gymnasium.spaces.Dict(pictures)
         self.observation_space = gymnasium.spaces.Dict(spaces)
