@@ -97,7 +97,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         rewards=carrying(held, **one),
         curriculum=CurriculumCfg(expert_starts=0.5),
         training=CALM,
-        budget=Budget(steps=250_000_000),
+        budget=Budget(steps=120_000_000),
         terminations=stays_on_table(scene, **one),
     )
 
