@@ -202,7 +202,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         },
         rewards=carrying(held, **commanded),
         training=SHOWN,
-        budget=Budget(steps=60_000_000),
+        budget=Budget(steps=45_000_000),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
             "object_off_table": DoneTerm(

@@ -55,7 +55,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
-        budget=Budget(steps=90_000_000),
+        budget=Budget(steps=70_000_000),
     )
 
 

@@ -64,7 +64,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
         },
         observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
         rewards={**tower.rewards(), "leaving": leaving},
-        budget=Budget(steps=90_000_000),
+        budget=Budget(steps=70_000_000),
     )
 
 
