@@ -234,7 +234,7 @@ def test_unknown_names(call, message):
 def test_registry_lists():
     everywhere = {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in ("lift", "reach")}
     more = ("follow_target", "pick_place", "place", "stack", "clutter", "lift_any", "push", "reach_obstacles", "lift_obstacles")
-    more += ("open_drawer", "open_door", "turn_knob")
+    more += ("open_drawer", "open_door", "turn_knob", "insert_peg", "hang_ring")
     controlled = {f"{robot}_{task}" for robot in ("nero", "cobotta") for task in more[:2]}
     everywhere |= {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in more[2:]}
     assert set(list_envs()) == everywhere | controlled | {"reach", "lift", *more}
@@ -398,7 +398,7 @@ def test_one_learner_is_for_all_tasks_and_arms():
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
-        taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles"))
+        taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles", "insert_peg", "hang_ring"))
         shown = taught and not env.endswith("pick_place")
         calm = SHOWN if shown else CALM if moves else {}
         assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env

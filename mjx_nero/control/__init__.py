@@ -13,6 +13,7 @@ from mjx_nero.control.grasp_thing import GraspThing, GraspThingCfg
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
+from mjx_nero.control.put_in import PutIn, PutInCfg, PutThing, PutThingCfg
 from mjx_nero.sim.robot import RobotCfg
 
 # name -> (class, its config); the class takes (robot, dt, config)
@@ -27,6 +28,8 @@ CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
         "pick_up": (PickUp, PickUpCfg()),
         "follow_joint": (FollowJoint, FollowJointCfg()),
         "grasp_thing": (GraspThing, GraspThingCfg()),
+        "put_in": (PutIn, PutInCfg()),
+        "put_thing": (PutThing, PutThingCfg()),
     },
 )
 

@@ -13,6 +13,8 @@ from mjx_nero.envs.task import SHOWN, EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import (
     clutter,
     follow_target,
+    hang_ring,
+    insert_peg,
     lift,
     lift_any,
     lift_obstacles,
@@ -142,6 +144,8 @@ FITTING: dict[str, Presets] = {
     "open_door": open_door.presets(),
     "turn_knob": turn_knob.presets(),
     "lift_any": lift_any.presets(),
+    "insert_peg": insert_peg.presets(),
+    "hang_ring": hang_ring.presets(),
     "push": push.presets(),
     "place": _presets(_tower, **place.presets()),
     "stack": _presets(_tower, **stack.presets()),

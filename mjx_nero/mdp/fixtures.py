@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
-from mjx_nero.config.bounds import Positive, Range
+from mjx_nero.config.bounds import NonNegative, Positive, Range
 from mjx_nero.types import FixtureStart, FixtureView, Key, Start, View
 
 Quat = tuple[float, float, float, float]
@@ -52,6 +52,20 @@ def stand_uniform(key: Key, start: Start, *, fixture: str, x: Range, y: Range, y
         seen, pos_w=seen.pos_w + jnp.stack([dx, dy, jnp.zeros(())]), quat_w=math.quat_mul(turn, seen.quat_w)
     )
     return _with(start, fixture, moved)
+
+
+def stand_at_goal(key: Key, start: Start, *, fixture: str, off: NonNegative = 0.0, turn: NonNegative = 0.0) -> Start:
+    """Puts a fixture below the goal, turned as the goal is: the goal says where somebody takes the fixture to be.
+
+    Args:
+        off: by how much the goal is wrong, at most, along x and y [m].
+        turn: and about the vertical [rad].
+    """
+    wrong = jnp.array([off, off, turn]) * jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)
+    seen = start.fixtures[fixture]
+    pos = jnp.append(start.goal_pos_w[:2] + wrong[:2], seen.pos_w[2])
+    quat = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), math.yaw(start.goal_quat_w) + wrong[2])
+    return _with(start, fixture, dataclasses.replace(seen, pos_w=pos, quat_w=quat))
 
 
 def joint_uniform(key: Key, start: Start, *, fixture: str, joint: str, position: Range) -> Start:

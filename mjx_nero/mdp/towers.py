@@ -27,8 +27,8 @@ class Place:
 
     Attributes:
         tower: the objects from the bottom up. ``("goal", "box")`` is a box at the goal; ``("blue", "red")`` is the red object on
-            the blue one, wherever that is.
-        rise: height from one object's centre to the next one's [m].
+            the blue one, wherever that is; ``("socket/hole", "peg")`` is the peg on a site of a fixture.
+        rise: height from one object's centre, or from the site, to the next one's [m].
         within: tolerances of a standing object: along the table [m], in height [m], and at the goal in angle [rad].
         minimal_height: least height of a held object [m].
         grasp_radius: greatest distance of a held object from the grasp point [m] (see ``rewards.held``).
@@ -54,7 +54,7 @@ class Place:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Level:
+class Level:
     """One object to move: its way to its place [m], and whether the objects below stand, it is over its place, and it stands."""
 
     object: str
@@ -66,9 +66,12 @@ class _Level:
 
 
 def way(view: View, *, below: str, object: str, rise: float) -> Float[Array, "3"]:
-    """Vector from the object to its place on the object ``below``, or at the goal [m]."""
-    place = view.goal_pos_w if below == GOAL else view.objects[below].pos_w + jnp.array([0.0, 0.0, rise])
-    return place - view.objects[object].pos_w
+    """Vector from the object to its place on what is ``below``, or at the goal [m]."""
+    (fixture, _, site), at = below.partition("/"), view.objects[object].pos_w
+    if below == GOAL:
+        return view.goal_pos_w - at
+    under = view.fixtures[fixture].site_pos_w[site] if site else view.objects[below].pos_w
+    return under + jnp.array([0.0, 0.0, rise]) - at
 
 
 def turn_to_goal(view: View, *, object: str) -> Float[Array, "3"]:
@@ -85,7 +88,8 @@ def turn_to_object(view: View, *, object: str, down: tuple[float, float, float, 
     return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), wanted))
 
 
-def _levels(view: View, place: Place) -> Iterator[_Level]:
+def levels(view: View, place: Place) -> Iterator[Level]:
+    """Yields the objects to move, from the bottom up."""
     aside, height, angle = place.within
     due = jnp.ones((), bool)
     for below, object in place.steps:
@@ -94,7 +98,7 @@ def _levels(view: View, place: Place) -> Iterator[_Level]:
         there = over & (jnp.abs(to[2]) < height)
         if below == GOAL:
             there &= jnp.linalg.norm(turn_to_goal(view, object=object)) < angle
-        yield _Level(object, below, to, due, over, due & there)
+        yield Level(object, below, to, due, over, due & there)
         due &= there
 
 
@@ -110,9 +114,9 @@ def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
     At rest: slower than ``max_speed`` [m/s] and ten times that [rad/s]. Let go: the grasp point is more than ``place.clearance``
     away.
     """
-    met = [level.stands for level in _levels(view, place)]
+    met = [level.stands for level in levels(view, place)]
     for name in place.tower:
-        if name == GOAL:
+        if name not in view.objects:
             continue
         seen = view.objects[name]
         still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
@@ -131,18 +135,19 @@ def left_alone(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, 
     return built(view, place=place, max_speed=max_speed) & (view.readings["hand"] == 0)
 
 
-def _sum(values: Iterable[Array]) -> Scalar:
+def total(values: Iterable[Array]) -> Scalar:
+    """Adds up, from zero."""
     return sum(values, start=jnp.zeros(()))
 
 
 def reached(view: View, *, place: Place, std: Positive) -> Scalar:
     """1 - tanh(d / std), where d is the distance from the grasp point to the object; 1 once the object stands."""
     near = {name: 1.0 - jnp.tanh(jnp.linalg.norm(view.objects[name].pos_w - view.ee_pos_w) / std) for name in place.tower[1:]}
-    levels = _levels(view, place)
-    return _sum(level.due * jnp.where(level.stands, 1.0, near[level.object]) for level in levels)
+    return total(level.due * jnp.where(level.stands, 1.0, near[level.object]) for level in levels(view, place))
 
 
-def _carried(view: View, level: _Level, place: Place) -> Bool[Array, ""]:
+def is_carried(view: View, level: Level, place: Place) -> Bool[Array, ""]:
+    """True if it is an object's turn to move and it is held, also below its height over its place, or stands."""
     # Over its place an object may be at any height: otherwise its last centimetre down would forfeit the reward.
     lowered = level.over & place.holds(view, level.object, minimal_height=-jnp.inf)
     return level.due & (place.holds(view, level.object) | lowered | level.stands)
@@ -150,7 +155,7 @@ def _carried(view: View, level: _Level, place: Place) -> Bool[Array, ""]:
 
 def carried(view: View, *, place: Place) -> Scalar:
     """1 while the object is held or stands, else 0."""
-    return _sum(_carried(view, level, place) for level in _levels(view, place))
+    return total(is_carried(view, level, place) for level in levels(view, place))
 
 
 def approached(view: View, *, place: Place, over: Positive, std: Positive, flat: NonNegative = 0.0) -> Scalar:
@@ -164,38 +169,38 @@ def approached(view: View, *, place: Place, over: Positive, std: Positive, flat:
             place earns most if it is that much too high.
     """
 
-    def near(level: _Level) -> Scalar:
+    def near(level: Level) -> Scalar:
         aside = jnp.linalg.norm(level.way[:2])
         off = jnp.hypot(aside, level.way[2] + jnp.clip(aside - flat, 0.0, over))
-        return _carried(view, level, place) * (1.0 - jnp.tanh(off / std))
+        return is_carried(view, level, place) * (1.0 - jnp.tanh(off / std))
 
-    return _sum(near(level) for level in _levels(view, place))
+    return total(near(level) for level in levels(view, place))
 
 
 def aligned(view: View, *, place: Place, std: Positive) -> Scalar:
     """1 - tanh(angle / std) while the lowest object is held or stands, where angle is its turn from the goal [rad]."""
-    level = next(_levels(view, place))
+    level = next(levels(view, place))
     angle = jnp.linalg.norm(turn_to_goal(view, object=level.object))
-    return _carried(view, level, place) * (1.0 - jnp.tanh(angle / std))
+    return is_carried(view, level, place) * (1.0 - jnp.tanh(angle / std))
 
 
 def standing(view: View, *, place: Place) -> Scalar:
     """1 while the object stands, else 0."""
-    return _sum(level.stands for level in _levels(view, place))
+    return total(level.stands for level in levels(view, place))
 
 
-def _away(view: View, level: _Level, place: Place) -> Scalar:
+def _away(view: View, level: Level, place: Place) -> Scalar:
     """Distance of the grasp point from the object, from 0 to 1. On another object, only distance above or beside counts.
 
     A hand below has not left: it slides down the tower with fingers hardly open to hold what is there, and takes the object along
     on its way up.
     """
     off = view.ee_pos_w - view.objects[level.object].pos_w
-    off = off if level.below == GOAL else off.at[2].max(0.0)
+    off = off.at[2].max(0.0) if level.below in view.objects else off
     return jnp.minimum(jnp.linalg.norm(off) / place.clearance, 1.0)
 
 
-def _let_go(view: View, level: _Level, place: Place, at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
+def _let_go(view: View, level: Level, place: Place, at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
     """Opening of the finger positions or targets ``at``, from 0 at ``hold`` to 1 at ``open``.
 
     Below the top of a tower the hand has more work to do, so its distance counts instead, if that is more.
@@ -213,8 +218,7 @@ def told_to_open(view: View, *, place: Place, open: tuple[float, ...], hold: tup
     Args:
         open, hold: targets of the gripper's drives (the last ones) for wide open, and where the reward begins [rad or m].
     """
-    levels = _levels(view, place)
-    return _sum(level.stands * _let_go(view, level, place, view.ctrl, open, hold) for level in levels)
+    return total(level.stands * _let_go(view, level, place, view.ctrl, open, hold) for level in levels(view, place))
 
 
 def left(view: View, *, place: Place) -> Scalar:
@@ -222,7 +226,7 @@ def left(view: View, *, place: Place) -> Scalar:
 
     On another object, only distance above or beside counts.
     """
-    return _sum(level.stands * _away(view, level, place) for level in _levels(view, place))
+    return total(level.stands * _away(view, level, place) for level in levels(view, place))
 
 
 def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
@@ -234,10 +238,10 @@ def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...],
         open, hold: positions of the gripper's joints (the last ones) for wide open, and where the reward begins [rad or m].
     """
 
-    def gone(level: _Level) -> Scalar:
+    def gone(level: Level) -> Scalar:
         return _let_go(view, level, place, view.joint_pos, open, hold) * _away(view, level, place)
 
-    return _sum(level.stands * gone(level) for level in _levels(view, place))
+    return total(level.stands * gone(level) for level in levels(view, place))
 
 
 def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:

@@ -1,4 +1,4 @@
-"""Fixtures: articulated things that stand in a scene, such as cabinets. Their models come from files, and their joints move.
+"""Fixtures: things that stand in a scene, such as cabinets. Their models come from files, and their joints, if any, move.
 
 A fixture's joints are part of ``qpos``. Where it stands differs from episode to episode, so it is a model field of each world.
 """
@@ -29,7 +29,7 @@ _HOLDER = "fixtures"  # the body that carries all of them
 
 @dataclasses.dataclass(frozen=True)
 class FixtureCfg:
-    """A thing with joints of its own that stands in the scene.
+    """A thing that stands in the scene, with joints of its own or at least a site.
 
     Attributes:
         file: one of ours by name (``assets/fixtures``), or a folder that holds ``model.xml``, MJCF as in a robot's folder.
@@ -60,8 +60,10 @@ def read(file: str) -> mujoco.MjSpec:
             f"no fixture {short(file)}{hint(file, names)}: choose one of {', '.join(names)}, or give a folder with {MODEL}"
         )
     spec, where = model_file.read(folder / MODEL), folder / MODEL
-    if not spec.joints:
-        raise UserError(f"{where} has no joint that moves: a thing that stands still is an obstacle (scene.obstacles)")
+    if not spec.joints and not spec.sites:
+        raise UserError(
+            f"{where} has no joint that moves, and no site: a thing that stands still is an obstacle (scene.obstacles)"
+        )
     if unnamed := [joint for joint in spec.joints if not joint.name]:
         raise UserError(f"{where}: a joint of body {unnamed[0].parent.name!r} has no name: give it one")
     return spec
@@ -194,8 +196,8 @@ class Fixtures(Part):
     def _view(self, name: str, qpos: Array, qvel: Array, fields: Mapping[str, Array]) -> FixtureView:
         found, joints, row = self._chains[name], self._joints[name], self._rows[name]
         base, turn = (jnp.asarray(fields.get(field, self._nominal[field]))[row] for field in FIELDS)
-        q = qpos[np.array([int(at.qposadr[0]) for at in joints])]
-        speed = qvel[np.array([int(at.dofadr[0]) for at in joints])]
+        q = qpos[np.array([int(at.qposadr[0]) for at in joints], int)]
+        speed = qvel[np.array([int(at.dofadr[0]) for at in joints], int)]
         pos, quat = found.poses(q) if found.frames else (jnp.zeros((0, 3)), jnp.zeros((0, 4)))
         sites = range(len(found.frames))
         return FixtureView(

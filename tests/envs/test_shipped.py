@@ -13,7 +13,7 @@ NAMES = [name for name in list_envs() if policy.shipped(name).exists()]
 # Nobody has trained these by the default command.
 TASKS = ("clutter", "push", "place", "stack", "reach_obstacles", "lift_obstacles")
 MISSING = {f"{arm}_{task}" for arm in ("piper", "so100", "so101") for task in TASKS}
-NEW = ("open_drawer", "open_door", "turn_knob", "lift_any")
+NEW = ("open_drawer", "open_door", "turn_knob", "lift_any", "insert_peg", "hang_ring")
 MISSING |= {f"{arm}_{task}" for arm in ("nero", "cobotta", "piper", "so100", "so101") for task in NEW}
 
 

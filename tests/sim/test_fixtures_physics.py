@@ -155,7 +155,7 @@ def test_a_fixture_moves_alike_on_warp(model, where, solver):
 
 
 def test_our_own_have_what_their_comments_say():
-    assert fixtures.own() == ("cabinet", "knob")
+    assert fixtures.own() == ("cabinet", "knob", "socket_round", "socket_square", "stand")
     cabinet, knob = fixtures.chain("cabinet"), fixtures.chain("knob")
     assert cabinet.joints == ("drawer", "door") and knob.joints == ("knob",)
     pos, quat = cabinet.poses(jnp.array([0.1, math.pi / 2]))
@@ -172,8 +172,8 @@ def test_our_own_have_what_their_comments_say():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "no fixture .*: choose one of cabinet, knob, or give a folder with model.xml"),
-        ("<mujoco><worldbody><body/></worldbody></mujoco>", "has no joint that moves"),
+        (None, "no fixture .*: choose one of cabinet, knob, .*, or give a folder with model.xml"),
+        ("<mujoco><worldbody><body/></worldbody></mujoco>", "has no joint that moves, and no site"),
         (
             "<mujoco><worldbody><body name='a'><joint/><geom size='1'/></body></worldbody></mujoco>",
             "a joint of body 'a' has no name: give it one",
