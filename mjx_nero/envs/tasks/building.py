@@ -103,7 +103,8 @@ class Tower:
         shared = {
             "robot": self.builder,
             "scene": self.scene,
-            "sim": contacts.sized(self.robot, self.scene, SimCfg(ramp=self.robot.max_step > 0)),  # contact buffers sized by a count
+            # Contact buffers are sized by a count. Stiff drives would jerk at new targets, and cubes slide in the jaw.
+            "sim": contacts.sized(self.robot, self.scene, SimCfg(ramp=self.robot.max_step > 0)),
             "episode_length_s": length_s + self.extra,
             "rewards": self.rewards(),
             "success": self.success(),
