@@ -103,7 +103,7 @@ class Tower:
         shared = {
             "robot": self.builder,
             "scene": self.scene,
-            "sim": contacts.sized(self.robot, self.scene, SimCfg(ramp=self.robot.max_step > 0)),  # contact buffers sized by a count
+            "sim": contacts.sized(self.robot, self.scene, SimCfg(ramp=self.robot.max_step > 0)),  # buffers by a count
             "episode_length_s": length_s + self.extra,
             "rewards": self.rewards(),
             "success": self.success(),
