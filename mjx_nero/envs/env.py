@@ -263,6 +263,17 @@ class ManipulationEnv(Env):
         home = jnp.asarray(self.cfg.robot.home)
         return Bank(Start(joint_pos=home, pull=jnp.zeros(len(home)), **self._parts.blank()), jnp.zeros((), bool))
 
+    def start(self, state: State) -> Start:
+        """Returns the start of an episode that begins where a state is, at rest: the fingers press as they do there."""
+        view, arm = self.view(state), len(self.cfg.robot.arm.joints)
+        return Start(
+            joint_pos=view.joint_pos,
+            goal_pos_w=view.root_pos_w + view.command,
+            goal_quat_w=view.goal_quat_w,
+            pull=(view.ctrl - view.joint_pos).at[:arm].set(0.0),
+            **self._parts.start(view, state.info["carry"]),
+        )
+
     def _qpos(self, start: Start, fields: Fields) -> Float[Array, " nq"]:
         """Builds qpos: joints within their ranges, everything else in its place, linkages closed."""
         joints = jnp.clip(start.joint_pos, *self._range)

@@ -19,7 +19,7 @@ from mjx_nero.sim import linkage, model_file
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.sim.robot import ASSETS
-from mjx_nero.types import Carry, FixtureStart, FixtureView, Sim, Start, UserError
+from mjx_nero.types import Carry, FixtureStart, FixtureView, Sim, Start, UserError, View
 
 FOLDER, MODEL = ASSETS / "fixtures", "model.xml"
 FIELDS = ("body_pos", "body_quat")
@@ -161,6 +161,10 @@ class Fixtures(Part):
                 for joint, at in zip(self._chains[name].joints, self._joints[name], strict=True)
             },
         )
+
+    def start(self, view: View, carry: Carry) -> dict[str, dict[str, FixtureStart]]:
+        """Returns where the fixtures and their joints are."""
+        return {"fixtures": {name: FixtureStart(at.pos_w, at.quat_w, at.joint_pos) for name, at in view.fixtures.items()}}
 
     def given(self, start: Start) -> Fields:
         """Returns the fields that say where the fixtures stand."""

@@ -28,6 +28,10 @@ class Part:
         """Returns its fields of ``Start``, before any reset event."""
         return {}
 
+    def start(self, view: View, carry: Carry) -> dict[str, Any]:
+        """Returns its fields of the ``Start`` that begins where a state is, at rest."""
+        return {}
+
     def given(self, start: Start) -> Fields:
         """Returns the model's fields that follow from a start. Randomization changes what these say."""
         return {}
@@ -76,6 +80,9 @@ class Parts(Part):
 
     def blank(self) -> dict[str, Any]:
         return {name: value for part in self._parts for name, value in part.blank().items()}
+
+    def start(self, view: View, carry: Carry) -> dict[str, Any]:
+        return {name: value for part in self._parts for name, value in part.start(view, carry).items()}
 
     def given(self, start: Start) -> Fields:
         return {name: value for part in self._parts for name, value in part.given(start).items()}

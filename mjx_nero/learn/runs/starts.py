@@ -17,7 +17,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from jaxtyping import Array
 
 from mjx_nero import config, control
@@ -28,7 +27,7 @@ from mjx_nero.envs.task import CurriculumCfg, EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import ROWS, Learner
 from mjx_nero.mdp import fixtures
-from mjx_nero.types import SHAPE, Bank, FixtureStart, Shown, Start
+from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
@@ -175,7 +174,7 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
         memory, targets = jax.vmap(expert.step)(memory, view)
         wanted = jax.vmap(env.actions.invert)(targets, view.joint_pos, view.ctrl)
         after = jax.vmap(env.step)(state, wanted + noise * jax.random.normal(key, wanted.shape))
-        seen = jax.vmap(lambda s: _at_rest(env, s))(after), after.metrics["distance"]
+        seen = jax.vmap(env.start)(after), after.metrics["distance"]
         grasped = after.info["carry"].memory[grasp] & (alive > 0)
         return (after, memory, alive * (1 - after.done)), (*seen, grasped, alive, Shown(state.obs, wanted))
 
@@ -187,23 +186,6 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
     # Where a fixture stands at the goal, both stay.
     tied = any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in env.cfg.events.values())
     return Bank(starts, (distance < distance[0] / 2) | tied), shown, grasped, won, state.info["carry"].memory[_HOLD]
-
-
-def _at_rest(env: ManipulationEnv, state: State) -> Start:
-    """Takes joints, objects, goal and finger pressure from a state."""
-    view = env.view(state)
-    objects = {name: view.objects[name] for name in env.cfg.scene.objects}
-    return Start(
-        joint_pos=view.joint_pos,
-        object_pos_w={name: seen.pos_w for name, seen in objects.items()},
-        object_quat_w={name: seen.quat_w for name, seen in objects.items()},
-        goal_pos_w=view.root_pos_w + view.command,
-        goal_quat_w=view.goal_quat_w,
-        target=jnp.zeros((), jnp.int32) if view.target is None else view.target,
-        shape=state.info["carry"].memory.get(SHAPE, {}),
-        pull=(view.ctrl - view.joint_pos).at[: len(env.cfg.robot.arm.joints)].set(0.0),
-        fixtures={name: FixtureStart(seen.pos_w, seen.quat_w, seen.joint_pos) for name, seen in view.fixtures.items()},
-    )
 
 
 def way(states: Bank, grasped: np.ndarray, won: np.ndarray, hold: np.ndarray, coming: int, past: int, whole: bool = True) -> Way:

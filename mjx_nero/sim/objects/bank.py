@@ -15,7 +15,7 @@ import numpy as np
 from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.parts import Fields, Part
-from mjx_nero.types import SHAPE, Carry, Sim, Start
+from mjx_nero.types import SHAPE, Carry, Sim, Start, View
 
 _GEOMS = ("geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
 _OF_C = ("geom_contype", "geom_conaffinity")  # which MuJoCo Warp keeps once for all worlds
@@ -49,6 +49,10 @@ class Banks(Part):
     def blank(self) -> dict[str, Any]:
         """Returns the first shape of each."""
         return {"shape": dict.fromkeys(self.counts, jnp.zeros((), jnp.int32))}
+
+    def start(self, view: View, carry: Carry) -> dict[str, Any]:
+        """Returns the shape of each."""
+        return {"shape": carry.memory.get(SHAPE, {})}
 
     def given(self, start: Start) -> Fields:
         """Returns the fields of a world whose objects have the start's shapes."""

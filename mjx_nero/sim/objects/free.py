@@ -14,7 +14,7 @@ from mjx_nero.sim.objects import body as mesh_body
 from mjx_nero.sim.objects import shapes
 from mjx_nero.sim.objects.cfg import SHAPES, ObjectCfg, as_geom, side
 from mjx_nero.sim.parts import Fields, Part
-from mjx_nero.types import LOOK, SHAPE, TARGET, Appearance, Carry, ObjectView, ShapeView, Sim, Start, UserError
+from mjx_nero.types import LOOK, SHAPE, TARGET, Appearance, Carry, ObjectView, ShapeView, Sim, Start, UserError, View
 
 # Contact bits: the table meets bit 1, objects bit 2; robot geoms have no type, so never meet one another. Objects meet by bit 4.
 TABLE, _OBJECT, _OBJECTS = 1, 2, 4
@@ -130,6 +130,15 @@ class Objects(Part):
         return {
             "object_pos_w": {name: jnp.asarray(pose[:3]) for name, pose in poses.items()},
             "object_quat_w": {name: jnp.asarray(pose[3:]) for name, pose in poses.items()},
+        }
+
+    def start(self, view: View, carry: Carry) -> dict[str, Any]:
+        """Returns their places, and which is commanded."""
+        seen = {name: view.objects[name] for name in self._at}
+        return {
+            "object_pos_w": {name: each.pos_w for name, each in seen.items()},
+            "object_quat_w": {name: each.quat_w for name, each in seen.items()},
+            "target": jnp.zeros((), jnp.int32) if view.target is None else view.target,
         }
 
     def qpos(self, qpos: Float[Array, " nq"], start: Start, fields: Fields) -> Float[Array, " nq"]:

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import trimesh
 
-from mjx_nero.sim import fixtures
 from mjx_nero.sim.touch import OBSTACLE
 from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.orders import Orders
@@ -98,10 +97,11 @@ class Scene:
         """Positions [bodies, n, 3] and orientations [bodies, n, 4] of all bodies."""
         model, data, n = self._model, self._data, len(frame.qpos)
         positions, quats = np.empty((model.nbody, n, 3), np.float32), np.empty((model.nbody, n, 4), np.float32)
+        moved = {field: values for field, values in frame.scenery.look.items() if field.startswith("body_")}
         for i in range(n):
             data.qpos[:] = frame.qpos[i]
-            for field in set(fixtures.FIELDS) & set(frame.scenery.look):
-                getattr(model, field)[:] = frame.scenery.look[field][i]
+            for field, values in moved.items():
+                getattr(model, field)[:] = values[i]
             data.mocap_pos[0], data.mocap_quat[0] = frame.scenery.goal_pos_w[i], frame.scenery.goal_quat_w[i]
             mujoco.mj_kinematics(model, data)
             positions[:, i], quats[:, i] = data.xpos + self._corners[i], data.xquat
