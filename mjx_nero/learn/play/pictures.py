@@ -7,7 +7,7 @@ import concurrent.futures
 import copy
 import dataclasses
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol
 
 import jax
@@ -50,10 +50,10 @@ class Cameras:
         self.names = tuple(names)
         self.sizes = {name: size or (own[name].size if name in own else SIZE) for name in names}
         self.renderer = renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
-        make = {"warp": _Traced, "mujoco": _Drawn}
         self._drawers: dict[str, _Drawer] = {}
         for name in names:
-            self._drawers[name] = make[self.renderer if name in own else "mujoco"](env, name, self.sizes[name])
+            kind: type[_Drawn] | type[_Traced] = _Traced if self.renderer == "warp" and name in own else _Drawn
+            self._drawers[name] = kind(env, name, self.sizes[name])
 
     def close(self) -> None:
         """Frees the renderers."""
@@ -75,7 +75,7 @@ class Cameras:
 class _Drawer(Protocol):
     """Draws a camera's frames of several steps, uint8 [height, width, 3] each."""
 
-    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]: ...
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]: ...
     def close(self) -> None: ...
 
 
@@ -90,7 +90,7 @@ class _Drawn:
         self._thread = concurrent.futures.ThreadPoolExecutor(1, "pictures")
         self._renderer = self._thread.submit(Renderer, model, *size, camera=camera, samples=0, shadows=SHADOWS).result()
 
-    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]:
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
         def draw() -> list[np.ndarray]:
             return [self._renderer.render(at.astype(np.float64), scenery[i]) for i, at in enumerate(qpos)]
 
@@ -109,7 +109,7 @@ class _Traced:
         seen, self._lock = env.draw_by({name: camera}, "warp"), threading.Lock()
         self._draw = jax.jit(jax.vmap(lambda qpos, scenery: seen(qpos, scenery)[name].rgb))
 
-    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Sequence[np.ndarray]:
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
         n = len(qpos)
         filled = np.minimum(np.arange(TOGETHER if n > 1 else 1), n - 1)  # two sizes, two programs
         with self._lock:  # the ray tracer's buffers are for one batch
