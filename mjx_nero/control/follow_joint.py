@@ -22,6 +22,8 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
 BEFORE, IN, CLOSE, MOVE = range(4)
+_SETTLING = 0.25  # [s] in about this time a handle that has slipped in the hand is brought the rest of its way
+_STILL = 0.05  # [rad/s]
 _LOST = 0.04  # [m] further than this from the grasp point, the handle has been lost
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
@@ -67,6 +69,7 @@ class FollowJointMemory:
     flip: Float[Array, ""]  # turn of the hand about the way in: 0 or half a turn [rad]
     out: Float[Array, ""]  # how far in front of the handle the set-point is [m]
     joint: Float[Array, ""]  # where the set-point is on the joint's path [rad or m]
+    slip: Float[Array, ""]  # how far it has to go beyond the target, so that the joint gets there [rad or m]
     tries: Int[Array, ""]
 
 
@@ -121,7 +124,8 @@ class FollowJoint:
         way = jnp.linalg.norm(found[0].q - q, axis=1) + UNREACHABLE * sum(~one.success for one in found)
         best = jnp.argmin(way)
         out = jnp.asarray(self.cfg.before)
-        return FollowJointMemory(zero, zero, q, jnp.zeros_like(q), found[0].q[best], flips[best], out, now, zero)
+        slip = jnp.zeros(())
+        return FollowJointMemory(zero, zero, q, jnp.zeros_like(q), found[0].q[best], flips[best], out, now, slip, zero)
 
     def step(self, memory: FollowJointMemory, view: View) -> tuple[FollowJointMemory, Float[Array, " nu"]]:
         """Targets of all drives."""
@@ -130,7 +134,11 @@ class FollowJoint:
         step = self.cfg.speed * self.dt
         out = jnp.where(phase == BEFORE, self.cfg.before, jnp.maximum(memory.out - step, 0.0))
         ahead = self.cfg.ahead / self.cfg.handle.lever
-        moved = memory.joint + jnp.clip(self._target(view) - memory.joint, -self._step, self._step)
+        target = self._target(view)
+        left = target + memory.slip - memory.joint
+        moved = memory.joint + jnp.clip(left, -self._step, self._step)
+        there = holds & (jnp.abs(left) < self._step) & (jnp.max(jnp.abs(memory.qd)) < _STILL)
+        slip = memory.slip + jnp.where(there, self.dt / _SETTLING, 0.0) * (target - now)
         joint = jnp.where(holds, jnp.clip(moved, now - ahead, now + ahead), now)
         pos, quat = self._pose(view, memory.flip, joint, out)
         found = self._ik.local(pos, quat, memory.q).q
@@ -151,6 +159,7 @@ class FollowJoint:
             before=jnp.where(lost, start, memory.before),
             out=out,
             joint=joint,
+            slip=jnp.where(holds, jnp.clip(slip, -ahead, ahead), 0.0),
             tries=memory.tries + lost,
         )
         return memory, jnp.concatenate([q + self._lead * qd, fingers])

@@ -143,9 +143,10 @@ class PickPlace:
         seen = jnp.stack([self._pose(view, name) for name in self.cfg.tower[1:]])[memory.move]
         place = jnp.stack([self._place(view, below) for below in self.cfg.tower[:-1]])[memory.move]
         memory = dataclasses.replace(memory, pick=jnp.where(phase <= 1, seen, memory.pick))
-        # Only while it is carried, and only what can still be a grip.
+        # Only while it is carried, and only what can still be a grip. Across, from the target: an arm that yields to its load
+        # takes the object aside by more than the hand's own error.
         carried = (phase >= 4) & (phase <= 6)
-        slip = _turned(view.ee_pos_w - seen[:3], -memory.target[3])
+        slip = _turned(memory.target[:3].at[2].set(view.ee_pos_w[2]) - seen[:3], -memory.target[3])
         slip = jnp.clip(slip, self._offset - 0.03, self._offset + 0.03)
         grip = memory.grip + jnp.where(carried, GRIP_FILTER, 0.0) * (slip - memory.grip)
         s = (1 - jnp.cos(jnp.pi * memory.count / steps)) / 2

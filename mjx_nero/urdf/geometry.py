@@ -13,10 +13,12 @@ from mjx_nero.urdf import drawing, files, meshes, primitives
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Shape, Tree, Vec
 
+APART = 2e-3  # [m, and of the axes] a collision is not where the visual of the same mesh is
 MAX_SHAPES = 4_000  # visuals and collisions of a robot
 MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once per scale
 MAX_SECONDS = 60.0  # [s] of processor time
 MAX_POINTS = 60_000  # on the surface of a link, all its shapes together
+_Loaded = tuple[Shape, str, list[meshes.Part]]  # a shape, the stem of its mesh file, and its pieces
 STAND_IN = (0.9, 0.6, 0.2, 1.0)
 
 
@@ -106,7 +108,7 @@ class Looks:
         Without a visual, the collision mesh is drawn, unless the link is fixed to one with a visual. Without a collision, the
         visual is fitted.
         """
-        loaded: dict[str, list[tuple[Shape, str, list[meshes.Part]]]] = {"visual": [], "collision": []}
+        loaded: dict[str, list[_Loaded]] = {"visual": [], "collision": []}
         failed: dict[str, list[str]] = {"visual": [], "collision": []}
         kind = "note"  # absent files share one warning
         for tag, shapes in (("visual", link.visuals), ("collision", link.collisions)):
@@ -136,10 +138,21 @@ class Looks:
                 self._notes.add("guessed", "link", link.name, f"no {tag} in the URDF: the {other}'s is {use}")
         shown = loaded["visual"] or (loaded["collision"] if link.visuals or link.name not in self._beside else [])
         drawn = [visual for item in shown for visual in self._files.visuals(*item, link.name)]
-        fitted = loaded["collision"] or loaded["visual"]
+        fitted = self._placed(link.name, loaded["visual"], loaded["collision"]) or loaded["visual"]
         count = min(primitives.SAMPLES, max(MAX_POINTS // max(len(fitted), 1), 20))
         surfaces = [self._surface(shape, parts, count) for shape, _, parts in fitted]
         return Look(drawn, surfaces, [primitives.exact(shape) for shape, _, _ in fitted])
+
+    def _placed(self, name: str, shown: list[_Loaded], fitted: list[_Loaded]) -> list[_Loaded]:
+        """Puts a link's only collision where its only visual is, if both are one mesh: a wrong visual would have been seen."""
+        if len(shown) != 1 or len(fitted) != 1:
+            return fitted
+        seen, felt = shown[0][0], fitted[0][0]
+        same = seen.kind == "mesh" and (seen.file, seen.size) == (felt.file, felt.size)
+        if not same or np.allclose(seen.origin, felt.origin, rtol=0, atol=APART):
+            return fitted
+        self._notes.add("repaired", "link", name, "its collision is its visual's mesh, but elsewhere: moved to the visual")
+        return shown
 
     def _surface(self, shape: Shape, parts: list[meshes.Part], count: int) -> tuple[Points, float]:
         """Samples points on the shape in the link's frame [count, 3], and computes the volume of its convex hull [m3]."""

@@ -16,7 +16,7 @@ from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PHASES, PickPlace, PickPlaceCfg, PickPlaceMemory
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.math import axis_angle
+from mjx_nero.math import axis_angle, rotate
 from mjx_nero.sim import scene
 from mjx_nero.types import View
 
@@ -133,6 +133,15 @@ def placer(**changes) -> PickPlace:
     return PickPlace(COBOTTA_PRO_900, DT, dataclasses.replace(PickPlaceCfg(), **changes))
 
 
+def hung(view: View, memory, name: str, grip=(0.0, 0.0, 0.0)) -> View:
+    """The object hangs ``grip`` off the hand, which is where it has to be, from when it is lifted until it is put down."""
+    if not 4 <= memory.phase <= 6:
+        return view
+    off = rotate(axis_angle(jnp.array([0.0, 0.0, 1.0]), memory.target[3]), jnp.array(grip))
+    object = view.objects[name].replace(pos_w=memory.target[:3] - off)
+    return view.replace(objects={**view.objects, name: object}, ee_pos_w=memory.target[:3])
+
+
 def with_cube(view: View, pos) -> View:
     return view.replace(objects={"cube": view.objects["cube"].replace(pos_w=pos)})
 
@@ -183,7 +192,7 @@ class Walk:
         step, memory = jax.jit(self.controller.step), self.controller.init(self.view)
         self.first, self.memories, self.targets = memory, [], []
         for _ in range(sum(self.steps) + 3):
-            memory, targets = step(memory, self.view)
+            memory, targets = step(memory, hung(self.view, memory, "cube", grip))
             self.memories.append(memory)
             self.targets.append(np.asarray(targets))
 
@@ -291,6 +300,17 @@ def test_a_cube_that_slid_in_the_grip_is_made_up_for(cobotta_view):
     np.testing.assert_allclose(lost.target(6, 2)[:2], PLACE[:2] + [0.03, 0.0], atol=1e-5)
 
 
+def test_an_arm_that_yields_to_its_load_puts_it_where_it_belongs(cobotta_view):
+    """The hand, and the cube in the middle of it, stay 1 cm behind: the target goes as far beyond."""
+    controller = placer(events_dt=(*SHORT[:6], 0.005, *SHORT[7:]))
+    step, memory = jax.jit(controller.step), controller.init(cobotta_view)
+    memory = memory.replace(phase=memory.phase + 6, target=jnp.append(cobotta_view.goal_pos_w, 0.0))
+    for _ in range(150):
+        at = memory.target[:3] - jnp.array([0.01, 0.0, 0.0])
+        memory, _ = step(memory, with_cube(cobotta_view, at).replace(ee_pos_w=at))
+    np.testing.assert_allclose(memory.target[:2] - cobotta_view.goal_pos_w[:2], [0.01, 0.0], atol=1e-4)
+
+
 def test_the_pick_is_where_the_cube_was_when_the_fingers_went_for_it(cobotta_view):
     controller = placer(events_dt=SHORT)
     step, cube = jax.jit(controller.step), cobotta_view.objects["cube"].pos_w
@@ -356,7 +376,7 @@ def test_a_tower_is_built_object_by_object(cobotta_view):
     step, view = jax.jit(controller.step), several(cobotta_view, **at)
     memory, seen = controller.init(view), []
     for _ in range(2 * sum(STEPS) + 2):
-        memory, _ = step(memory, view.replace(ee_pos_w=view.objects["bc"[int(memory.move)]].pos_w))
+        memory, _ = step(memory, hung(view, memory, "bc"[int(memory.move)]))
         seen.append((int(memory.move), int(memory.phase), np.asarray(memory.target)))
     first, second = seen[: sum(STEPS)], seen[sum(STEPS) :]
     assert [m for m, _, _ in first] == [0] * (sum(STEPS) - 1) + [1] and {m for m, _, _ in second} == {1}
@@ -380,15 +400,15 @@ def test_the_hand_turns_as_the_object_and_then_as_the_goal(cobotta_view):
     step, view = jax.jit(controller.step), view.replace(ee_pos_w=view.objects["box"].pos_w + jnp.array([*off, 0.0]))
     memory, targets = controller.init(view), []
     for _ in range(sum(STEPS)):
-        memory, _ = step(memory, view)
+        memory, _ = step(memory, hung(view, memory, "box", (0.01, 0.0, 0.0)))
         targets.append(np.asarray(memory.target))
     starts = np.cumsum([0, *STEPS])
     assert targets[2][3] == pytest.approx(0.2, abs=1e-6)  # half-way in phase 0
     np.testing.assert_allclose(targets[starts[1]][[0, 1, 3]], [*(PICK[:2] + off), 0.4], atol=1e-6)
     assert targets[starts[5] + 2][3] == pytest.approx(-0.1, abs=1e-6)  # half-way across
-    # A hand that is turned across while the box stays is off by a little: the place in the grip counts by a twentieth a step.
+    # The box may lag by a step of the turn: its place in the grip counts by a twentieth a step.
     end = 0.01 * np.array([np.cos(-0.6), np.sin(-0.6)])
-    np.testing.assert_allclose(targets[starts[9]][[0, 1, 3]], [*(PLACE[:2] + end), -0.6], atol=3e-3)
+    np.testing.assert_allclose(targets[starts[9]][[0, 1, 3]], [*(PLACE[:2] + end), -0.6], atol=1e-3)
 
 
 def test_a_tower_of_nothing_is_refused():

@@ -259,3 +259,19 @@ def test_two_slides_of_different_signs_each_find_their_ends(tmp_path):
     gripper = report.robot.gripper
     assert gripper.open == (0.05, -0.05) and gripper.close == (0.01, -0.01)
     assert report.robot.opening == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_collision_that_lies_elsewhere_than_the_visual_of_the_same_mesh_is_moved_there(tmp_path):
+    """The left finger's collision is turned by half a turn about the finger, so that its back would be its inner face."""
+
+    models, said = {}, {}
+    for turn in ("0 0 0", "0 0 3.1416"):
+        folder, felt = tmp_path / str(len(models)), make.mesh("left.stl")
+        parts = [*six(), *fingers(folder, "link6")]
+        both = make.mesh("left.stl", "visual") + felt.replace('rpy="0 0 0"', f'rpy="{turn}"')
+        imported(folder, base(), *(part.replace(felt, both) for part in parts))
+        models[turn], said[turn] = (folder / "out" / "model.xml").read_text(), (folder / "out" / "report.json").read_text()
+    one, other = said.values()
+    text = "its collision is its visual's mesh, but elsewhere: moved to the visual"
+    assert text not in one and other.count(text) == 1
+    assert len(set(models.values())) == 1
