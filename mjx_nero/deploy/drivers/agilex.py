@@ -2,8 +2,9 @@
 
 Those of the Piper stand in agilexrobotics/piper_sdk (``piper_msgs/msg_v2``), those of the Nero in agilexrobotics/pyAgxArm
 (``protocols/can_protocol``): they are the Piper's and a seventh joint's. All numbers are big-endian. Targets go out in joint
-mode, whose frames are the same in all firmware of the Nero; its versions differ in torque mode, which nothing here uses. Nothing
-here sends 0x150, whose resume drops the arm, and nothing disables a motor.
+mode, whose frames are the same in all firmware of the Nero up to 1.20; its versions differ in torque mode, which nothing here
+uses. Byte 6 of the mode, which switches the Nero's own messages on and off, is 0: they stay as they are. Nothing here sends
+0x150, whose resume drops the arm, and nothing disables a motor.
 """
 
 import dataclasses
