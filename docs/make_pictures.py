@@ -2,8 +2,7 @@
 
 docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
 docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the package's
-objects, docs/failures/, three failures of tasks that fall short, and docs/fixtures/, what scripts do with drawers, doors and
-knobs. A name makes one.
+objects, and docs/failures/, three failures of tasks that fall short. A name makes one; gallery/nero_push is one film.
 """
 
 import dataclasses
@@ -21,7 +20,7 @@ from mjx_nero.envs import registry
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import evaluation, rollout
 from mjx_nero.sim import objects, render
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, results
 from mjx_nero.tools.inspection import things
 
 HERE = pathlib.Path(__file__).parent
@@ -32,7 +31,6 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
 }
 
 SEEING = ("nero_lift", "piper_lift")  # have bundled policies of the preset rgb
-SCRIPTED = ("nero_open_drawer", "nero_open_door", "cobotta_turn_knob")  # nobody has trained these
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
@@ -64,11 +62,17 @@ def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 
 def gallery(folder: pathlib.Path) -> None:
-    """A small moving picture of every environment that has a robot of its own: the first episode that succeeds, by who plays it
-    by default."""
+    """A small moving picture of every environment that somebody is good at: its bundled policy, or a controller."""
+    learnt = set(results.learnable())
     for name in filter(registry.robot_of, mjx_nero.list_envs()):
-        played = evaluation.play(evaluation.EvalCfg(name, episodes=8, record=8, backend="mujoco"))
-        film(folder / f"{name}.webp", played, np.argmax(played.episodes.success, keepdims=True))
+        if name not in learnt or policy.shipped(name).exists():
+            episode(folder / name)
+
+
+def episode(path: pathlib.Path) -> None:
+    """The first episode of an environment that succeeds, by who plays it by default."""
+    played = evaluation.play(evaluation.EvalCfg(path.stem, episodes=8, record=8, backend="mujoco"))
+    film(path.with_suffix(".webp"), played, np.argmax(played.episodes.success, keepdims=True))
 
 
 def seeing(folder: pathlib.Path) -> None:
@@ -92,13 +96,6 @@ def failures(folder: pathlib.Path) -> None:
         film(folder / f"{name}.webp", played, np.flatnonzero(~played.episodes.success)[:3])
 
 
-def scripted(folder: pathlib.Path) -> None:
-    """The first episode that succeeds, by the task's expert."""
-    for name in SCRIPTED:
-        played = evaluation.play(evaluation.EvalCfg(name, controller="expert", episodes=8, record=8, backend="mujoco"))
-        film(folder / f"{name}.webp", played, np.argmax(played.episodes.success, keepdims=True))
-
-
 def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> None:
     """A small moving picture of the recorded episodes named, 40 frames each."""
     path.parent.mkdir(exist_ok=True)
@@ -117,10 +114,10 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
 def main() -> None:
     """All pictures, or those named."""
     cli.setup_jax()
-    folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "fixtures": scripted, "objects.png": objects_sheet}
+    folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "objects.png": objects_sheet}
     for name in sys.argv[1:] or (*folders, *PICTURES):
-        if name in folders:
-            folders[name](HERE / name)
+        if name in folders or name.startswith("gallery/"):
+            folders.get(name, episode)(HERE / name)
             continue
         robots, (width, height), every, quality = PICTURES[name]
         cfg = dataclasses.replace(mjx_nero.env_cfg("nero_lift"), corruption=False)

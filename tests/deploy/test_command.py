@@ -64,6 +64,7 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
         (("--arm", "sim", "--goal", "1,2,nan"), "--goal takes 3 or 7 numbers"),
         (("--arm", "sim", "--workspace", "0,1,0,1,1,0"), "--workspace takes ranges from low to high"),
         (("--arm", "sim", "--speed", "2"), "--speed"),
+        (("--arm", "sim", "--hottest", "1000"), "--hottest"),
         (("--arm", "sim", "--log", "nowhere/log.csv"), "the folder nowhere does not exist"),
         (("--arm", "piper", "--emulate"), "the policy is for so_arm101, and --arm piper is a piper"),
         (("--arm", "so101", "--port", "/dev/nothing", "--object", "0.2,0,0.015"), "needs --calibration"),
