@@ -24,6 +24,7 @@ from mjx_nero.tools import cli, results
 from mjx_nero.tools.inspection import things
 
 HERE = pathlib.Path(__file__).parent
+LARGEST = 80_000  # bytes of a film of the gallery
 STEPS = 150  # of an episode are shown: the cube is up by then
 PICTURES = {  # name -> robots, width and height, steps between frames, quality of the WebP
     "lift": (1, (640, 400), 4, 60),
@@ -97,7 +98,7 @@ def failures(folder: pathlib.Path) -> None:
 
 
 def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> None:
-    """A small moving picture of the recorded episodes named, 40 frames each."""
+    """A small moving picture of the recorded episodes named, 40 frames each, as good as it may be large."""
     path.parent.mkdir(exist_ok=True)
     shown, frames = played.episodes.recorded(which), []
     every = max(1, len(shown.qpos) // 40)
@@ -108,7 +109,10 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
                     (320, 240), Image.Resampling.BOX
                 )
                 frames.append(Image.fromarray(render.inset(np.array(frame), [each[t, k] for each in shown.pictures])))
-    write(path, frames, every * played.env.dt, 35)
+    for quality in (35, 20, 10):
+        write(path, frames, every * played.env.dt, quality)
+        if path.stat().st_size < LARGEST:
+            break
 
 
 def main() -> None:
