@@ -8,7 +8,7 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, curriculum, observations, success, terminations
+from mjx_nero.mdp import actions, curriculum, fixtures, observations, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -243,6 +243,11 @@ class EnvCfg:
     def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Translates fields of version 0.5.0 to their present names: see ``envs.old_names``."""
         return old_names.current(fields, self.observations, self.curriculum.weights)
+
+    @property
+    def goal_is_tied(self) -> bool:
+        """True if an event places a thing by the goal: a start that keeps the one keeps the other."""
+        return any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in self.events.values())
 
     def uncorrupted(self) -> "EnvCfg":
         """Returns the task without observation noise, for measuring policies."""

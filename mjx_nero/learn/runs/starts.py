@@ -20,13 +20,11 @@ import numpy as np
 from jaxtyping import Array
 
 from mjx_nero import config, control
-from mjx_nero.config import bounds
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg, EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import ROWS, Learner
-from mjx_nero.mdp import fixtures
 from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
@@ -183,9 +181,13 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
     played: Any = jax.lax.scan(step, begin, jax.random.split(keys[0], env.episode_length))
     (state, *_), (starts, distance, grasped, alive, shown) = played
     won = (state.metrics["success"] > 0) & (alive[-1] > 0)
-    # Where a fixture stands at the goal, both stay.
-    tied = any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in env.cfg.events.values())
-    return Bank(starts, (distance < distance[0] / 2) | tied), shown, grasped, won, state.info["carry"].memory[_HOLD]
+    return (
+        Bank(starts, (distance < distance[0] / 2) | env.cfg.goal_is_tied),
+        shown,
+        grasped,
+        won,
+        state.info["carry"].memory[_HOLD],
+    )
 
 
 def way(states: Bank, grasped: np.ndarray, won: np.ndarray, hold: np.ndarray, coming: int, past: int, whole: bool = True) -> Way:
