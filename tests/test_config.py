@@ -237,7 +237,8 @@ def test_registry_lists():
     more += ("open_drawer", "open_door", "turn_knob", "insert_peg", "hang_ring")
     controlled = {f"{robot}_{task}" for robot in ("nero", "cobotta") for task in more[:2]}
     everywhere |= {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in more[2:]}
-    assert set(list_envs()) == everywhere | controlled | {"reach", "lift", *more}
+    everywhere |= {f"{robot}_reorient" for robot in ("nero", "cobotta", "piper")}
+    assert set(list_envs()) == everywhere | controlled | {"reach", "lift", "reorient", *more}
     assert set(list_robots()) == {"nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101"}
     assert list_presets("nero_lift")[0] == "default" and "isaac" in list_presets("nero_lift")
     assert list_presets("cobotta_follow_target") == ("default", "static")
@@ -398,7 +399,8 @@ def test_one_learner_is_for_all_tasks_and_arms():
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
-        taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles", "insert_peg", "hang_ring"))
+        taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles"))
+        taught |= env.endswith(("insert_peg", "hang_ring", "reorient"))
         shown = taught and not env.endswith("pick_place")
         calm = SHOWN if shown else CALM if moves else {}
         assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env

@@ -14,6 +14,7 @@ from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PickPlace, PickPlaceCfg
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.control.put_in import PutIn, PutInCfg, PutThing, PutThingCfg
+from mjx_nero.control.turn_over import TurnOver, TurnOverCfg
 from mjx_nero.sim.robot import RobotCfg
 
 # name -> (class, its config); the class takes (robot, dt, config)
@@ -30,6 +31,7 @@ CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
         "grasp_thing": (GraspThing, GraspThingCfg()),
         "put_in": (PutIn, PutInCfg()),
         "put_thing": (PutThing, PutThingCfg()),
+        "turn_over": (TurnOver, TurnOverCfg()),
     },
 )
 

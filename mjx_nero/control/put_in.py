@@ -148,7 +148,8 @@ class PutIn:
 
         found = self._pick._ik.local(pos, math.quat_mul(upright, self._pick._hand(yaw)), pick.q).q
         wanted = jnp.where(stage == OPEN, pick.q, found)
-        q, qd = setpoint.follow(pick.q, pick.qd, wanted, jnp.asarray(self._speed), self.dt)
+        fastest = jnp.where(stage == AWAY, setpoint.FASTEST, self._pick._gentle)
+        q, qd = setpoint.follow(pick.q, pick.qd, wanted, jnp.asarray(self._speed), self.dt, fastest)
         fingers = self._fingers(pick, view, stage >= OPEN)
 
         lost = ((stage == OVER) | (stage == IN)) & (self._pick._off(pick, view) > self._pick._lost)
@@ -212,7 +213,7 @@ class PutIn:
         there = (jnp.linalg.norm(way[:2]) < _CLOSE) & (jnp.abs(off) < _ALIGNED)
         return jnp.select(
             [memory.stage == OVER, memory.stage == IN, memory.stage == OPEN],
-            [there | (time > 4.0), -way[2] < self.cfg.done, time > self.cfg.pick.closing + 0.1],
+            [there | (time > 4.0), -way[2] < self.cfg.done, time > self._pick._closed],
             False,
         )
 

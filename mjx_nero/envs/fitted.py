@@ -25,6 +25,7 @@ from mjx_nero.envs.tasks import (
     push,
     reach,
     reach_obstacles,
+    reorient,
     stack,
     turn_knob,
 )
@@ -146,6 +147,7 @@ FITTING: dict[str, Presets] = {
     "lift_any": lift_any.presets(),
     "insert_peg": insert_peg.presets(),
     "hang_ring": hang_ring.presets(),
+    "reorient": reorient.presets(),
     "push": push.presets(),
     "place": _presets(_tower, **place.presets()),
     "stack": _presets(_tower, **stack.presets()),

@@ -96,12 +96,13 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
 def so_arm(prefix: str, robot: RobotCfg, *setups: Any) -> Envs:
     """Lists the environments of either SO-ARM. The preset ``isaac`` has the recipe's drives.
 
-    None stacks three cubes: the hand does not point straight down so high.
+    None stacks three cubes: the hand does not point straight down so high. None turns cubes over: it has five joints.
     """
     envs = fitted.envs(prefix, robot, *setups, REACH_OBSTACLES, LIFT_OBSTACLES)
     for task in ("lift", "reach"):
         _, presets = envs[f"{prefix}_{task}"]
         envs[f"{prefix}_{task}"] = robot, {**presets, "isaac": functools.partial(_with_recipe, preset=presets["isaac"])}
+    del envs[f"{prefix}_reorient"]
     envs[f"{prefix}_stack"] = robot, {"default": fitted.FITTING["stack"]["default"]}
     return envs
 

@@ -178,6 +178,7 @@ def picking(robot: RobotCfg, width: float, lowest: float, above: float, **own: A
     fields = {
         "lowest": round(lowest, 4),
         "beyond": grasp.beyond(robot, width),
+        "aside": (grasp.aside(robot, width + 2 * grasp.BESIDE),),
         "closing": round(max(CLOSING, grasp.closing_time(robot, width)), 3),
         "above": round(above, 4),
         **TIGHT,

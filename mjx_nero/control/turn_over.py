@@ -1,0 +1,178 @@
+"""Turns a cube over until a commanded side is up: grasps it with a leaning hand, turns it by a quarter, and sets it down."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from mjx_nero.config.bounds import Positive
+from mjx_nero.control import setpoint
+from mjx_nero.control.gripper import ParallelGripper
+from mjx_nero.control.ik import IkCfg, InverseKinematics
+from mjx_nero.control.pick_up import PRESS
+from mjx_nero.control.turns import TOP, Plan, Table, Turns
+from mjx_nero.mdp import sides
+from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.types import View
+
+ABOVE, DOWN, CLOSE, UP, TURN, SET, OPEN, BACK, REST = range(9)
+_LOST = 0.05  # [m] further than this from the grasp point, the cube has been lost
+_LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] a phase has so much time
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnOverCfg:
+    """Settings of the turns; lengths in m.
+
+    Attributes:
+        object: the cube.
+        rest: height of its centre when it rests.
+        spot: where it is set down, x and y in the world.
+        lean: of the hand from straight down, to one side at first [rad].
+        beyond: the grasp point: from there the pads' middle is so much further along the hand's direction.
+        before: the hand comes from so far in front of the cube, and leaves so far.
+        lift: height to which the cube is lifted to be turned.
+        speed: of the grasp point [m/s].
+        closing: how long the fingers take [s], beside the lag of their drives.
+        ik: of the arm's motion.
+    """
+
+    object: str = "box"
+    rest: Positive = 0.02
+    spot: tuple[float, float] = (0.35, 0.0)
+    lean: Positive = 0.7854
+    beyond: float = 0.0
+    before: Positive = 0.07
+    lift: Positive = 0.06
+    speed: Positive = 0.25
+    closing: Positive = 0.4
+    ik: IkCfg = IkCfg(orientation_weight=0.1, iterations=40, restarts=3)
+
+
+@struct.dataclass
+class TurnOverMemory:
+    """The state of ``TurnOver`` between two steps."""
+
+    phase: Int[Array, ""]
+    count: Int[Array, ""]  # steps made in this phase
+    q: Float[Array, " nj"]  # the arm's set-point [rad]
+    qd: Float[Array, " nj"]
+    pos: Float[Array, "3"]  # where the grasp point is on a straight way
+    plan: Plan
+    table: Table
+    tries: Int[Array, ""]  # turns begun
+
+
+class TurnOver:
+    """Turns the cube by quarters, one after another.
+
+    | phase | above | down | close | up | turn | set | open | back |
+    | --- | --- | --- | --- | --- | --- | --- | --- | --- |
+    | hand | before the cube | at it | stays | up | over the spot, turned | down | stays | away |
+
+    The first turn may only bring the cube to the spot, and turn it about the vertical to suit: see ``Turns``.
+
+    Args:
+        robot: what turns.
+        dt: control step [s].
+        cfg: see ``TurnOverCfg``.
+    """
+
+    def __init__(self, robot: RobotCfg, dt: float, cfg: TurnOverCfg = TurnOverCfg()):
+        self.dt, self.cfg = dt, cfg
+        self.gripper, self._ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
+        self._n = len(robot.arm.joints)
+        self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
+        self._gentle = setpoint.gentle(robot.arm.lead)
+        travel, lag = np.abs(self.gripper.opened - self.gripper.closed), float(np.max(robot.gripper.lead, initial=0.0))
+        self._closed = cfg.closing + 2 * lag + PRESS
+        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
+        self._lost = float(np.linalg.norm(robot.grip)) + abs(cfg.beyond) + _LOST
+        self._turns = Turns(robot, self._ik, (*cfg.spot, cfg.rest), cfg.lean, cfg.beyond, cfg.before, cfg.lift)
+
+    def init(self, view: View) -> TurnOverMemory:
+        """Finds out what the arm can do, and plans the first turn."""
+        q, zero, table = view.joint_pos[: self._n], jnp.zeros((), jnp.int32), self._turns.table()
+        here = self._turns.leaning(view.objects[self.cfg.object].pos_w, self.cfg.lean)
+        plan = self._plan(view, table, q, here)
+        return TurnOverMemory(zero, zero, q, jnp.zeros_like(q), view.ee_pos_w, plan, table, zero)
+
+    def step(self, memory: TurnOverMemory, view: View) -> tuple[TurnOverMemory, Float[Array, " nu"]]:
+        """Targets of all drives."""
+        phase, plan, seen = memory.phase, memory.plan, view.objects[self.cfg.object].pos_w
+        quat = jnp.where(phase <= UP, plan.grasp, plan.end)
+        wanted = self._wanted(memory, seen)
+        way = wanted - memory.pos
+        far, leaps = jnp.linalg.norm(way), (phase == ABOVE) | (phase == TURN)
+        pos = memory.pos + way * jnp.where(leaps, 1.0, jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
+        seed = jnp.select([phase == ABOVE, phase == TURN], [plan.near, plan.over], memory.q)
+        found = self._ik.local(pos, quat, seed).q
+        stays = (phase == CLOSE) | (phase == OPEN)
+        wanted_q = jnp.where(stays, memory.q, found)
+        closed = (phase >= CLOSE) & (phase <= SET)
+        fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
+        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
+        ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
+        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+
+        lost = (phase >= UP) & (phase <= SET) & (jnp.linalg.norm(view.ee_pos_w - seen) > self._lost)
+        near = jnp.linalg.norm(memory.q - wanted_q) < 0.05
+        ended = self._ended(memory, jnp.where(leaps, near, far < 1e-3), jnp.linalg.norm(view.ee_pos_w - wanted))
+        up = sides.normal(view, self.cfg.object)[2] > TOP
+        after = jnp.where(lost | ended & (phase == BACK) & ~up, ABOVE, phase + ended)
+        begins = (after == ABOVE) & (phase != ABOVE)
+        new = self._plan(view, memory.table, q)
+        memory = dataclasses.replace(
+            memory,
+            phase=after,
+            count=jnp.where(after != phase, 0, memory.count + 1),
+            q=q,
+            qd=qd,
+            pos=pos,
+            plan=jax.tree.map(lambda a, b: jnp.where(begins, a, b), new, plan),
+            tries=memory.tries + begins,
+        )
+        return memory, jnp.concatenate([q + self._lead * qd, fingers])
+
+    def _wanted(self, memory: TurnOverMemory, cube: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The place where the grasp point has to be at the end of the phase."""
+        phase, plan, pos = memory.phase, memory.plan, memory.pos
+        hold = self._turns.hold
+        low, put = hold(cube, plan.grasp), hold(jnp.asarray(self._turns.spot), plan.end)
+        up, before = jnp.array([0.0, 0.0, self.cfg.lift]), self.cfg.before
+        into, out = self._turns.into(plan.grasp), self._turns.into(plan.end)
+        raised = pos.at[2].set(jnp.maximum(pos[2], self.cfg.rest + self.cfg.lift))
+        lifted = pos.at[2].set(low[2] - cube[2] + self.cfg.rest + self.cfg.lift)
+        cases = {
+            ABOVE: low - before * into,
+            DOWN: low,
+            UP: lifted,
+            TURN: put + up,
+            SET: put,
+            BACK: put - before * out,
+            REST: raised,
+        }
+        return jnp.select([phase == each for each in cases], list(cases.values()), pos)
+
+    def _ended(self, memory: TurnOverMemory, arrived: Bool[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
+        """True if the phase is done, or has had enough time."""
+        phase, time = memory.phase, (memory.count + 1) * self.dt
+        still = jnp.max(jnp.abs(memory.qd)) < 0.2
+        careful = (phase == ABOVE) | (phase == TURN) | (phase == DOWN) | (phase == SET)
+        done = jnp.where(careful, arrived & still & (error < 0.008), arrived)
+        done = jnp.where((phase == CLOSE) | (phase == OPEN), time > self._closed, done)
+        late = jnp.select([phase == each for each in _LATE], [time > most for most in _LATE.values()], False)
+        return (done | late) & (phase != REST)
+
+    def _plan(self, view: View, table: Table, q: Float[Array, " nj"], here: tuple[Array, Array] | None = None) -> Plan:
+        cube = view.objects[self.cfg.object].quat_w
+        return self._turns.plan(table, cube, sides.normal(view, self.cfg.object), q, here)
+
+    def warning(self, memory: TurnOverMemory) -> str:
+        """Says how many cubes are still to be turned."""
+        busy = np.asarray(memory.phase) != REST
+        return f"{busy.sum()} of {busy.size} episodes ended before the cube was turned" if busy.any() else ""
