@@ -82,7 +82,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         robot=robot,
         scene=scene,
         sim=contacts.sized(robot, scene, SimCfg(ramp=robot.max_step > 0)),
-        episode_length_s=16.0,
+        episode_length_s=20.0,
         actions=lets_go({**velocity_actions(), "gripper": Term(ContinuousGripper)}),
         controllers={"turn_over": script},
         command=CommandTerm(sides.any_side, resample_s=ONCE),
