@@ -29,8 +29,23 @@ def main() -> None:
     features = {name: list(feature.shape) for name, feature in env_to_policy_features(cfg).items()}
     shapes = {name: list(x.shape) for name, x in preprocess_observation(last).items()}
     success = info["final_info"]["is_success"].tolist()
+    seeing = lerobot_env_mjx_nero.MjxNeroEnv(task="nero_lift", preset="rgb", cameras="front,wrist", width=32, height=32)
+    env = make_env(seeing, n_envs=1)["mjx_nero"][0]
+    pictures = {name: list(x.shape) for name, x in preprocess_observation(env.reset(seed=[1])[0]).items()}
+    asked = {name: list(feature.shape) for name, feature in env_to_policy_features(seeing).items()}
     print(
-        json.dumps({"fps": cfg.fps, "steps": steps, "moved": moved, "success": success, "features": features, "shapes": shapes})
+        json.dumps(
+            {
+                "fps": cfg.fps,
+                "steps": steps,
+                "moved": moved,
+                "success": success,
+                "features": features,
+                "shapes": shapes,
+                "pictures": pictures,
+                "asked": asked,
+            }
+        )
     )
 
 

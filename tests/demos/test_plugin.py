@@ -17,7 +17,8 @@ def test_lerobot_makes_and_steps_an_environment():
     if not python:
         pytest.skip("lerobot is not installed: name a Python that has it in MJX_NERO_LEROBOT_PYTHON")
     paths = os.pathsep.join(map(str, (root, root / "plugins" / "lerobot_env_mjx_nero")))
-    env = {**os.environ, "PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
+    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}  # for this Python's JAX
+    env = {**usual, "PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([python, HERE / "plugin_check.py"], capture_output=True, text=True, env=env)
     if "No module named 'jax'" in done.stderr:
         pytest.skip("lerobot's Python lacks what this package needs: pip install -e '.[demos,gym]' there")
@@ -28,3 +29,7 @@ def test_lerobot_makes_and_steps_an_environment():
     shapes = {"observation.state": [9], "observation.environment_state": [21]}
     assert told["features"] == {"action": [9], **shapes}
     assert told["shapes"] == {name: [2, *shape] for name, shape in shapes.items()}
+    seen = {"observation.state": [9], "observation.environment_state": [7]}  # who sees is told the goal alone
+    seen |= {f"observation.images.{name}": [3, 32, 32] for name in ("front", "wrist")}
+    assert told["asked"] == {"action": [9], **seen}
+    assert told["pictures"] == {name: [1, *shape] for name, shape in seen.items()}

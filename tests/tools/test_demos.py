@@ -165,6 +165,9 @@ def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(cal
     code, _, err = call("mjx_nero", "demos", *argv)
     assert code == 0, err
     found = open_dataset(tmp_path / "d")
+    told = found.schema.features[names.ENVIRONMENT].names  # who sees is told the goal alone, and learns no more from LeRobot
+    assert told == tuple(f"goal.{axis}" for axis in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+    assert found.column(names.ENVIRONMENT)[:, :3].std(axis=0).max() > 0.01
     for camera in ("front", "wrist"):
         frames = found.column(names.PICTURES + camera).reshape(3, 10, 64, 64, 3)
         assert frames.std() > 10

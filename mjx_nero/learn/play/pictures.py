@@ -80,7 +80,7 @@ class _Drawer(Protocol):
 
 
 class _Drawn:
-    """By MuJoCo's renderer, in one thread, to which OpenGL's context belongs."""
+    """MuJoCo's renderer, in one thread, to which OpenGL's context belongs."""
 
     def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
         model, camera = env.mj_model, name
@@ -102,7 +102,7 @@ class _Drawn:
 
 
 class _Traced:
-    """By MuJoCo Warp's ray tracer, each step a world of one batch."""
+    """MuJoCo Warp's ray tracer; each step is a world of one batch."""
 
     def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
         camera = dataclasses.replace(env.cfg.scene.cameras[name], size=size, kinds=("rgb",))

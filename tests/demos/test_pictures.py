@@ -1,0 +1,29 @@
+"""Both drawers of episodes' pictures, at steps that do not fill a batch."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_nero.envs import registry
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn.play import pictures
+
+
+@pytest.mark.slow
+def test_the_ray_tracer_draws_what_mujoco_draws(monkeypatch):
+    monkeypatch.setattr(pictures, "TOGETHER", 4)
+    cfg = registry.env_cfg("nero_lift", "rgb").uncorrupted()
+    env = ManipulationEnv(dataclasses.replace(cfg, observations={"state": cfg.observations["state"]}), impl="native")
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 9))
+    shown = np.asarray(state.pipeline_state.qpos), jax.device_get(jax.vmap(env.scenery)(state))
+    drawn = {}
+    for renderer in ("mujoco", "warp"):
+        cameras = pictures.Cameras(env, ["front", "wrist"], (48, 48), renderer)
+        drawn[renderer] = {name: np.stack(list(cameras.frames(name, *shown))).astype(int) for name in cameras.names}
+        cameras.close()
+    for name, frames in drawn["warp"].items():
+        off = np.abs(frames - drawn["mujoco"][name]).mean(axis=(1, 2, 3))
+        assert frames.shape == (9, 48, 48, 3) and frames.std() > 30
+        assert off.max() < 10 and off.max() < 0.2 * np.abs(frames - np.roll(drawn["mujoco"][name], 1, axis=0)).mean()
