@@ -91,7 +91,8 @@ class Turns:
         over = self._ik.solve_batch(low + jnp.array([0.0, 0.0, self._lift]), quats, home, jax.random.PRNGKey(0))
         before = low - self._before * jax.vmap(self.into)(quats)
         others = [jax.vmap(self._ik.local)(place, quats, over.q) for place in (low, before)]
-        return over.q.reshape(_WAYS, 2, -1), sum(1.0 - x.success for x in (over, *others)).reshape(_WAYS, 2)
+        fails = jnp.sum(jnp.stack([1.0 - x.success for x in (over, *others)]), axis=0)
+        return over.q.reshape(_WAYS, 2, -1), fails.reshape(_WAYS, 2)
 
     def table(self) -> Table:
         """Finds out where the hand can lean at the spot. It does not depend on an episode."""

@@ -53,9 +53,14 @@ def default(robot: RobotCfg) -> EnvCfg:
     edge = box.size[0]
     robot = dataclasses.replace(grasp.opened(robot, WIDER * edge), gravity_compensation=True)
     scene = scenes.around(robot, SceneCfg(objects={BOX: box}, fingers=True, goal="none"))
-    held = {"minimal_height": round(edge / math.sqrt(2) + LIFTED, 4), "grasp_radius": regions.near(there)}
-    clearance = round(edge / 2 + robot.pad[0] / 2 + AWAY, 4)
-    lying = Lying(**one, rest=box.rest_height, within=(round(TILT, 5), FLAT), clearance=clearance, **held)
+    lying = Lying(
+        object=BOX,
+        rest=box.rest_height,
+        within=(round(TILT, 5), FLAT),
+        clearance=round(edge / 2 + robot.pad[0] / 2 + AWAY, 4),
+        minimal_height=round(edge / math.sqrt(2) + LIFTED, 4),
+        grasp_radius=regions.near(there),
+    )
     done, fingers = {"lying": lying, "max_speed": STILL}, {"open": robot.gripper.open, "hold": robot.gripper.close}
     state = {
         **arm_state(),
@@ -74,7 +79,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "spot": spot,
         "beyond": grasp.beyond(robot, edge),
         "lift": round(1.2 * edge, 4),
-        "before": round(clearance + LIFTED, 4),
+        "before": round(lying.clearance + LIFTED, 4),
         "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
         **regions.ik(robot, "ik."),
     }
@@ -89,7 +94,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         success=SuccessCfg(
             condition=Term(sides.turned_up, params=done), distance=Term(sides.tilt, params={"lever": round(edge / 2, 4), **one})
         ),
-        metrics=metrics.grasping(**held, **one),
+        metrics=metrics.grasping(minimal_height=lying.minimal_height, grasp_radius=lying.grasp_radius, **one),
         observations={
             "state": ObservationGroup(state),
             "privileged_state": privileged(state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}),
