@@ -19,7 +19,7 @@ _WAYS = 8  # directions in which the hand leans: multiples of an eighth of a tur
 
 @struct.dataclass
 class Table:
-    """What the arm can do at the spot, by the direction in which the hand leans, and the side to which its fingers open."""
+    """Table of what the arm can do at the spot, by where the hand leans and to which side its fingers open."""
 
     fails: Float[Array, "ways 2"]  # 0 if the arm gets there
     q: Float[Array, "ways 2 nj"]  # over the spot [rad]
@@ -157,5 +157,5 @@ class Turns:
         return Plan(lean(start), lean(ends), home, home), _EACH / 2 + turned + UNREACHABLE * table.down[to] + left
 
     def _remains(self, table: Table, angle: Float[Array, " n"]) -> Float[Array, " n"]:
-        """What remains to be done if the wanted side looks in a level direction [rad]."""
+        """Computes what remains to be done if the wanted side looks in a level direction [rad]."""
         return table.go[jnp.mod(jnp.round((angle - self._out) / (2 * jnp.pi / _WAYS)).astype(jnp.int32), _WAYS)]

@@ -74,7 +74,7 @@ def opening(robot: RobotCfg) -> np.ndarray:
 
 
 def aside(robot: RobotCfg, gap: float) -> float:
-    """How far the pads' middle is, along the opening, from where it is when they go around the robot's cube [m].
+    """Returns how far the pads' middle is, along the opening, from where it is when they go around the robot's cube [m].
 
     0 if both sides move alike. If one side stands still, its pad comes down as near to a small object as to the cube.
 

@@ -26,7 +26,7 @@ def check(kind: str, metadata: Mapping[str, Any]) -> None:
 
 
 def ports(kind: str, options: Mapping[str, Any]) -> list[str]:
-    """What an arm is reached by, and no other program may use meanwhile; none for the simulated arm.
+    """Returns the ports of an arm, which no other program may use meanwhile; none for the simulated arm.
 
     Args:
         options: see ``make``.

@@ -54,7 +54,7 @@ class Putting(Tower):
 
     @property
     def place(self) -> dict[str, towers.Place]:
-        """As a tower's, on the fixture's site."""
+        """The place on the fixture's site."""
         place = super().place["place"]
         return {"place": dataclasses.replace(place, rise=self.rise)}
 

@@ -202,7 +202,7 @@ def _cut(kept: tuple, slot: int, steps: int) -> tuple:
 
 
 def told(env: ManipulationEnv, seen: bool) -> tuple[str, ...]:
-    """What ``environment_state`` has the poses of.
+    """Lists what ``environment_state`` has the poses of.
 
     Args:
         seen: pictures show the rest.
