@@ -122,7 +122,7 @@ class Detour:
         memory, targets = self._follow(memory, view, jnp.zeros(3), None)
         return memory, jnp.concatenate([targets, view.ctrl[self._n :]])
 
-    def _follow(self, way: Way, view: View, offset, orientation, weight=1.0) -> tuple[Way, Float[Array, " nj"]]:
+    def _follow(self, way: Way, view: View, offset, orientation, weight=None) -> tuple[Way, Float[Array, " nj"]]:
         """Takes one step along a way; ``offset`` leads from the way to the end effector's place [m]."""
         position = way.target()
         goes = jnp.linalg.norm(position + offset - view.ee_pos_w) < self.cfg.lead

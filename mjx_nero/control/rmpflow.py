@@ -89,7 +89,7 @@ class Target:
     position: Float[Array, "3"] | None = None  # [m]
     orientation: Float[Array, "4"] | None = None  # wxyz
     velocity: Float[Array, "3"] | None = None  # [m/s]
-    weight: Float[Array, ""] | float = 1.0  # of the orientation; 0: it is free
+    weight: Float[Array, ""] | float | None = None  # of the orientation; 0: it is free; None: 1
 
 
 class RmpFlow:
@@ -251,7 +251,7 @@ class RmpFlow:
         if target.orientation is not None:
             errors = rotation_matrix(target.orientation).T - x[1:]
             pulls = jax.vmap(lambda e, v: rmp.axis_target_rmp(p.axis_target_rmp, e, v, distance))(errors, xd[1:])
-            nodes[1] = jax.tree.map(lambda x: target.weight * x, pulls)
+            nodes[1] = pulls if target.weight is None else jax.tree.map(lambda x: target.weight * x, pulls)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
 
     def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> rmp.Rmp:

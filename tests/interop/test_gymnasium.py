@@ -59,8 +59,7 @@ def test_make_vec_takes_the_compiled_batch():
 
 def test_actions_end_where_the_joints_do(vector):
     """Home plus half a radian an action: joint 4 is at home at 2.0 and goes from -1.01 to 2.14. Velocities: +-1."""
-    place = Env("nero_place", impl="native")
-    box = place.action_space
+    box = Env("nero_lift", preset="isaac", impl="native").action_space
     assert box.low[3] == pytest.approx((-1.01 - 2.0) / 0.5) and box.high[3] == pytest.approx((2.14 - 2.0) / 0.5)
     assert (vector.single_action_space.low == -1).all() and (vector.single_action_space.high == 1).all()
     assert (box.low[-1], box.high[-1]) == (-1, 1)  # the gripper
