@@ -490,6 +490,9 @@ def test_make_by_name():
         "carry",
         "follow_joint",
         "grasp_thing",
+        "put_in",
+        "put_thing",
+        "turn_over",
     }
 
 

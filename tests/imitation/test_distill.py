@@ -24,10 +24,10 @@ CFG = DistillCfg(
 )
 
 
-def drawn(sim, scenery):
+def drawn(qpos, scenery):
     """Pictures of the table from above, 40 cm wide: where the cube is it is bright."""
     x, y = jnp.meshgrid(jnp.linspace(0.15, 0.55, EDGE), jnp.linspace(-0.2, 0.2, EDGE), indexing="ij")
-    bright = jnp.exp(-((x - sim.qpos[9]) ** 2 + (y - sim.qpos[10]) ** 2) / 0.05**2)
+    bright = jnp.exp(-((x - qpos[9]) ** 2 + (y - qpos[10]) ** 2) / 0.05**2)
     rgb = jnp.tile((255 * bright).astype(jnp.uint8)[..., None], (1, 1, 3))
     return {"front": Picture(rgb=rgb), "wrist": Picture(rgb=255 - rgb)}
 

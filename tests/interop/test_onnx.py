@@ -168,7 +168,7 @@ def test_histories_and_filters_are_told():
 @pytest.mark.parametrize("env_name", ["nero_lift", "so100_reach", "nero_push", "nero_place", "cobotta_stack", "nero_stack"])
 def test_the_page_program_moves_the_arm_as_the_environment_does(call, tmp_path, env_name):
     """The page's program, word for word, without JAX or MuJoCo: its joint targets are the environment's."""
-    punctual = {"actions.delay.params.steps": (0, 0)} if env_name not in ("nero_push", "nero_place") else {}
+    punctual = {"actions.delay.params.steps": (0, 0)} if env_name != "nero_push" else {}
     env = mjx_nero.make(env_name, impl="native", corruption=False, **punctual)
     trained = policy.load_for(env, env_name, policy.shipped(env_name))
     reset, step, targets, view = (jax.jit(f) for f in (env.reset, env.step, env.targets, env.view))

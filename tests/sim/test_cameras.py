@@ -18,7 +18,7 @@ from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm
 from mjx_nero.sim import cameras, scene
 from mjx_nero.sim.cameras import opengl, places
 from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
-from mjx_nero.types import Scenery, Sim, UserError
+from mjx_nero.types import Scenery, UserError
 
 # Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 8 degrees from a metre above the table.
 ABOVE = CameraCfg(pos=(0.35, 0.1, 1.0), quat=(1.0, 0.0, 0.0, 0.0), fovy=8.0, kinds=KINDS)
@@ -44,10 +44,8 @@ def worlds():
 
     def draw(renderer):
         eyes = cameras.Cameras(model, cfg.scene.cameras, renderer)
-        zero = jnp.zeros((3, 0))
-        sim = Sim(jnp.asarray(qpos, jnp.float32), zero, zero, zero, zero)
         unseen = Scenery(jnp.array([[0.35, 0.1, 0.3]] * 3), jnp.ones((3, 4)))  # the goal's marker, between camera and cube
-        return jax.jit(jax.vmap(eyes))(sim, unseen)
+        return jax.jit(jax.vmap(eyes))(jnp.asarray(qpos, jnp.float32), unseen)
 
     return model, {name: jax.device_get(draw(name)) for name in ("mujoco", "warp")}
 

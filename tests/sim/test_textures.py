@@ -16,7 +16,7 @@ from mjx_nero.sim import cameras, scene
 from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import Look
-from mjx_nero.types import Scenery, Sim, UserError
+from mjx_nero.types import Scenery, UserError
 
 # Straight down on the table's middle, all of which and a little more it sees: 1.2 m of y over 64 pixels, x upwards.
 DOWN = CameraCfg(pos=(0.3, 0.0, 3.0), quat=(0.7071068, 0.0, 0.0, -0.7071068), fovy=22.6)
@@ -93,10 +93,10 @@ def test_both_renderers_show_each_worlds_own(built):
     drawn = {}
     for renderer in ("mujoco", "warp"):
         eyes = cameras.Cameras(model, seen.cameras, renderer, fields=("geom_matid", "geom_rgba"))
-        zero, qpos = jnp.zeros((3, 0)), jnp.tile(jnp.asarray(model.qpos0, jnp.float32), (3, 1)).at[:, 1].set(1.5)
+        qpos = jnp.tile(jnp.asarray(model.qpos0, jnp.float32), (3, 1)).at[:, 1].set(1.5)
         look = {"geom_matid": jnp.asarray(matid), "geom_rgba": jnp.asarray(rgba)}
         unseen = Scenery(jnp.zeros((3, 3)), jnp.ones((3, 4)), look=look)
-        drawn[renderer] = jax.device_get(jax.jit(jax.vmap(eyes))(Sim(qpos, zero, zero, zero, zero), unseen))["down"].rgb
+        drawn[renderer] = jax.device_get(jax.jit(jax.vmap(eyes))(qpos, unseen))["down"].rgb
     # The photograph's top left corner is at the picture's bottom left: +x, upwards here, goes to its right.
     at = {"red": (0, 1), "green": (0, 0), "blue": (1, 1), "white": (1, 0)}
     lit = {"red": [1, 0, 0], "green": [0, 1, 0], "blue": [0, 0, 1], "white": [1, 1, 1]}

@@ -39,7 +39,7 @@ def test_list_envs_at_eighty_columns():
     words = said.get().split()
     for row in rows:
         assert row.name in words and (row.robot or "any") in words and row.task in words
-    assert "privileged_state" in words and words.count("ships") == 22
+    assert "privileged_state" in words and words.count("ships") == 50
     assert sum(row.task == "follow_target" for row in rows) == 3 and words.count("any") == sum(not row.robot for row in rows)
 
 

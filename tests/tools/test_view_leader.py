@@ -49,6 +49,7 @@ def arm(tmp_path):
     made = so_leader.of(told, port.name, tmp_path / "leader.json", Clock())
     made.connect()
     yield made, plant, servos
+    made.close()  # or the next terminal of the same name is taken
     over.set()
     thread.join()
     port.close()

@@ -21,6 +21,11 @@ class SoLeader(SoArm):
         for servo in self.ids:
             self._bus.write(servo, "torque_enable", 0)
 
+    def close(self) -> None:
+        """Closes the port, which others may have then."""
+        super().close()
+        self._taken.close()
+
     def engage(self) -> None:
         """Refuses.
 
