@@ -9,7 +9,7 @@ from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
 from mjx_nero.mdp import actions, curriculum, fixtures, observations, success, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import TARGET, UserError
@@ -55,6 +55,12 @@ def nearer(name: str, func: Callable, **params: Any) -> dict[str, RewardTerm]:
     """
     scales = {name: (10.0, 0.3), f"{name}_near": (10.0, 0.1), f"{name}_fine": (15.0, 0.03)}
     return {each: RewardTerm(func, weight=weight, params={"std": std, **params}) for each, (weight, std) in scales.items()}
+
+
+def observed(state: Mapping[str, ObservationTerm], **object: str) -> dict[str, ObservationGroup]:
+    """Groups the observations of a policy, and those of a critic that also knows the object's velocity."""
+    velocity = ObservationTerm(observations.object_velocity, params=object)
+    return {"state": ObservationGroup(state), "privileged_state": privileged(state, {"object_velocity": velocity})}
 
 
 def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero.deploy.arm import Arm, Clock
+from mjx_nero.deploy.drivers import bcap
 from mjx_nero.deploy.executor import Lag
 from mjx_nero.errors import UserError
 
@@ -35,7 +36,7 @@ def ports(kind: str, options: Mapping[str, Any]) -> list[str]:
     if kind == "lerobot":  # TYPE:field=value,...
         told = next((part[5:] for part in told.partition(":")[2].split(",") if part.startswith("port=")), told)
     elif kind == "cobotta":
-        told = told.removeprefix("udp:").removesuffix(":5007")
+        told = told.removeprefix("udp:").removesuffix(f":{bcap.PORT}")
     return [port for port in (told.removeprefix("slcan:"), options.get("gripper")) if port]
 
 

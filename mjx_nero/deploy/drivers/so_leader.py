@@ -9,6 +9,7 @@ import numpy as np
 from mjx_nero.deploy.alone import alone
 from mjx_nero.deploy.arm import ArmError, Clock
 from mjx_nero.deploy.drivers.so_arm import SoArm, read_calibration
+from mjx_nero.errors import UserError
 
 
 class SoLeader(SoArm):
@@ -17,7 +18,11 @@ class SoLeader(SoArm):
     def connect(self) -> None:
         """Opens the port, and cuts the servos' torque."""
         self._taken = alone(self._port)  # that of an arm which another program moves would drop it
-        super().connect()
+        try:
+            super().connect()
+        except UserError:
+            self._taken.close()
+            raise
         for servo in self.ids:
             self._bus.write(servo, "torque_enable", 0)
 

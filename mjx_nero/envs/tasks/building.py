@@ -25,9 +25,12 @@ PRESS = 0.075  # [s] least time the fingers press before an object is lifted
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
 
 
-def lets_go(acts: dict[str, Term]) -> dict[str, Term]:
-    """Adds anti-windup, so that the gripper lets go at once. It precedes the speed limit, which starts from its targets."""
-    others = dict(acts)
+def lets_go() -> dict[str, Term]:
+    """Lists action terms: velocities, and a gripper that closes as far as told and lets go at once.
+
+    Anti-windup precedes the speed limit, which starts from its targets.
+    """
+    others = {**velocity_actions(), "gripper": Term(actions.ContinuousGripper)}
     limit = others.pop("speed_limit")
     return {**others, "anti_windup": Term(actions.AntiWindup), "speed_limit": limit}
 
@@ -111,7 +114,7 @@ class Tower:
             "metrics": self.metrics(),
             "terminations": self.terminations(),
             "controllers": self.controllers(),
-            "actions": lets_go({**velocity_actions(), "gripper": Term(actions.ContinuousGripper)}),
+            "actions": lets_go(),
             "training": SHOWN,
         }
         return EnvCfg(**{**shared, **own})

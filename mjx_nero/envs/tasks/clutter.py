@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import SHOWN, Budget, EnvCfg, Presets, arm_state, object_at_goal, velocity_actions
+from mjx_nero.envs.task import SHOWN, Budget, EnvCfg, Presets, arm_state, object_at_goal, observed, velocity_actions
 from mjx_nero.envs.tasks.lift import carrying
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -175,12 +175,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         ),
         success=object_at_goal(**commanded),
         metrics=metrics.grasping(**held),
-        observations={
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(
-                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=commanded)}
-            ),
-        },
+        observations=observed(state, **commanded),
         events={
             "scatter": Term(
                 events.scatter,

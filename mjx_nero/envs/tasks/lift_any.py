@@ -17,12 +17,13 @@ from mjx_nero.envs.task import (
     Presets,
     arm_state,
     object_at_goal,
+    observed,
     stays_on_table,
     velocity_actions,
 )
 from mjx_nero.envs.tasks.lift import carrying
 from mjx_nero.mdp import commands, events, metrics, observations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, grasp, objects
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.objects import events as thing_events
@@ -84,10 +85,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         command=CommandTerm(commands.uniform_position, params=dict(zip("xyz", there.hold, strict=True)), resample_s=ONCE),
         success=object_at_goal(**one),
         metrics=metrics.grasping(**held),
-        observations={
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}),
-        },
+        observations=observed(state, **one),
         events={
             "reset_object_position": Term(
                 events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}

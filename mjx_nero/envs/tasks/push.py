@@ -4,9 +4,9 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, stays_on_table
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, observed, stays_on_table
 from mjx_nero.mdp import commands, events, observations, rewards, success
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -60,12 +60,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             condition=Term(success.object_at_pose, params=at_goal),
             distance=Term(success.object_distance, params=object),
         ),
-        observations={
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(
-                state, {"object_velocity": ObservationTerm(observations.object_velocity, params=object)}
-            ),
-        },
+        observations=observed(state, **object),
         events={
             "reset_object_position": Term(events.object_position_uniform, params={**start, **object}),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": TURN, **object}),

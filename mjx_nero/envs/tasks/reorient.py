@@ -14,14 +14,13 @@ from mjx_nero.envs.task import (
     Presets,
     SuccessCfg,
     arm_state,
+    observed,
     stays_on_table,
-    velocity_actions,
 )
 from mjx_nero.envs.tasks.building import lets_go
 from mjx_nero.mdp import events, metrics, observations, rewards, sides, towers
-from mjx_nero.mdp.actions import ContinuousGripper
 from mjx_nero.mdp.sides import Lying
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -88,17 +87,14 @@ def default(robot: RobotCfg) -> EnvCfg:
         scene=scene,
         sim=contacts.sized(robot, scene, SimCfg(ramp=robot.max_step > 0)),
         episode_length_s=20.0,
-        actions=lets_go({**velocity_actions(), "gripper": Term(ContinuousGripper)}),
+        actions=lets_go(),
         controllers={"turn_over": script},
         command=CommandTerm(sides.any_side, resample_s=ONCE),
         success=SuccessCfg(
             condition=Term(sides.turned_up, params=done), distance=Term(sides.tilt, params={"lever": round(edge / 2, 4), **one})
         ),
         metrics=metrics.grasping(minimal_height=lying.minimal_height, grasp_radius=lying.grasp_radius, **one),
-        observations={
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(state, {"object_velocity": ObservationTerm(observations.object_velocity, params=one)}),
-        },
+        observations=observed(state, **one),
         events={
             "reset_object_position": Term(
                 events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}
