@@ -247,3 +247,15 @@ def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...],
 def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:
     """1 while the tower is built (see ``built``), else 0."""
     return built(view, place=place, max_speed=max_speed).astype(jnp.float32)
+
+
+def rested(view: View, *, place: Place, max_speed: Positive, std: Positive) -> Scalar:
+    """exp(-(v / std)^2) while the tower is built (see ``built``), else 0, where v is the joints' root-mean-square speed.
+
+    Without it nothing tells a hand that has done its work to stay: it swings away, and sooner or later meets something.
+
+    Args:
+        std: speed at which most of the reward is lost [rad/s].
+    """
+    speed = jnp.mean(jnp.square(view.joint_vel)) / std**2
+    return completed(view, place=place, max_speed=max_speed) * jnp.exp(-speed)

@@ -19,6 +19,7 @@ STILL = 0.005  # [m/s]
 FLAT = 0.005  # [m] tolerance of an object's height at its place
 LIFTED = 0.01  # [m] height of a lifted object above where it lay
 AWAY = 0.02  # [m] clearance of the pads above an object that the hand has left
+RESTING = 0.3  # [rad/s] speed of the joints at which a hand that has left no longer rests
 CLOSING = 0.5  # [s] least closing time: fingers at a metre a second throw what they meet
 PRESS = 0.075  # [s] least time the fingers press before an object is lifted
 # Share of each of the ten phases that one control step covers: 305 steps in all, 25 to close and 20 to open.
@@ -142,6 +143,7 @@ class Tower:
             "releasing": RewardTerm(towers.told_to_open, weight=10.0, params={**place, **fingers}),
             "leaving": RewardTerm(towers.left, weight=10.0, params=place),
             "completed": RewardTerm(towers.completed, weight=15.0, params=self.done),
+            "resting": RewardTerm(towers.rested, weight=10.0, params={**self.done, "std": RESTING}),
             "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
