@@ -25,6 +25,9 @@ _UP, _STILL = np.array([0.0, 0.0, 1.0], np.float32), np.array([1.0, 0.0, 0.0, 0.
 _TURN, _TURN_SHARE = 1.0, 0.1  # [rad/s] the hand turns so fast at most; share of what the object's turn lacks, a control step
 _STANDS = 0.25  # of the speed down: what is slower than this stands on something
 _SHARE, _AHEAD = 0.06, 0.004  # of an error along the table, a control step; what it adds up to at most [m]
+# The same share while the object rubs on the rim, and the search's greatest speed about the goal [rad/s]: a set-point that turns
+# faster than it is made up for goes round, and the object sticks where it is.
+_RUBS, _ROUND = 0.2, 5.0
 _CLEARS = 0.003  # [m] that the object is above the rim before it goes across
 _STROKE = 0.005  # [m] an object that has gone so far down is in
 _CLOSE, _ALIGNED = 1.5e-3, 0.03  # [m, rad] the object is over its place
@@ -56,11 +59,11 @@ class PutInCfg:
     top: Positive = 0.025
     turns: int = 0
     speed: Positive = 0.04
-    press: Positive = 0.002
+    press: Positive = 0.001
     push: Positive = 0.008
     reach: NonNegative = 0.0
-    pitch: Positive = 4e-4
-    sweep: Positive = 0.01
+    pitch: Positive = 5e-4
+    sweep: Positive = 0.005
     done: Positive = 0.002
     patience: Positive = 3.5
     away: Positive = 0.06
@@ -134,17 +137,21 @@ class PutIn:
     def _put(self, memory: PutInMemory, view: View) -> tuple[PutInMemory, Float[Array, " nu"]]:
         """Makes a step of the stages after the grasp."""
         stage, pick, seen = memory.stage, memory.pick, view.objects[self._object]
-        off, slow = self._off(view), jnp.max(jnp.abs(pick.qd)) < _SLOW
+        slow = jnp.max(jnp.abs(pick.qd)) < _SLOW
+        # Above the goal, turns are made up for from where the hand is told to be: it is on its way there, and lags.
+        told = math.quat_mul(math.quat_mul(memory.upright, self._pick._hand(pick.yaw)), math.quat_conj(view.ee_quat_w))
+        turned = jnp.where(stage == OVER, math.quat_mul(told, seen.quat_w), seen.quat_w)
+        off, lacks = self._off(view, seen.quat_w), self._off(view, turned)
         end = self._end(view)
         way = view.goal_pos_w - end
         steers = (stage == OVER) | (stage == IN) & (-way[2] > self.cfg.top - _STROKE)
-        leans = jnp.cross(math.rotate(seen.quat_w, jnp.asarray(_UP)), jnp.asarray(_UP))
+        leans = jnp.cross(math.rotate(turned, jnp.asarray(_UP)), jnp.asarray(_UP))
         upright = math.quat_mul(math.quat_exp(jnp.where(steers, _SHARE, 0.0) * leans), memory.upright)
         share = jnp.where((stage == OVER) & slow, GRIP_FILTER, 0.0)
         grip = memory.grip + share * (pick.pos - end - memory.grip)
-        turn = jnp.clip(_TURN_SHARE * off, -_TURN * self.dt, _TURN * self.dt)
+        turn = jnp.clip(_TURN_SHARE * lacks, -_TURN * self.dt, _TURN * self.dt)
         yaw = pick.yaw + jnp.where(steers, turn, 0.0)
-        pos, turned = self._position(memory, view, grip, end)
+        pos, sought = self._position(memory, view, grip, end)
 
         found = self._pick._ik.local(pos, math.quat_mul(upright, self._pick._hand(yaw)), pick.q).q
         wanted = jnp.where(stage == OPEN, pick.q, found)
@@ -168,7 +175,7 @@ class PutIn:
         pick = dataclasses.replace(pick, yaw=jnp.where(lost, pick.yaw, yaw))
         fresh = following != stage
         count = jnp.where(fresh, 0, memory.count + 1)
-        after = PutInMemory(pick, following, count, grip, jnp.where(fresh, 0.0, turned), upright)
+        after = PutInMemory(pick, following, count, grip, jnp.where(fresh, 0.0, sought), upright)
         return after, jnp.concatenate([q + self._lead * qd, fingers])
 
     def _position(
@@ -189,12 +196,12 @@ class PutIn:
         low = jnp.maximum(pos[2] - step, jnp.maximum(view.ee_pos_w[2] - press, goal[2] + grip[2] - press))
         stands = ~entered & (height < cfg.top + _STROKE) & (falls < _STANDS * cfg.speed)
         radius = cfg.pitch * memory.turned / (2 * jnp.pi)
-        speed = cfg.sweep / jnp.maximum(radius, cfg.pitch)
+        speed = jnp.minimum(_ROUND, cfg.sweep / jnp.maximum(radius, cfg.pitch))
         turned = memory.turned + jnp.where(stands & (cfg.reach > 0), speed * self.dt, 0.0)
         turned = jnp.where(radius > cfg.reach, 0.0, turned)
         aside = jnp.minimum(radius, cfg.reach) * jnp.stack([jnp.cos(turned), jnp.sin(turned)])
         # Above the rim the set-point goes on until the object does, however it sticks; below, the arm yields to the walls.
-        sought = pos[:2] + _SHARE * (goal[:2] + aside - seen[:2])
+        sought = pos[:2] + jnp.where(stands, _RUBS, _SHARE) * (goal[:2] + aside - seen[:2])
         sought = jnp.clip(sought, goal[:2] + grip[:2] - _AHEAD, goal[:2] + grip[:2] + _AHEAD)
         beside = jnp.where(entered, pos[:2] + _SHARE * (view.ee_pos_w[:2] - pos[:2]), sought)
         down = jnp.append(beside, low)
@@ -217,12 +224,12 @@ class PutIn:
             False,
         )
 
-    def _off(self, view: View) -> Float[Array, ""]:
+    def _off(self, view: View, quat: Float[Array, "4"]) -> Float[Array, ""]:
         """Angle about the vertical that the object lacks, the shortest of those that look the same [rad]."""
         if not self.cfg.turns:
             return jnp.zeros(())
         most = jnp.pi / self.cfg.turns
-        lacks = math.yaw(view.goal_quat_w) - math.yaw(view.objects[self._object].quat_w)
+        lacks = math.yaw(view.goal_quat_w) - math.yaw(quat)
         return jnp.mod(lacks + most, 2 * most) - most
 
     def _fingers(self, pick: PickUpMemory, view: View, opens: Bool[Array, ""]) -> Float[Array, " ng"]:
