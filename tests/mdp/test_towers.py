@@ -57,6 +57,7 @@ THREE = {**STACK, "tower": ("blue", "red", "top")}
 PLACE = {**STACK, "tower": ("goal", "red")}
 HELD = {"minimal_height": 0.03, "grasp_radius": 0.04}
 GRIPPER = {"open": (0.05, -0.05), "hold": (0.02, -0.02), "clearance": 0.05}
+RESTING = {"max_speed": 0.005, "clearance": 0.05, "std": 0.1}
 WAY = {**HELD, "over": 0.03, "std": 0.05}
 ON, LYING, TOP = (0.4, 0.1, 0.06), (0.4, -0.1, 0.02), (0.4, 0.1, 0.1)
 IN_HAND = (0.4, -0.1, 0.06)  # 20 cm beside blue, as high as on it
@@ -148,6 +149,10 @@ ASIDE = (0.4, 0.12, 0.06)
         (towers.left, {**STACK, "clearance": 0.05}, view(LYING), 0.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(ON), 1.0),
         (towers.completed, {**STACK, "max_speed": 0.005, "clearance": 0.05}, view(LYING), 0.0),
+        # At rest; one of three joints moves at 0.3 rad/s: exp(-0.03 / 0.01); at rest beside a cube that lies elsewhere.
+        (towers.rested, {**STACK, **RESTING}, view(ON), 1.0),
+        (towers.rested, {**STACK, **RESTING}, dataclasses.replace(view(ON), joint_vel=jnp.array([0.3, 0.0, 0.0])), math.exp(-3)),
+        (towers.rested, {**STACK, **RESTING}, view(LYING), 0.0),
         (towers.distance, {"tower": ("blue", "red"), "rise": 0.04}, view((0.43, 0.1, 0.02)), 0.05),
         (towers.distance, {"tower": ("blue", "red", "top"), "rise": 0.04}, view(ON, top=(0.4, 0.16, 0.02)), 0.1),
         (towers.distance, {"tower": ("goal", "red"), "rise": 0.04}, view((0.3, 0.3, 0.02)), 0.3),
