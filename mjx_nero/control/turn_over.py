@@ -114,8 +114,8 @@ class TurnOver:
         stays = (phase == CLOSE) | (phase == OPEN)
         wanted_q = jnp.where(stays, memory.q, found)
         closed = (phase >= CLOSE) & (phase <= SET)
-        # On the way that the joints take one by one, the hand may dip until the cube strikes the table.
         fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
+        # Straight, as the hand may dip until the cube strikes the table if some joints are there before the others.
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest, phase == TURN)
         ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
