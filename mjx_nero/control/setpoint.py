@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero.mdp.actions import rate_limit
 
@@ -29,19 +29,24 @@ def follow(
     speed: Float[Array, " nj"],
     dt: float,
     fastest: float | Float[Array, ""] = _GENTLE,
+    straight: bool | Bool[Array, ""] = False,
 ) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-    """Moves the set-point ``q``, which moves at ``qd``, for a step on its way to ``wanted``, all joints in step.
+    """Moves the set-point ``q``, which moves at ``qd``, for a step on its way to ``wanted``.
 
     Args:
         speed: greatest speeds [rad/s or m/s].
         dt: the step [s].
         fastest: greatest acceleration [rad/s2 or m/s2].
+        straight: all joints are on their way for as long. Otherwise those with less to go are there sooner.
 
     Returns:
         the set-point and its speed.
     """
     way = wanted - q
-    quick = jnp.sign(way) * jnp.minimum(jnp.abs(way) / _SMOOTH, jnp.sqrt(fastest * jnp.abs(way)))
+    far = jnp.abs(way)
+    quick = jnp.sign(way) * jnp.minimum(far / _SMOOTH, jnp.sqrt(fastest * far))
+    together = way * jnp.minimum(1.0 / _SMOOTH, jnp.sqrt(fastest / (jnp.max(far) + 1e-9)))
+    quick = jnp.where(straight, together, quick)
     quick /= jnp.maximum(1.0, jnp.max(jnp.abs(quick) / speed))
     qd = rate_limit(quick, qd, step=jnp.full(q.shape, fastest * dt))
     return q + qd * dt, qd

@@ -115,7 +115,8 @@ class TurnOver:
         wanted_q = jnp.where(stays, memory.q, found)
         closed = (phase >= CLOSE) & (phase <= SET)
         fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
-        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
+        # Straight, as the hand may dip until the cube strikes the table if some joints are there before the others.
+        q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest, phase == TURN)
         ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
