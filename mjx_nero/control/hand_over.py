@@ -24,6 +24,7 @@ _SLOW = 0.1  # [rad/s]
 _THERE = 0.05  # [rad] an arm so near to where it goes has arrived
 _LONGEST = 4.0  # [s] of a way across; and of a way up or down:
 _SHORT = 1.0
+_CLOSE = 0.005  # [m] a hand so near to its place on the object closes
 _WITHIN = 0.01  # [m] the taking hand comes down once it is so near to its place over the object
 _AHEAD = 0.03  # [m] the set-point corrects the object's place at the goal by so much at most
 
@@ -127,9 +128,9 @@ class _Arm:
         return dataclasses.replace(arm, q=q, qd=qd, pos=jnp.where(across, now, pos))
 
 
-def _there(arm: ArmMemory, end: Float[Array, " nj"]) -> Bool[Array, ""]:
-    """True if the set-point rests where it goes to."""
-    return (jnp.max(jnp.abs(end - arm.q)) < _THERE) & (jnp.max(jnp.abs(arm.qd)) < _SLOW)
+def _there(view: View, arm: ArmMemory, end: Float[Array, " nj"]) -> Bool[Array, ""]:
+    """True if the arm is where it goes to, and its set-point rests."""
+    return (jnp.max(jnp.abs(end - view.joint_pos[: len(end)])) < _THERE) & (jnp.max(jnp.abs(arm.qd)) < _SLOW)
 
 
 class HandOver:
@@ -189,10 +190,12 @@ class HandOver:
         """Targets of all drives."""
         stage, first, second = memory.stage, view.of(), view.of(self.cfg.taker)
         pos, yaw, pitch = self._seen(view)
-        giver = self._give(memory, pos, yaw, pitch)
+        giver, low = self._give(memory, pos, yaw, pitch)
         taker, to_taker = self._take(memory, second, pos, yaw, pitch)
         grip = jnp.clip(memory.grip + GRIP_FILTER * (view.goal_pos_w - pos), -_AHEAD, _AHEAD)
-        ended = self._ended(memory, giver, taker, jnp.linalg.norm(second.ee_pos_w - to_taker))
+        off = [jnp.linalg.norm(own.ee_pos_w - to) for own, to in ((first, low), (second, to_taker))]
+        reached = [[_there(own, arm, end) for end in (arm.first, arm.second)] for own, arm in ((first, giver), (second, taker))]
+        ended = self._ended(memory, reached, off)
         memory = HandOverMemory(
             stage=stage + ended,
             count=jnp.where(ended, 0, memory.count + 1),
@@ -207,8 +210,10 @@ class HandOver:
         arms = [arm.q + side.lead * arm.qd for arm, side in ((giver, self._giver), (taker, self._taker))]
         return memory, jnp.concatenate([arms[0], fingers[0], arms[1], fingers[1]])
 
-    def _give(self, memory: HandOverMemory, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]) -> ArmMemory:
-        """The giver's next set-point, for an object seen at ``pos``."""
+    def _give(
+        self, memory: HandOverMemory, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
+    ) -> tuple[ArmMemory, Float[Array, "3"]]:
+        """The giver's next set-point, and where its grasp point has to be on an object seen at ``pos``."""
         stage, arm, mine = memory.stage, memory.giver, self._giver
         arm = dataclasses.replace(arm, yaw=jnp.where(stage < MEET, arm.yaw, 0.0))  # the object then lies along x
         low = mine.place(pos, yaw, pitch)
@@ -221,7 +226,7 @@ class HandOver:
         across = (stage == OVER) | (stage == MEET) | (stage >= BRING)
         to = jnp.select([stage == OVER, stage >= BRING], [arm.first, jnp.asarray(mine.home)], arm.second)
         next = jnp.where(moves, self._towards(arm.pos, end), arm.pos)
-        return mine.step(arm, across, to, next, (stage > CLOSE) & (stage < LEAVE))
+        return mine.step(arm, across, to, next, (stage > CLOSE) & (stage < LEAVE)), low
 
     def _take(
         self, memory: HandOverMemory, view: View, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
@@ -239,24 +244,28 @@ class HandOver:
         next = jnp.where(moves, self._towards(arm.pos, end), arm.pos)
         return mine.step(arm, across, to, next, stage > GRIP), end
 
-    def _ended(self, memory: HandOverMemory, giver: ArmMemory, taker: ArmMemory, off: Float[Array, ""]) -> Bool[Array, ""]:
-        """True if the stage is done, or has had enough time; ``off``: of the taking hand [m]."""
-        time = (memory.count + 1) * self.dt
-        gives, takes = [[_there(arm, end) for end in (arm.first, arm.second)] for arm in (giver, taker)]
-        way = self.cfg.above / self.cfg.speed
+    def _ended(self, memory: HandOverMemory, reached: list, off: list) -> Bool[Array, ""]:
+        """True if the stage is done, or has had enough time.
+
+        Args:
+            reached: of giver and taker, whether the arm is at its first and at its second place.
+            off: of giver and taker, how far the hand is from where it takes the object, or over it [m].
+        """
+        time, way = (memory.count + 1) * self.dt, self.cfg.above / self.cfg.speed
+        (over, meets), (waits, brought) = reached
         return jnp.stack(
             [
-                gives[0] | (time > _LONGEST),
-                time > way + 0.3,
+                over | (time > _LONGEST),
+                (off[0] < _CLOSE) | (time > way + _SHORT),
                 time > self._giver.closed,
                 time > way + 0.1,
-                gives[1] & takes[0] | (time > _LONGEST),
-                (off < _WITHIN) | (time > _SHORT),
-                time > way + 0.4,
+                meets & waits | (time > _LONGEST),
+                (off[1] < _WITHIN) | (time > _SHORT),
+                (off[1] < _CLOSE) | (time > way + _SHORT),
                 time > self._taker.closed,
                 time > self._giver.closed,
                 time > way,
-                takes[1],
+                brought | (time > _LONGEST),
                 jnp.zeros((), bool),
             ]
         )[memory.stage]
