@@ -9,9 +9,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from mjx_nero import math as turns
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import SHOWN, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, arm_state, nearer, stays_on_table
 from mjx_nero.envs.tasks.building import working
@@ -87,9 +87,11 @@ def _side(robot: RobotCfg, edge: float, faces: float, aside: float) -> Side:
     regions.box(robot, "hold", "where it can hold what it has grasped")
     quarter = round(float(np.arctan2(*pick.mean(1)[1::-1])) / SIDE)  # of a turn: its front
     front = np.sort(np.abs(pick[quarter % 2]))
-    turn = np.array([math.cos((faces - quarter * SIDE) / 2), 0.0, 0.0, math.sin((faces - quarter * SIDE) / 2)])
-    quat = tuple(float(v) for v in np.asarray(turns.quat_mul(turn, np.array(robot.base_quat))).round(6))
-    robot = dataclasses.replace(working(grasp.opened(robot, WIDER * edge)), base_quat=quat)
+    half = (faces - quarter * SIDE) / 2
+    quat = np.zeros(4)
+    mujoco.mju_mulQuat(quat, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array(robot.base_quat))
+    w, x, y, z = (round(float(v), 6) for v in quat)
+    robot = dataclasses.replace(working(grasp.opened(robot, WIDER * edge)), base_quat=(w, x, y, z))
     ahead = regions.turn_to(robot, math.cos(faces), math.sin(faces))
     home = ahead + _turned(robot, ahead, faces, aside)
     arm = dataclasses.replace(robot.arm, home=(round(robot.arm.home[0] + home, 4), *robot.arm.home[1:]))
@@ -341,4 +343,4 @@ def presets() -> Presets:
 
 def taken_by(taker: RobotCfg) -> Presets:
     """The presets with another robot that takes the bar."""
-    return {name: functools.partial(factory, taker=taker) for name, factory in presets().items()}
+    return {"default": functools.partial(default, taker=taker)}
