@@ -82,6 +82,16 @@ def check(robot: RobotCfg, others: Robots, things: Iterable[str]) -> None:
             )
 
 
+def alone(robots: Robots, what: str) -> None:
+    """Refuses scenes of several robots; ``robots`` are those beside the first.
+
+    Raises:
+        UserError: there are some; ``what`` does not know them.
+    """
+    if robots:
+        raise UserError(f"{what} knows scenes of one robot only, and this one has {', '.join(robots)}, too")
+
+
 def add(spec: mujoco.MjSpec, others: Robots, whole: bool) -> None:
     """Adds the other robots to a scene.
 
