@@ -12,8 +12,8 @@ from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.hand_over import HandOver
 from mjx_nero.envs import registry
 from mjx_nero.learn.play import evaluation
-from mjx_nero.mdp import handover, observations
-from mjx_nero.mdp.terms import ObservationTerm, Term
+from mjx_nero.mdp import handover, observations, success
+from mjx_nero.mdp.terms import MetricTerm, ObservationTerm
 from mjx_nero.sim import kinematics, scene, team
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
@@ -74,7 +74,7 @@ def test_names_and_places_are_checked(robots, text):
 def test_a_term_names_a_robot_that_is_there():
     cfg = env_cfg("nero_handover")
     with pytest.raises(UserError, match=r"to_goal.params.robot is 'tacker', and the scene's further robots are: taker"):
-        dataclasses.replace(cfg, metrics={"to_goal": Term(observations.ee_position, params={"robot": "tacker"})})
+        dataclasses.replace(cfg, metrics={"to_goal": MetricTerm(success.ee_distance, params={"robot": "tacker"})})
     with pytest.raises(UserError, match="events.reset_object_yaw.params.robot means nothing"):
         event = cfg.events["reset_object_yaw"]
         event = dataclasses.replace(event, params={**event.params, "robot": "taker"})
