@@ -1,5 +1,6 @@
 """Shared pytrees and aliases. Imports neither mujoco nor brax."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -185,11 +186,22 @@ class Picture:
 
 
 @struct.dataclass
+class RobotView:
+    """One of several robots, as terms may read it."""
+
+    ee_pos_w: Float[Array, "3"]  # grasp point between the fingers [m]
+    ee_quat_w: Float[Array, "4"]
+    root_pos_w: Float[Array, "3"]
+    joints: tuple[int, int] = struct.field(pytree_node=False)  # the first of its joints among all, and one past the last
+
+
+@struct.dataclass
 class View:
     """Everything that a term may read of one environment after the step. All poses are consistent with ``qpos``.
 
     ``_w`` is the world frame, ``_b`` the robot's root frame (where it is mounted, before the mounting turn).
-    Quaternions are wxyz.
+    Quaternions are wxyz. In a scene of several robots, joints and ``ctrl`` are those of all, one robot after another; hand and
+    root are the first one's (see ``of``).
     """
 
     joint_pos: Float[Array, " nj"]  # arm joints, then gripper joints [rad, m]
@@ -212,6 +224,7 @@ class View:
     encoder_bias: Float[Array, " nj"] | None = None
     obstacles: dict[str, ObstacleView] = struct.field(default_factory=dict)  # by name
     fixtures: dict[str, FixtureView] = struct.field(default_factory=dict)  # by name
+    robots: dict[str, RobotView] = struct.field(default_factory=dict)  # by name, of a scene of several: the first one's is ""
     # What the scene's sensors measured in this step, by name. ``touch``: the strongest contact with an obstacle, or of the robot
     # with itself [N].
     readings: dict[str, Array] = struct.field(default_factory=dict)
@@ -219,3 +232,29 @@ class View:
     # Which of ``CommandTerm.targets`` is commanded; None: there are none.
     target: Int[Array, ""] | None = None
     max_steps: int = struct.field(pytree_node=False, default=0)
+
+    def of(self, robot: str = "") -> "View":
+        """Returns the view of one robot, as if it were alone: its joints, hand, root and command. The action stays whole.
+
+        Args:
+            robot: its name; empty: the first.
+        """
+        if robot not in self.robots:
+            if robot:
+                raise UserError(f"no robot is called {robot!r}: the scene's are {', '.join(filter(None, self.robots)) or 'one'}")
+            return self
+        one = self.robots[robot]
+        own = slice(*one.joints)
+        return dataclasses.replace(
+            self,
+            joint_pos=self.joint_pos[own],
+            joint_vel=self.joint_vel[own],
+            default_joint_pos=self.default_joint_pos[own],
+            ctrl=self.ctrl[own],
+            ee_pos_w=one.ee_pos_w,
+            ee_quat_w=one.ee_quat_w,
+            root_pos_w=one.root_pos_w,
+            command=self.command + self.root_pos_w - one.root_pos_w,
+            encoder_bias=None if self.encoder_bias is None else self.encoder_bias[own],
+            robots={},
+        )

@@ -238,7 +238,8 @@ def test_registry_lists():
     controlled = {f"{robot}_{task}" for robot in ("nero", "cobotta") for task in more[:2]}
     everywhere |= {f"{robot}_{task}" for robot in ("nero", "cobotta", "piper", "so100", "so101") for task in more[2:]}
     everywhere |= {f"{robot}_reorient" for robot in ("nero", "cobotta", "piper")}
-    assert set(list_envs()) == everywhere | controlled | {"reach", "lift", "reorient", *more}
+    everywhere |= {"nero_handover", "nero_cobotta_handover"}
+    assert set(list_envs()) == everywhere | controlled | {"reach", "lift", "reorient", "handover", *more}
     assert set(list_robots()) == {"nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101"}
     assert list_presets("nero_lift")[0] == "default" and "isaac" in list_presets("nero_lift")
     assert list_presets("cobotta_follow_target") == ("default", "static")
@@ -254,8 +255,9 @@ def test_every_environment_has_a_config_that_fits(name):
         assert "drives" not in cfg.actions or cfg.controllers
         for controller, fields in cfg.controllers.items():
             config.override(control.CONTROLLERS[controller][1], fields)
-        env, arm = make(name, preset, impl="jax"), len(cfg.robot.arm.joints)
-        assert env.action_size == (env.physics_model.nu if "drives" in cfg.actions else arm + ("gripper" in cfg.actions))
+        env, robots = make(name, preset, impl="jax"), (cfg.robot, *cfg.scene.robots.values())
+        arms = sum(len(robot.arm.joints) + ("gripper" in cfg.actions) for robot in robots)
+        assert env.action_size == (env.physics_model.nu if "drives" in cfg.actions else arms)
 
 
 def test_drives_are_given_joint_by_joint():

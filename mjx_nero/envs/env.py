@@ -27,7 +27,7 @@ from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
-from mjx_nero.sim import cameras, forces, linkage, scene, touch
+from mjx_nero.sim import cameras, forces, linkage, scene, team, touch
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
@@ -82,6 +82,7 @@ class ManipulationEnv(Env):
     Attributes:
         actions: the task's action terms, as a chain that can also describe and invert itself.
         home_action: the action that keeps the robot at home [na].
+        team: all robots of the scene by name (``sim.team.of``).
 
     Raises:
         UserError: ``impl`` is unknown or unavailable on this machine, or the task is impossible.
@@ -104,10 +105,13 @@ class ManipulationEnv(Env):
             cfg.scene, model, cfg.command.targets, cfg.obstacles, lambda: self.mj_model, lambda: self._randomization.names
         )
         sees = self._pictures if cfg.scene.cameras else None
-        self._viewer = Viewer(model, cfg.robot, self._parts, self.episode_length, self.dt, cfg.command, sees)
+        self.team = team.of(cfg.robot, cfg.scene.robots)
+        self._viewer = Viewer(
+            model, cfg.robot, self._parts, self.episode_length, self.dt, cfg.command, sees, others=cfg.scene.robots
+        )
         self._coupled = linkage.couplings(model)
         self._qpos0 = np.array(model.qpos0, np.float32)
-        self._range = np.array([model.joint(j).range for j in cfg.robot.joints], np.float32).T
+        self._range = np.array([model.joint(j).range for j in team.joints(self.team)], np.float32).T
         self.actions = Chain(cfg.actions, self._drives())
         self.home_action, self.action_kinds = self.actions.home, self.actions.kinds
         self._randomization = Randomization(model, cfg.randomization)
@@ -120,7 +124,7 @@ class ManipulationEnv(Env):
 
     def _drives(self) -> dict[str, Drives]:
         groups, at = {}, 0
-        for name, cfg in (("arm", self.cfg.robot.arm), ("gripper", self.cfg.robot.gripper)):
+        for name, cfg in team.drives(self.team).items():
             own, at = slice(at, at + len(cfg.joints)), at + len(cfg.joints)
             open, close = (getattr(cfg, end, cfg.home) for end in ("open", "close"))
             home, speed, open, close, lag = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close, cfg.lead))
@@ -260,17 +264,18 @@ class ManipulationEnv(Env):
 
     def blank(self) -> Bank:
         """Returns one row of a bank: joints at home, everything else as in the scene, no goal."""
-        home = jnp.asarray(self.cfg.robot.home)
+        home = jnp.asarray(team.home(self.team))
         return Bank(Start(joint_pos=home, pull=jnp.zeros(len(home)), **self._parts.blank()), jnp.zeros((), bool))
 
     def start(self, state: State) -> Start:
         """Returns the start of an episode that begins where a state is, at rest: the fingers press as they do there."""
-        view, arm = self.view(state), len(self.cfg.robot.arm.joints)
+        view = self.view(state)
+        arms = [name not in robot.gripper.joints for robot in self.team.values() for name in robot.joints]
         return Start(
             joint_pos=view.joint_pos,
             goal_pos_w=view.root_pos_w + view.command,
             goal_quat_w=view.goal_quat_w,
-            pull=(view.ctrl - view.joint_pos).at[:arm].set(0.0),
+            pull=(view.ctrl - view.joint_pos).at[np.flatnonzero(arms)].set(0.0),
             **self._parts.start(view, state.info["carry"]),
         )
 

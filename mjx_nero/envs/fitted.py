@@ -13,6 +13,7 @@ from mjx_nero.envs.task import SHOWN, EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import (
     clutter,
     follow_target,
+    handover,
     hang_ring,
     insert_peg,
     lift,
@@ -183,4 +184,5 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
+    "handover": (None, handover.presets()),
 }

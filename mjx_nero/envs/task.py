@@ -9,7 +9,17 @@ from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
 from mjx_nero.envs import old_names
 from mjx_nero.mdp import actions, curriculum, fixtures, observations, success, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import (
+    ROBOT,
+    CommandTerm,
+    DoneTerm,
+    MetricTerm,
+    ObservationGroup,
+    ObservationTerm,
+    RewardTerm,
+    Term,
+    privileged,
+)
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.types import TARGET, UserError
@@ -231,6 +241,7 @@ class EnvCfg:
             raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
         for name, term in self.terms().items():
             self._check_objects(name, term)
+            self._check_robot(name, term)
 
     def _check_objects(self, name: str, term: Term) -> None:
         """Checks that the objects of the term called ``name`` exist."""
@@ -245,6 +256,16 @@ class EnvCfg:
         heights = term.params.get("minimal_height")
         if isinstance(heights, tuple) and len(heights) != len(targets):
             raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(targets)} targets")
+
+    def _check_robot(self, name: str, term: Term) -> None:
+        """Checks that the robot that the term called ``name`` sees exists, and that it reads a view."""
+        if (robot := term.params.get(ROBOT)) is None:
+            return
+        if robot and robot not in self.scene.robots:
+            there = ", ".join(self.scene.robots) or "none but the first"
+            raise UserError(f"{name}.params.robot is {robot!r}, and the scene's further robots are: {there}")
+        if not name.startswith(tuple(f"{group}." for group in self.view_terms())):
+            raise UserError(f"{name}.params.robot means nothing: only terms that read a view see a robot")
 
     def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Translates fields of version 0.5.0 to their present names: see ``envs.old_names``."""
@@ -291,7 +312,14 @@ def for_controllers(cfg: EnvCfg) -> EnvCfg:
     """
     if any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values()):
         return cfg
-    return dataclasses.replace(cfg, actions=drive_targets(), robot=dataclasses.replace(cfg.robot, gravity_compensation=True))
+    return compensated(dataclasses.replace(cfg, actions=drive_targets()))
+
+
+def compensated(cfg: EnvCfg) -> EnvCfg:
+    """Returns the task with robots whose drives carry their weight."""
+    robot, *others = (dataclasses.replace(each, gravity_compensation=True) for each in (cfg.robot, *cfg.scene.robots.values()))
+    scene = dataclasses.replace(cfg.scene, robots=dict(zip(cfg.scene.robots, others, strict=True)))
+    return dataclasses.replace(cfg, robot=robot, scene=scene)
 
 
 Presets = Mapping[str, Callable[[RobotCfg], EnvCfg]]  # by name, default first

@@ -18,6 +18,7 @@ from mjx_nero.interop.graph import Graph
 from mjx_nero.learn import learner
 from mjx_nero.learn.policy import Policy
 from mjx_nero.learn.runs.folder import versions
+from mjx_nero.sim import team
 from mjx_nero.types import UserError
 
 OPSET = 17  # of 2021: what embedded runtimes know, too
@@ -93,6 +94,7 @@ def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
     """Collects what a runtime needs beside the graph; docs/guides/deploy_onnx.md explains every field."""
+    team.alone(env.cfg.scene.robots, "an exported policy")
     robot, own = env.cfg.robot, _own(policy.meta)
     return {
         "env": policy.meta["env"],

@@ -55,7 +55,7 @@ class Drives:
         return self.speed * np.float32(self.dt)
 
 
-Groups = Mapping[str, Drives]  # the groups ``arm`` and ``gripper``
+Groups = Mapping[str, Drives]  # ``arm`` and ``gripper``, then those of further robots: ``taker/arm`` and ``taker/gripper``
 
 
 @struct.dataclass
@@ -134,10 +134,12 @@ class Joints(Plain):
 class Gripper(Plain):
     """Base of terms that read one entry for all gripper joints, if the robot has a gripper."""
 
+    group: str = dataclasses.field(default="gripper", kw_only=True)
+
     @property
     def drives(self) -> Drives:
         """The gripper's drives."""
-        return self.groups["gripper"]
+        return self.groups[self.group]
 
     def _described(self, kind: str) -> Description:
         own = self.drives
@@ -291,7 +293,7 @@ class BinaryGripper(Gripper):
             return memory, act
         closed = own[0] < (jnp.where(memory, self.hysteresis, -self.hysteresis) if self.hysteresis else 0.0)
         targets = jnp.clip(jnp.where(closed, drives.close, drives.open), drives.low, drives.high)
-        return (closed if self.hysteresis else memory), act.to("gripper", targets)
+        return (closed if self.hysteresis else memory), act.to(self.group, targets)
 
     def describe(self) -> Description:
         """Describes ``close`` below -hysteresis, ``open`` at +hysteresis and above, and the last state in between."""
@@ -301,7 +303,7 @@ class BinaryGripper(Gripper):
         """Picks the end that the targets move towards; if they stay, the nearer one."""
         if not len(self.home):
             return super().invert(act, late)
-        to, at = (opening(x["gripper"], self.drives.open, self.drives.close) for x in (act.targets, act.ctrl))
+        to, at = (opening(x[self.group], self.drives.open, self.drives.close) for x in (act.targets, act.ctrl))
         return jnp.where(jnp.where(jnp.abs(to - at) > _STAYS, to - at, to) < 0, -1.0, 1.0)[..., None]
 
 
@@ -327,7 +329,7 @@ class ContinuousGripper(Gripper):
         if not len(own):
             return memory, act
         share = jnp.clip(0.5 + 0.5 * own[0], 0.0, 1.0)
-        return memory, act.to("gripper", jnp.clip(drives.close + share * (drives.open - drives.close), drives.low, drives.high))
+        return memory, act.to(self.group, jnp.clip(drives.close + share * (drives.open - drives.close), drives.low, drives.high))
 
     def describe(self) -> Description:
         """Describes ``close`` at -1 to ``open`` at 1."""
@@ -337,7 +339,7 @@ class ContinuousGripper(Gripper):
         """Finds the opening that comes nearest."""
         if not len(self.home):
             return super().invert(act, late)
-        return opening(act.targets["gripper"], self.drives.open, self.drives.close)[..., None]
+        return opening(act.targets[self.group], self.drives.open, self.drives.close)[..., None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -470,10 +472,13 @@ class Chain:
         kinds: class names of the terms that read the action.
 
     Raises:
-        UserError: no term reads the action.
+        UserError: no term reads the action, or a term names a group of drives that does not exist.
     """
 
     def __init__(self, terms: Mapping[str, Any], groups: Groups):
+        for name, term in terms.items():
+            if (group := term.params.get("group")) and group not in groups:
+                raise UserError(f"actions.{name}.params.group is {group!r}, and the drives' groups are: {', '.join(groups)}")
         self.terms: dict[str, ActionTerm] = {name: term.func(groups, **term.params) for name, term in terms.items()}
         self._groups, sizes = groups, [len(term.home) for term in self.terms.values()]
         self._splits = np.cumsum(sizes)[:-1]

@@ -22,10 +22,15 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History, delay
 from mjx_nero.types import LEVEL, Key, UserError, View
 
+ROBOT = "robot"  # a parameter that any term may have besides its function's: the robot whose arm and hand it sees
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
     """A function and its keyword parameters; parameters with defaults may be omitted.
+
+    In a scene of several robots, the parameter ``robot`` of a term that reads a view names the one that it sees
+    (``View.of``). Without it, the hand is the first robot's, and the joints are all robots'.
 
     Raises:
         UserError: a parameter is missing or unknown; the message lists the valid names.
@@ -37,7 +42,7 @@ class Term:
     def __post_init__(self):
         parameters = [p for p in inspect.signature(self.func).parameters.values() if p.kind is p.KEYWORD_ONLY]
         defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
-        wanted = [p.name for p in parameters]
+        wanted = [p.name for p in parameters] + [ROBOT] * (ROBOT in self.params)
         params = {**defaults, **self.params}
         if set(wanted) != set(params):
             given, valid = ", ".join(self.params) or "none", ", ".join(wanted) or "none"
@@ -58,11 +63,19 @@ class Term:
     @functools.cached_property
     def made(self) -> Any:
         """The object of a term that remembers."""
-        return self.func(**self.params)
+        return self.func(**self._own)
+
+    @property
+    def _own(self) -> dict[str, Any]:
+        return {name: value for name, value in self.params.items() if name != ROBOT}
+
+    def seen(self, view: View) -> View:
+        """What the term sees of a view: all of it, or what concerns its robot."""
+        return view.of(self.params[ROBOT]) if ROBOT in self.params else view
 
     def __call__(self, *args: Any) -> Any:
         """Calls the function with its parameters."""
-        return self.func(*args, **self.params)
+        return self.func(*args, **self._own)
 
     def hints(self) -> dict[str, Any]:
         """The annotations of the parameters, for ``bounds.check``."""
@@ -183,6 +196,7 @@ class Recall:
 
     def __call__(self, name: str, term: Term, view: View) -> Any:
         """Computes the term's value."""
+        view = term.seen(view)
         return self.through(name, term.made, view) if term.remembers else term(view)
 
     def through(self, name: str, step: Any, value: Any) -> Any:
@@ -200,12 +214,12 @@ def init(groups: Mapping[str, Mapping[str, Term]], key: Key, view: View) -> dict
     memory: dict[str, Any] = {}
     for group, terms in groups.items():
         for name, term in terms.items():
-            at = f"{group}.{name}"
+            at, seen = f"{group}.{name}", term.seen(view)
             if term.remembers:
-                memory[at] = term.made.init(_key(key, memory), view)
+                memory[at] = term.made.init(_key(key, memory), seen)
             if isinstance(term, ObservationTerm):
                 for line in term.lines:
-                    value = jnp.asarray(term.made.step(memory[at], view)[1] if term.remembers else term(view))
+                    value = jnp.asarray(term.made.step(memory[at], seen)[1] if term.remembers else term(seen))
                     memory[f"{at}.{type(line).__name__.lower()}"] = line.init(_key(key, memory), value)
     return memory
 

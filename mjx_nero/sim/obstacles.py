@@ -36,12 +36,12 @@ class ObstacleCfg:
     rgba: tuple[float, float, float, float] = (0.32, 0.38, 0.5, 1.0)
 
 
-def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, ObstacleCfg], objects: Iterable[str]) -> None:
-    """Adds obstacles to a scene, lets robot and objects collide with them, and adds sensors for their contacts.
+def add(spec: mujoco.MjSpec, bases: Iterable[str], obstacles: Mapping[str, ObstacleCfg], objects: Iterable[str]) -> None:
+    """Adds obstacles to a scene, lets robots and objects collide with them, and adds sensors for their contacts.
 
     Args:
-        spec: robot and objects.
-        base: the robot's base link.
+        spec: robots and objects.
+        bases: the robots' base links.
         objects: names of objects; body and geom share a name.
 
     Raises:
@@ -49,7 +49,8 @@ def add(spec: mujoco.MjSpec, base: str, obstacles: Mapping[str, ObstacleCfg], ob
     """
     if not obstacles:
         return
-    for geom in (*touch.collision_shapes(spec, base), *(spec.geom(name) for name in objects)):
+    shapes = [shape for base in bases for shape in touch.collision_shapes(spec, base)]
+    for geom in (*shapes, *(spec.geom(name) for name in objects)):
         if geom.type not in touch.MEETS_BOX:
             kind = mujoco.mjtGeom(geom.type).name.removeprefix("mjGEOM_").lower()
             raise UserError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, OneOf, Positive
-from mjx_nero.sim import drawn, fixtures, forces, obstacles, robot_file, touch
+from mjx_nero.sim import drawn, fixtures, forces, obstacles, team, touch
 from mjx_nero.sim.cameras import cfg as cameras
 from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
@@ -37,9 +37,11 @@ class SceneCfg:
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
         fixtures: things with joints of their own by name, such as a cabinet (``sim.fixtures``).
-        self_collision: the robot's links collide with one another; ``sim.touch`` measures those forces, too.
-        hand: ``sim.touch`` measures the force with which the robot presses objects.
-        wrist, fingers: ``sim.forces`` measures force and torque between arm and hand, and the forces at the pads.
+        robots: further robots by name, beside the task's own (``sim.team``).
+        self_collision: a robot's links collide with one another; ``sim.touch`` measures those forces, too.
+        hand: ``sim.touch`` measures the force with which robots press objects.
+        wrist, fingers: ``sim.forces`` measures force and torque between arm and hand, and the forces at the pads, of the task's
+            own robot.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
@@ -60,6 +62,7 @@ class SceneCfg:
     objects: Mapping[str, ObjectCfg] = dataclasses.field(default_factory=lambda: {"cube": ObjectCfg()})
     obstacles: Mapping[str, ObstacleCfg] = dataclasses.field(default_factory=dict)
     fixtures: Mapping[str, FixtureCfg] = dataclasses.field(default_factory=dict)
+    robots: Mapping[str, RobotCfg] = dataclasses.field(default_factory=dict)
     self_collision: bool = False
     hand: bool = False
     wrist: bool = False
@@ -117,7 +120,9 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         UserError: a thing's shape, size or name is not possible.
     """
     whole = bool(scene.obstacles) or scene.self_collision
-    spec = _robot_spec(robot, whole)
+    team.check(robot, scene.robots, (*scene.objects, *scene.obstacles, *scene.fixtures))
+    spec, every = team.mounted(robot, whole), team.of(robot, scene.robots)
+    team.add(spec, scene.robots, whole)
     spec.modelname = f"{robot.name}_scene"
     if not visuals:
         spec.discard_visual()  # before things bring meshes that no geom has yet (``objects.bank``), which it would drop, too
@@ -133,16 +138,18 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     world = spec.worldbody
     if scene.table:
         world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=free.TABLE, conaffinity=0, group=3)
-    for drive in (robot.arm, robot.gripper):
-        _add_drives(spec, drive)
+    for each in every.values():
+        for drive in (each.arm, each.gripper):
+            _add_drives(spec, drive)
     free.add(spec, scene.objects, visuals)
     goal = world.add_body(name="goal", mocap=True, pos=[0.325, 0, 0.275])
     fixtures.add(spec, scene.fixtures, visuals)
-    obstacles.add(spec, robot.base_link, scene.obstacles, scene.objects)
-    if scene.self_collision:
-        touch.add_pairs(spec, robot)
-    if scene.hand:
-        touch.add_hand(spec, robot.base_link, tuple(scene.objects))
+    obstacles.add(spec, [each.base_link for each in every.values()], scene.obstacles, scene.objects)
+    for name, each in every.items():
+        if scene.self_collision:
+            touch.add_pairs(spec, scene.robots.get(name, robot), name)
+        if scene.hand:
+            touch.add_hand(spec, each.base_link, tuple(scene.objects))
     forces.add(spec, robot, scene.wrist, scene.fingers)
     if visuals:
         drawn.add(spec, scene, goal, robot)
@@ -150,7 +157,8 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         drawn.add_props(spec, scene, robot)
         textures.add(spec, scene.photographs, scene.patterns)
     # Fixtures stand elsewhere in each world, so what carries them has to stay a body.
-    spec.compiler.fusestatic = fuse and spec.site(robot.ee_site) is not None and not scene.fixtures
+    ends = all(spec.site(each.ee_site) is not None for each in every.values())
+    spec.compiler.fusestatic = fuse and ends and not scene.fixtures
     return obstacles.unbounded(spec.compile())
 
 
@@ -205,21 +213,7 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
 
 def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
     """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that meet obstacles only."""
-    return _robot_spec(robot, whole).compile()
-
-
-def _robot_spec(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
-    """Reads and mounts the robot. ``whole`` keeps the shapes that meet obstacles only."""
-    spec = robot_file.model(robot)
-    for geom in [] if whole else spec.geoms:
-        if geom.conaffinity == touch.OBSTACLE:
-            spec.delete(geom)
-    base = spec.body(robot.base_link)
-    base.pos, base.quat = robot.base_pos, robot.base_quat
-    if robot.gravity_compensation:
-        for body in [base, *base.find_all(mujoco.mjtObj.mjOBJ_BODY)]:
-            body.gravcomp = 1.0
-    return spec
+    return team.mounted(robot, whole).compile()
 
 
 def _add_drives(spec: mujoco.MjSpec, drive) -> None:

@@ -32,10 +32,17 @@ Pair = tuple[int, int]  # geoms
 Depths = dict[Pair, float]
 
 
-def add_pairs(spec: mujoco.MjSpec, robot: RobotCfg) -> None:
-    """Lets shapes of the robot collide with one another (``self_pairs``), and adds sensors for their contacts."""
-    collision_shapes(spec, robot.base_link)  # names them
-    for first, second in self_pairs(robot):
+def add_pairs(spec: mujoco.MjSpec, robot: RobotCfg, name: str = "") -> None:
+    """Lets shapes of the robot collide with one another (``self_pairs``), and adds sensors for their contacts.
+
+    Args:
+        robot: as in its own file.
+        name: the robot's in the scene (``sim.team``).
+    """
+    before = f"{name}/" if name else ""
+    collision_shapes(spec, before + robot.base_link)  # names them
+    for pair in self_pairs(robot):
+        first, second = (before + shape for shape in pair)
         spec.add_pair(geomname1=first, geomname2=second)
         add_sensor(spec, first, second)
 

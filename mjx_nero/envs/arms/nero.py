@@ -4,8 +4,9 @@ import dataclasses
 import math
 
 from mjx_nero.envs import fitted
+from mjx_nero.envs.arms import cobotta_pro_900
 from mjx_nero.envs.task import Envs
-from mjx_nero.envs.tasks import follow_target, lift, lift_obstacles, pick_place, reach, reach_obstacles
+from mjx_nero.envs.tasks import follow_target, handover, lift, lift_obstacles, pick_place, reach, reach_obstacles
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, cube
 
@@ -95,3 +96,7 @@ ENVS: Envs = fitted.envs(
     reach=REACH_NERO,
     reach_obstacles=REACH_NERO,
 )
+ENVS |= {
+    "nero_handover": (NERO, handover.presets()),
+    "nero_cobotta_handover": (NERO, handover.taken_by(cobotta_pro_900.ROBOT)),
+}

@@ -36,6 +36,15 @@ def lets_go() -> dict[str, Term]:
     return {**others, "anti_windup": Term(actions.AntiWindup), "speed_limit": limit}
 
 
+def working(robot: RobotCfg) -> RobotCfg:
+    """The robot as its own controller runs it: drives that carry its weight, and fingers as quick as real ones."""
+    fingers = robot.gripper
+    slow = (min(v, abs(a - b) / CLOSING) for v, a, b in zip(fingers.speed, fingers.open, fingers.close, strict=True))
+    return dataclasses.replace(
+        robot, gravity_compensation=True, gripper=dataclasses.replace(fingers, speed=tuple(round(v, 4) for v in slow))
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Tower:
     """A tower and the robot that builds it.
@@ -80,12 +89,8 @@ class Tower:
 
     @property
     def builder(self) -> RobotCfg:
-        """The robot as its own controller runs it: drives that carry its weight, and fingers as quick as real ones."""
-        fingers = self.robot.gripper
-        slow = (min(v, abs(a - b) / CLOSING) for v, a, b in zip(fingers.speed, fingers.open, fingers.close, strict=True))
-        return dataclasses.replace(
-            self.robot, gravity_compensation=True, gripper=dataclasses.replace(fingers, speed=tuple(round(v, 4) for v in slow))
-        )
+        """The robot as its own controller runs it (``working``)."""
+        return working(self.robot)
 
     @functools.cached_property
     def slow(self) -> float:

@@ -58,7 +58,7 @@ def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[s
         raise UserError(f"{env_name} has no controller, only policies")
     if name not in able:
         raise UserError(f"controller {name!r} cannot do {env_name}: choose one of {', '.join(able)}")
-    return control.make(name, env.cfg.robot, env.dt, {**able[name], **(fields or {})})
+    return control.make(name, env.cfg.robot, env.dt, {**able[name], **(fields or {})}, env.cfg.scene.robots)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from mjx_nero import config, control
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import CurriculumCfg, EnvCfg
+from mjx_nero.envs.task import CurriculumCfg, EnvCfg, compensated
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import ROWS, Learner
 from mjx_nero.types import Bank, Shown
@@ -119,8 +119,7 @@ def playground(cfg: EnvCfg) -> EnvCfg:
     Its states are valid states of the task itself.
     """
     plain: dict[str, Any] = {"randomization": {}, "sensors": {}, "pushes": {}, "curriculum": CurriculumCfg()}
-    robot = dataclasses.replace(cfg.robot, gravity_compensation=True)
-    return dataclasses.replace(cfg.uncorrupted(), robot=robot, **plain)
+    return dataclasses.replace(compensated(cfg).uncorrupted(), **plain)
 
 
 def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown]]:
@@ -135,7 +134,7 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
     count = min(most, EPISODES)
     env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
     quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
-    expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick})
+    expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
     some = jax.random.split(jax.random.PRNGKey(0), count)
     run = jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile()
 

@@ -23,6 +23,7 @@ from mjx_nero.learn import policy
 from mjx_nero.learn.play import demonstrations, evaluation, rollout
 from mjx_nero.learn.play.demonstrations import Player
 from mjx_nero.learn.play.pictures import Cameras
+from mjx_nero.sim import team
 from mjx_nero.sim.fingerprint import fingerprint
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos.cfg import DemosCfg
@@ -127,7 +128,12 @@ def sentence(env_name: str) -> str:
 
 
 def units_of(env: ManipulationEnv, kind: str) -> units.Units:
-    """Units of an environment's joints; ``kind``: one of ``units.KINDS``, or ``auto``."""
+    """Units of an environment's joints; ``kind``: one of ``units.KINDS``, or ``auto``.
+
+    Raises:
+        UserError: the scene has several robots.
+    """
+    team.alone(env.cfg.scene.robots, "a data set of demonstrations")
     robot, model = env.cfg.robot, env.physics_model
     slides = [bool(model.joint(joint).type == 2) for joint in robot.joints]  # mjJNT_SLIDE
     if kind == "auto":

@@ -33,7 +33,7 @@ def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], pre
             able["rmpflow"] = {}
     for name, fields in able.items():
         found[name] = lambda name=name, fields=fields: of_controller(  # type: ignore[misc]
-            env, control.make(name, env.cfg.robot, env.dt, fields)
+            env, control.make(name, env.cfg.robot, env.dt, fields, env.cfg.scene.robots)
         )
     found[SLIDERS] = lambda: of_targets(env)
     found[hand.NAME] = lambda: hand.agent(env)

@@ -16,6 +16,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn import policy
 from mjx_nero.learn.runs.folder import CONFIG
+from mjx_nero.sim import team
 from mjx_nero.tools import cli
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError
@@ -181,7 +182,7 @@ def open_view(
     if leader and leaders.same_joints(env):
         makers[leaders.NAME] = lambda: leaders.agent(env)
     chosen = _chosen(agent, list(makers), env_name)
-    home = jnp.array(env.cfg.robot.home) if chosen == agents.SLIDERS else None
+    home = jnp.array(team.home(env.team)) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
     if demos and episode is not None:
         sim.replay(tape.of_dataset(demos, episode, sim.frame))

@@ -31,15 +31,19 @@ _IK = IkCfg(orientation_weight=0.03, restarts=0)
 
 
 def agent(env: ManipulationEnv) -> rollout.Agent:
-    """Moves the hand to its parameters: ``pos`` [m], ``quat`` (wxyz), and ``open``, from 0 to 1, at the drives' speed."""
+    """Moves the hand to its parameters: ``pos`` [m], ``quat`` (wxyz), and ``open``, from 0 to 1, at the drives' speed.
+
+    Of several robots, the first moves and the others stay.
+    """
     robot, ik = env.cfg.robot, InverseKinematics(env.cfg.robot, cfg=_IK)
-    n, step = len(robot.arm.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
+    n, own, step = len(robot.arm.joints), len(robot.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
     opened, closed = (np.array(x, np.float32) for x in (robot.gripper.open, robot.gripper.close))
 
     def one(asked, point):
         arm = ik.local(asked["pos"], asked["quat"], point[:n]).q
         fingers = closed + asked["open"] * (opened - closed)
-        return rate_limit(jnp.concatenate([arm, fingers]), point, step=jnp.asarray(step))
+        moved = rate_limit(jnp.concatenate([arm, fingers]), point[:own], step=jnp.asarray(step))
+        return jnp.concatenate([moved, point[own:]])
 
     def act(asked, points, state, key):  # of their own, as targets may lead joints by much
         points = jax.vmap(one, (None, 0))(asked, points)

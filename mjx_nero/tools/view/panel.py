@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_nero.sim import team
 from mjx_nero.tools.view.agents import SLIDERS, Make
 from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import CURVE, Frame, Session
@@ -90,9 +91,9 @@ class Panel:
         self._run.label = "Pause" if self._session.running else "Run"
 
     def _add_sliders(self) -> list:
-        model, robot = self._session.env.physics_model, self._session.env.cfg.robot
+        model, robots = self._session.env.physics_model, self._session.env.team
         sliders = []
-        for name, home in zip(robot.joints, robot.home, strict=True):
+        for name, home in zip(team.joints(robots), team.home(robots), strict=True):
             low, high = (float(x) for x in model.joint(name).range)
             sliders.append(self._gui.add_slider(name, min=low, max=high, step=(high - low) / 1000, initial_value=home))
             sliders[-1].on_update(lambda _: self._orders.give("slid", self._slid))
