@@ -20,7 +20,7 @@ from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import policy
 from mjx_nero.learn.ppo import networks
 from mjx_nero.mdp.terms import Term
-from mjx_nero.sim import grasp, linkage, render, scene
+from mjx_nero.sim import grasp, linkage, render, scene, team
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
 from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -160,10 +160,10 @@ def inspect(name: str, preset: str | None = None, robot: str | None = None) -> R
 
 
 def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
-    """A robot in a scene."""
-    model = scene.build(robot, where, sim, visuals=False)
+    """A robot in a scene, perhaps with others."""
+    model, robots = scene.build(robot, where, sim, visuals=False), team.of(robot, where.robots)
     data, gripper = mujoco.MjData(model), robot.gripper
-    for joint, position in zip(robot.joints, robot.home, strict=True):
+    for joint, position in zip(team.joints(robots), team.home(robots), strict=True):
         data.joint(joint).qpos[0] = position
     mujoco.mj_forward(model, data)
     others = {*where.objects, *where.fixtures, "goal", "obstacles", "fixtures"}
@@ -172,8 +172,8 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
     if formulas:
         gaps = (float(formulas[0](jnp.array(gripper.open))), float(formulas[0](jnp.array(gripper.close))))
     return Report(
-        robot=robot.name,
-        joints=tuple(_joints(model, robot, where)),
+        robot=", ".join([robot.name, *(f"{other.name} as {name}" for name, other in where.robots.items())]),
+        joints=tuple(_joints(model, robots, where)),
         open=gripper.open,
         close=gripper.close,
         gaps=gaps,
@@ -230,11 +230,11 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
         return renderer.render(qpos, render.unmarked())
 
 
-def _joints(model: mujoco.MjModel, robot: RobotCfg, where: SceneCfg) -> Iterator[Joint]:
+def _joints(model: mujoco.MjModel, robots: team.Robots, where: SceneCfg) -> Iterator[Joint]:
     joint_at = {int(at): j for j, at in enumerate(model.jnt_qposadr)}
     leaders = {joint_at[c.follower]: joint_at[c.leader] for c in linkage.couplings(model) if c.leader != c.follower}
     driven: dict[str, tuple] = {}
-    for group, drive in (("arm", robot.arm), ("gripper", robot.gripper)):
+    for group, drive in team.drives(robots).items():
         rows = zip(drive.home, drive.stiffness, drive.damping, drive.effort, drive.speed, strict=True)
         driven |= {name: (group, *row) for name, row in zip(drive.joints, rows, strict=True)}
     ids = [model.joint(name).id for name in driven]
