@@ -1,6 +1,6 @@
 """Terms of a long object that goes from the first robot's hand to another's. They share ``Hands``.
 
-The object's x axis leads from the giver's end to the taker's. Rewards of earlier stages stay once the taker alone holds it.
+The object's x axis leads from the giver's end to the taker's. Rewards of earlier stages stay once the taker holds it.
 """
 
 import dataclasses
@@ -92,6 +92,10 @@ class Hands:
         """True if the object is in the taker's hand, above the table, and the giver's hand has left it."""
         return self.near(view, True) & self.lifted(view) & (self.gap(view, False) > self.clearance)
 
+    def passed(self, view: View) -> Bool[Array, ""]:
+        """True if the taker holds the object, alone or not. Then a hand that leaves forfeits nothing."""
+        return self.takes(view) | self.alone(view)
+
 
 def way(view: View, *, hands: Hands, taker: bool) -> Float[Array, "3"]:
     """Vector from a hand to its place on the object [m]."""
@@ -119,32 +123,32 @@ def to_meeting(view: View, *, hands: Hands, meet: tuple[float, float, float]) ->
 
 
 def reached(view: View, *, hands: Hands, std: Positive) -> Scalar:
-    """1 - tanh(d / std), where d is the distance of the giver's hand from its place; 1 once the taker alone holds the object."""
+    """1 - tanh(d / std), where d is the distance of the giver's hand from its place; 1 once the taker holds the object."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(hands.way(view, False)) / std)
-    return jnp.where(hands.alone(view), 1.0, near)
+    return jnp.where(hands.passed(view), 1.0, near)
 
 
 def held(view: View, *, hands: Hands) -> Scalar:
-    """1 while the giver or the taker alone holds the object."""
-    return (hands.gives(view) | hands.alone(view)).astype(jnp.float32)
+    """1 while somebody holds the object."""
+    return (hands.gives(view) | hands.passed(view)).astype(jnp.float32)
 
 
 def presented(view: View, *, hands: Hands, meet: tuple[float, float, float], std: Positive) -> Scalar:
-    """1 - tanh(d / std) while the giver holds the object, where d is its way to the meeting; 1 once the taker alone does."""
+    """1 - tanh(d / std) while the giver holds the object, where d is its way to the meeting; 1 once the taker does."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(to_meeting(view, hands=hands, meet=meet)) / std)
-    return jnp.where(hands.alone(view), 1.0, hands.gives(view) * near)
+    return jnp.where(hands.passed(view), 1.0, hands.gives(view) * near)
 
 
 def pointed(view: View, *, hands: Hands, std: Positive) -> Scalar:
     """1 - tanh(angle / std) while the giver holds the object, where angle is from its axis to x [rad]; 1 as in ``presented``."""
     angle = jnp.arccos(jnp.clip(hands.axis(view)[0], -0.9999, 0.9999))
-    return jnp.where(hands.alone(view), 1.0, hands.gives(view) * (1.0 - jnp.tanh(angle / std)))
+    return jnp.where(hands.passed(view), 1.0, hands.gives(view) * (1.0 - jnp.tanh(angle / std)))
 
 
 def met(view: View, *, hands: Hands, std: Positive) -> Scalar:
     """1 - tanh(d / std) while somebody holds the object, where d is the distance of the taker's hand from its place."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(hands.way(view, True)) / std)
-    return (hands.gives(view) | hands.alone(view)) * near
+    return (hands.gives(view) | hands.passed(view)) * near
 
 
 def taken(view: View, *, hands: Hands) -> Scalar:

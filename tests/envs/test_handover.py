@@ -158,6 +158,11 @@ def test_rewards_of_earlier_stages_stay(placed):
     assert float(handover.met(both, hands=hands, std=0.05)) == pytest.approx(1.0)
     off = place(AT, (0.09, 0.0, 0.05))
     assert float(handover.met(off, hands=hands, std=0.05)) == pytest.approx(1 - np.tanh(1.0), abs=1e-5)
+    between = place((-0.09, 0.0, 0.045), end)  # the giver's hand has let go, and has not left
+    assert not hands.gives(between) and not hands.alone(between)
+    closed = between.ctrl.at[-2:].set(jnp.array(hands.taking[1]))
+    between = between.replace(ctrl=closed)
+    assert hands.takes(between) and float(handover.presented(between, hands=hands, meet=meet, std=0.1)) == 1.0
     for value in (handover.reached(alone, hands=hands, std=0.1), handover.held(alone, hands=hands)):
         assert float(value) == 1.0
     assert float(handover.brought(both, hands=hands, std=0.1)) == 0.0
