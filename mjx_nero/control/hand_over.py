@@ -84,7 +84,7 @@ class HandOverMemory:
 
 
 class _Arm:
-    """What the script knows of one robot. ``faces``: the turn of its mount about the vertical [rad]."""
+    """One robot, as the script knows it. ``faces``: the turn of its mount about the vertical [rad]."""
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: HandOverCfg, place: int):
         self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
@@ -105,7 +105,7 @@ class _Arm:
         return math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw + self.faces), jnp.asarray(self.down))
 
     def place(self, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]) -> Float[Array, "3"]:
-        """Where the grasp point has to be for an object whose middle is at ``pos``, along ``yaw``, and rises by ``pitch``."""
+        """Computes where the grasp point has to be for an object whose middle is at ``pos``, along ``yaw``, and rises by ``pitch``."""
         along = jnp.stack([jnp.cos(yaw) * jnp.cos(pitch), jnp.sin(yaw) * jnp.cos(pitch), jnp.sin(pitch)])
         end = pos + self.side * along
         height = jnp.maximum(end[2], self.lowest) + self.beyond

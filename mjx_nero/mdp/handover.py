@@ -21,7 +21,7 @@ Fingers = tuple[float, ...]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Hands:
-    """Who holds the object, and when.
+    """Two hands and an object: who holds it, and when.
 
     Attributes:
         object: the object's name.
@@ -49,7 +49,7 @@ class Hands:
         return math.rotate(view.objects[self.object].quat_w, jnp.array([1.0, 0.0, 0.0]))
 
     def place(self, view: View, taker: bool) -> Float[Array, "3"]:
-        """Where the hand belongs on the object [m]."""
+        """Place of a hand on the object [m]."""
         return view.objects[self.object].pos_w + (self.along if taker else -self.along) * self.axis(view)
 
     def hand(self, view: View, taker: bool) -> View:
@@ -79,7 +79,7 @@ class Hands:
         return self.near(view, False) & self.lifted(view)
 
     def told(self, view: View, taker: bool) -> Scalar:
-        """How far a hand's fingers are told to be open: 0 closed, 1 open."""
+        """Opening that a hand's fingers are told: 0 closed, 1 open."""
         open, close = (np.array(ends, np.float32) for ends in (self.taking if taker else self.giving))
         targets = self.hand(view, taker).ctrl[-len(open) :]
         return jnp.clip(0.5 + 0.5 * opening(targets, open, close), 0.0, 1.0)
@@ -108,7 +108,7 @@ def axis(view: View, *, hands: Hands) -> Float[Array, "3"]:
 
 
 def fingers(view: View, *, hands: Hands) -> Float[Array, "2"]:
-    """How far the fingers of giver and taker are told to be open: 0 closed, 1 open."""
+    """Opening that the fingers of giver and taker are told: 0 closed, 1 open."""
     return jnp.stack([hands.told(view, False), hands.told(view, True)])
 
 
@@ -157,12 +157,12 @@ def taken(view: View, *, hands: Hands) -> Scalar:
 
 
 def released(view: View, *, hands: Hands) -> Scalar:
-    """How far the giver's fingers are told to open while the taker holds the object; 1 once that alone does."""
+    """Opening that the giver's fingers are told, from 0 to 1, while the taker holds the object; 1 once that alone does."""
     return jnp.where(hands.alone(view), 1.0, hands.takes(view) * hands.told(view, False))
 
 
 def left(view: View, *, hands: Hands) -> Scalar:
-    """How far the giver's hand has left the object, from 0 to 1, while the taker holds it."""
+    """Distance of the giver's hand from the object, as a share of ``clearance``, at most 1, while the taker holds it."""
     return hands.takes(view) * jnp.minimum(hands.gap(view, False) / hands.clearance, 1.0)
 
 

@@ -70,7 +70,7 @@ class Term:
         return {name: value for name, value in self.params.items() if name != ROBOT}
 
     def seen(self, view: View) -> View:
-        """What the term sees of a view: all of it, or what concerns its robot."""
+        """Returns the part of a view that the term sees: all of it, or what concerns its robot."""
         return view.of(self.params[ROBOT]) if ROBOT in self.params else view
 
     def __call__(self, *args: Any) -> Any:

@@ -47,7 +47,7 @@ JOINTS = 6  # of an arm that can point its hand down anywhere around it
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """What the task takes from one robot.
+    """One robot, as the task sees it.
 
     Attributes:
         robot: mounted, its home turned to its own side.
@@ -107,7 +107,7 @@ def _side(robot: RobotCfg, edge: float, faces: float, aside: float) -> Side:
 
 
 def _turned(robot: RobotCfg, ahead: float, faces: float, aside: float) -> float:
-    """How far the first joint turns from straight ahead to its own side [rad]."""
+    """Turn of the first joint from straight ahead to its own side [rad]."""
     to = regions.turn_to(robot, math.cos(faces + aside), math.sin(faces + aside)) - ahead
     if abs(abs(to) - SIDE) > 0.01:
         raise UserError(f"{robot.name}: its first joint does not turn it by 90 degrees about the vertical: a handover needs that")
@@ -124,7 +124,7 @@ class Pair:
 
     @property
     def height(self) -> float:
-        """Of the bar where it changes hands, from the table [m]."""
+        """Height of the bar where it changes hands, from the table [m]."""
         return round(min(side.low + 0.75 * (side.high - side.low) for side in (self.giver, self.taker)), 4)
 
     @property
@@ -167,7 +167,7 @@ class Pair:
 
     @property
     def hands(self) -> Hands:
-        """Who holds the bar."""
+        """The two hands and the bar."""
         giving, taking = ((side.robot.gripper.open, side.robot.gripper.close) for side in (self.giver, self.taker))
         return Hands(
             object=BAR,
@@ -182,7 +182,7 @@ class Pair:
         )
 
     def ways(self, side: Side) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Where the bar's middle lies beside a robot, from its root: across, and out from its base [m]."""
+        """Region of the bar's middle beside a robot, from its root: across, and out from its base [m]."""
         return (-side.across, side.across), (round(side.near + ALONG, 4), round(side.far + ALONG, 4))
 
     def script(self) -> dict[str, Any]:
