@@ -105,7 +105,7 @@ class _Arm:
         return math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw + self.faces), jnp.asarray(self.down))
 
     def place(self, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]) -> Float[Array, "3"]:
-        """Computes where the grasp point has to be for an object whose middle is at ``pos``, along ``yaw``, and rises by ``pitch``."""
+        """Place of the grasp point for an object whose middle is at ``pos``, which lies along ``yaw`` and rises by ``pitch``."""
         along = jnp.stack([jnp.cos(yaw) * jnp.cos(pitch), jnp.sin(yaw) * jnp.cos(pitch), jnp.sin(pitch)])
         end = pos + self.side * along
         height = jnp.maximum(end[2], self.lowest) + self.beyond

@@ -26,7 +26,7 @@ NO_GL = (
 _ENOUGH_S = 30.0  # for the drawing of a video
 # Width, height, samples a pixel and shadows' edge, the best first: OpenGL in software takes a tenth of a second and more a frame.
 _QUALITIES = ((1280, 720, 4, 4096), (960, 540, 0, 1024), (640, 360, 0, 1024))
-_APART = 1.5  # between robots that share a picture [m]
+_APART = 1.5  # between tables that share a picture, at least [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +82,8 @@ class Renderer:
         quality.shadowsize = quality.shadowsize if shadows is None else shadows
         self._data, self._model, self._camera = mujoco.MjData(model), model, camera
         self._option, self._hand = mujoco.MjvOption(), mujoco.MjvPerturb()
+        table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "table_top")
+        self._apart = max(_APART, 2 * float(model.geom_size[table, :2].max())) if table >= 0 else _APART
         try:
             self._renderer = mujoco.Renderer(model, height, width, max_geom=max(10_000, envs * (model.ngeom + 10)))
         except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
@@ -124,9 +126,9 @@ class Renderer:
                 mujoco.mjv_addGeoms(self._model, self._data, self._option, self._hand, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
             x, y = i // columns - (rows - 1) / 2, i % columns - (columns - 1) / 2
             for geom in scene.geoms[before : scene.ngeom]:
-                geom.pos[:2] += _APART * np.array([x, y])
+                geom.pos[:2] += self._apart * np.array([x, y])
         for light in scene.lights[: scene.nlight]:  # far enough for all robots, too
-            light.pos[:] -= _APART * (max(columns, rows) - 1) * light.dir
+            light.pos[:] -= self._apart * (max(columns, rows) - 1) * light.dir
         return self._renderer.render()
 
     def _forward(self, qpos: np.ndarray, scenery: Scenery) -> None:
@@ -143,7 +145,7 @@ class Renderer:
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat = self._model.stat.center
-        camera.distance = 1.3 * self._model.stat.extent + 1.2 * _APART * (max(columns, rows) - 1)
+        camera.distance = 1.3 * self._model.stat.extent + 1.2 * self._apart * (max(columns, rows) - 1)
         camera.azimuth, camera.elevation = 138, -32
         return camera
 

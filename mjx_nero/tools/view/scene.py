@@ -15,7 +15,7 @@ from mjx_nero.tools.view.session import Frame, Session, free_joints
 
 HIDDEN = 3  # geom groups from here on: what collides
 SHAPE = "/drawn/"  # in the names of geoms that draw one shape of an object that may have several (``sim.objects.body``)
-APART = 1.5  # between environments [m]
+APART = 1.5  # between environments, at least [m]
 
 
 class Scene:
@@ -33,8 +33,8 @@ class Scene:
         own = model.site_bodyid[model.site(session.env.cfg.robot.ee_site).id]
         self._hands = [model.body(b).name for b in range(model.nbody) if hand and own in _above(model, b)]
         self._server, self._session, self._model, self._data = server, session, model, mujoco.MjData(model)
-        across = int(np.ceil(np.sqrt(session.size)))
-        self._corners = np.array([(i // across * APART, i % across * APART, 0.0) for i in range(session.size)])
+        across, apart = int(np.ceil(np.sqrt(session.size))), max(APART, *session.env.cfg.scene.table_size)
+        self._corners = np.array([(i // across * apart, i % across * apart, 0.0) for i in range(session.size)])
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(hdri=None)  # the maps there are come from the internet
         server.scene.configure_default_lights(cast_shadow=False)  # shadows are dear for a browser that draws in software
