@@ -16,6 +16,8 @@ from mjx_nero.mdp import handover, observations, success
 from mjx_nero.mdp.terms import MetricTerm, ObservationTerm
 from mjx_nero.sim import kinematics, scene, team
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tools.demos import making
+from mjx_nero.tools.inspection import report
 
 NERO, COBOTTA = registry.robot("nero"), registry.robot("cobotta_pro_900")
 
@@ -100,6 +102,21 @@ def test_a_view_of_one_robot_is_as_if_it_were_alone(env, state):
     assert ObservationTerm(observations.ee_position, params={"robot": "taker"}).seen(view).robots == {}
     with pytest.raises(UserError, match="no robot is called 'x': the scene's are taker"):
         view.of("x")
+
+
+def test_what_knows_one_robot_says_so(env):
+    with pytest.raises(
+        UserError, match="a data set of demonstrations knows scenes of one robot only, and this one has taker, too"
+    ):
+        making.units_of(env, "si")
+
+
+def test_inspect_lists_the_joints_of_both():
+    found = report.inspect("nero_cobotta_handover")
+    assert found.robot == "nero, cobotta_pro_900 as taker"
+    groups = {joint.name: joint.group for joint in found.joints}
+    assert groups["joint1"] == "arm" and groups["taker/joint_1"] == "taker/arm"
+    assert groups["taker/finger_joint"] == "taker/gripper" and groups["taker/left_inner_finger_joint"] == ""
 
 
 def test_bar_and_goal_are_out_of_the_others_reach():

@@ -35,7 +35,7 @@ class Joint:
         kind: ``hinge``, ``slide``, ...
         range: limits [rad or m]; None: unlimited.
         follows: the joint that it is coupled to, or empty.
-        group: ``arm``, ``gripper`` or empty.
+        group: ``arm``, ``gripper``, those of another robot, or empty.
     """
 
     name: str
