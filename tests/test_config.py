@@ -402,7 +402,7 @@ def test_one_learner_is_for_all_tasks_and_arms():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
         taught = env == "lift" or env.endswith(("place", "stack", "clutter", "lift_obstacles"))
-        taught |= env.endswith(("insert_peg", "hang_ring", "reorient"))
+        taught |= env.endswith(("insert_peg", "hang_ring", "reorient", "handover"))
         shown = taught and not env.endswith("pick_place")
         calm = SHOWN if shown else CALM if moves else {}
         assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env

@@ -14,7 +14,7 @@ def tables(report: Report) -> list[Table]:
     for j in report.joints:
         gains = (j.home, j.stiffness, j.damping, j.effort, j.speed)
         note = f"{j.kind}, follows {j.follows}" if j.follows and j.home is None else j.kind
-        joints.add(j.name, _range(j.range), *map(_number, gains), f"{note}, {j.group}" if j.group == "gripper" else note)
+        joints.add(j.name, _range(j.range), *map(_number, gains), f"{note}, {j.group}" if j.group.endswith("gripper") else note)
     joints.caption = "rad, N m/rad, N m s/rad, N m, rad/s; slides: m, N/m, N s/m, N, m/s"
     out = [joints]
     if report.open:
