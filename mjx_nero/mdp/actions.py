@@ -22,9 +22,6 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.types import LEVEL, Key, UserError
 
 Memory = Any
-# Of a ``JointVelocity`` that follows an expert's targets: its set-points come to them, and its rates to what that takes, in these
-# times [s]. Anything faster swings with actions that come a control step late.
-_COMES, _SETTLES = 0.1, 0.05
 _STAYS = 0.01  # targets of fingers that move less in a step, on the scale of a ``ContinuousGripper``, stay where they are
 
 
@@ -67,7 +64,6 @@ class Act:
     ctrl: dict[str, Float[Array, "... n"]]  # the current targets
     targets: dict[str, Float[Array, "... n"]]  # the new targets; at first, home
     level: Float[Array, ""] | None = None  # see ``types.LEVEL``
-    memory: Memory = ()  # of the term that inverts itself; (): unknown
 
     def to(self, group: str, targets: Float[Array, " n"]) -> "Act":
         """Returns a copy with new targets for one group."""
@@ -189,13 +185,10 @@ class JointVelocity(Joints):
         time: time constant with which velocities follow the action [s].
         ahead: a set-point leads its joint by at most the distance covered in this time at full speed [s]. Without this limit, a
             hand that leans on a table winds the set-point up until no action has an effect.
-        follows: an expert that is shown through this term has its targets followed as they move, with no more force than it asks
-            for. Otherwise its joints approach them, slowly: what is thrown by quick turns gains, what is pressed does not.
     """
 
     time: Positive = dataclasses.field(default=0.15, kw_only=True)
     ahead: Positive = dataclasses.field(default=0.1, kw_only=True)
-    follows: bool = dataclasses.field(default=False, kw_only=True)
 
     def init(self, key: Key, act: Act) -> Memory:
         """Returns the set-point [rad or m], at the joints, and its rate [share of full speed], zero."""
@@ -218,21 +211,10 @@ class JointVelocity(Joints):
         return {"type": "joint_velocity", **of}
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Moves towards the targets no faster than velocities follow the action; anything faster oscillates.
-
-        One that ``follows`` and knows its set-points moves these instead: at the rate ``(targets - point) / (lag * speed)``, the
-        targets that lead by the lag are those wanted.
-        """
-        if self.follows and act.memory:
-            return self._following(act)
+        """Moves towards the targets no faster than velocities follow the action; anything faster oscillates."""
         drives, slow = self.groups[self.group], 2 * (self.time + late * self.groups[self.group].dt)
         way = act.targets[self.group] - act.joint_pos[self.group]
         return jnp.clip(way / (slow * drives.speed), -1.0, 1.0)
-
-    def _following(self, act: Act) -> Float[Array, "... n"]:
-        (point, rate), drives = act.memory, self.groups[self.group]
-        wanted = (act.targets[self.group] - point) / (np.maximum(drives.lag + drives.dt, _COMES) * drives.speed)
-        return jnp.clip(rate + self.time / _SETTLES * (wanted - rate), -1.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -531,11 +513,7 @@ class Chain:
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 
     def invert(
-        self,
-        targets: Float[Array, "... nu"],
-        joint_pos: Float[Array, "... nu"],
-        ctrl: Float[Array, "... nu"] | None = None,
-        memory: Mapping[str, Memory] | None = None,
+        self, targets: Float[Array, "... nu"], joint_pos: Float[Array, "... nu"], ctrl: Float[Array, "... nu"] | None = None
     ) -> Float[Array, "... na"]:
         """Finds the action whose targets come nearest to those given, so that a controller can act in a policy's place.
 
@@ -543,15 +521,12 @@ class Chain:
             targets: position targets of the drives [rad or m].
             joint_pos: current joint positions [rad or m].
             ctrl: targets in force now [rad or m]; None: the joint positions.
-            memory: the terms' part of the episode's memory (see ``init``); None: unknown.
         """
         delays: list[Any] = [term for term in self.terms.values() if isinstance(term, Delay)]
         late = sum(term.steps[1] for term in delays)
         wanted, joints, now = map(self._by_group, (targets, joint_pos, joint_pos if ctrl is None else ctrl))
         act = Act(jnp.zeros((*jnp.shape(targets)[:-1], len(self.home))), joints, now, wanted)
-        held = memory or {}
-        acts = {name: dataclasses.replace(act, memory=held.get(f"actions.{name}", ())) for name in self.terms}
-        return jnp.concatenate([term.invert(acts[name], late) for name, term in self.terms.items()], axis=-1)
+        return jnp.concatenate([term.invert(act, late) for term in self.terms.values()], axis=-1)
 
     def _by_group(self, values: Float[Array, "... nu"]) -> dict[str, Float[Array, "... n"]]:
         ends = np.cumsum([len(drives.home) for drives in self._groups.values()])[:-1]

@@ -106,29 +106,6 @@ def test_velocities_lead_to_the_targets_and_stay():
     np.testing.assert_allclose(at[:3], wanted[:3], atol=5e-3)
 
 
-@pytest.mark.parametrize("late", [0, 1])
-def test_targets_that_are_followed_stay_near(late):
-    """A set-point swings by 0.2 rad with a period of 4 s, and its targets lead by the lag. Joints stand still under it: those who
-    approach them never come to rest there."""
-    own = GROUPS["arm"]
-
-    def farthest(follows: bool) -> float:
-        arm = Term(actions.JointVelocity, params={"follows": follows, "ahead": 1.0})
-        chain = actions.Chain({"delay": Term(actions.Delay, params={"steps": (late, late)}), "arm": arm}, GROUPS)
-        at, worst = jnp.asarray(JOINTS.home, jnp.float32), 0.0
-        memory, ctrl = chain.init(jax.random.PRNGKey(0), at), at
-        step, invert = jax.jit(chain.step), jax.jit(chain.invert)
-        for i in range(200):
-            phase = 2 * np.pi * (i + 1) * own.dt / 4.0
-            point, speed = own.home + 0.1 * (1 - np.cos(phase)), 0.1 * np.sin(phase) * 2 * np.pi / 4.0
-            wanted = jnp.asarray(np.concatenate([point + own.lag * speed, GROUPS["gripper"].home]), jnp.float32)
-            memory, ctrl = step(memory, invert(wanted, at, ctrl, memory), at, ctrl)
-            worst = max(worst, float(np.max(np.abs(memory["actions.arm"][0] - point))))
-        return worst
-
-    assert farthest(True) < 0.02 < 0.05 < farthest(False)
-
-
 def test_actions_are_clipped_first():
     parts = actions.Chain(CHAINS["positions"], GROUPS).describe()
     free, clipped = Executor(JOINTS, parts, JOINTS.home), Executor(JOINTS, parts, JOINTS.home, clip=0.1)

@@ -8,8 +8,8 @@ import numpy as np
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, nearer
-from mjx_nero.envs.tasks.building import Tower, lets_go
-from mjx_nero.mdp import actions, commands, events, fixtures, holes, observations, rewards, sensors, towers
+from mjx_nero.envs.tasks.building import Tower
+from mjx_nero.mdp import commands, events, fixtures, holes, observations, rewards, sensors, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import fixtures as models
@@ -150,8 +150,6 @@ class Putting(Tower):
             },
             "observations": self.observations(),
             "controllers": controllers,
-            # The expert searches, presses and yields by small motions, which joints that approach its targets do not make.
-            "actions": {**lets_go(), "arm": Term(actions.JointVelocity, params={"follows": True})},
             "curriculum": CurriculumCfg(expert_starts=0.5),
             "budget": Budget(steps=200_000_000),
         }

@@ -61,8 +61,7 @@ def through_actions(env: ManipulationEnv, agent: Agent) -> Agent:
     def act(params, memory, state, key):
         targets, memory = agent.act(params, memory, state, key)
         joint_pos = jax.vmap(lambda each: env.view(each).joint_pos)(state)
-        held = state.info["carry"].memory
-        return env.actions.invert(targets, joint_pos, state.pipeline_state.ctrl, held), memory
+        return env.actions.invert(targets, joint_pos, state.pipeline_state.ctrl), memory
 
     return dataclasses.replace(agent, act=act)
 

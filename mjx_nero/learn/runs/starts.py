@@ -169,7 +169,7 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
         state, memory, alive = carry
         view = jax.vmap(env.view)(state)
         memory, targets = jax.vmap(expert.step)(memory, view)
-        wanted = jax.vmap(env.actions.invert)(targets, view.joint_pos, view.ctrl, state.info["carry"].memory)
+        wanted = jax.vmap(env.actions.invert)(targets, view.joint_pos, view.ctrl)
         after = jax.vmap(env.step)(state, wanted + noise * jax.random.normal(key, wanted.shape))
         seen = jax.vmap(env.start)(after), after.metrics["distance"]
         grasped = after.info["carry"].memory[grasp] & (alive > 0)
