@@ -61,11 +61,15 @@ jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_C
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)
 jax.config.update("jax_default_matmul_precision", "highest")
 
+# Minutes of a core; other files are sorted by how many of their tests are slow.
+LONGEST = {"test_shipped": 3.0, "test_notebooks": 2.9, "test_putting": 1.4, "test_fixture_tasks": 1.5, "test_controllers": 1.5}
+LONGEST |= {"test_physics": 1.3, "test_guests": 1.2, "test_ppo": 1.2, "test_speed": 1.1}
+
 
 def pytest_collection_modifyitems(items):
-    """Files with most slow tests come first, so that no worker is left with one at the end. GPU tests skip themselves."""
+    """The longest files come first, so that no worker is left with one at the end. GPU tests skip themselves."""
     slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
+    items.sort(key=lambda item: (LONGEST.get(item.path.stem, 0), slow[item.path]), reverse=True)
     if any(item.get_closest_marker("gpu") for item in items) and jax.default_backend() != "gpu":
         for item in items:
             if item.get_closest_marker("gpu"):
