@@ -22,7 +22,7 @@ from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.tools.benchmark import throughput
 from mjx_nero.tools.benchmark.program import Program
 
-NUM_ENVS, ROUNDS = 128, 9
+NUM_ENVS, ROUNDS = 128, 5
 
 
 class Still:
