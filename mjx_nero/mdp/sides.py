@@ -125,7 +125,9 @@ def turned_up(view: View, *, lying: Lying, max_speed: Positive) -> Bool[Array, "
         UserError: the scene has no sensors of the fingers.
     """
     if "fingers" not in view.readings:
-        raise UserError("sides.turned_up needs scene.fingers, and this task is without, or its backend cannot measure them")
+        raise UserError(
+            "sides.turned_up needs 'fingers' among scene.sensors, and this task is without, or its backend cannot measure them"
+        )
     seen = view.objects[lying.object]
     still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
     return stands(view, lying) & still & (_away(view, lying) > lying.clearance) & (jnp.max(view.readings["fingers"]) == 0)
