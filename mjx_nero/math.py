@@ -1,9 +1,16 @@
 """Quaternion and frame helpers. Quaternions are wxyz and of unit length."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+# Python traces such a function once for each shape, and puts its operations where it is called: no trace calls others as often.
+_traced_once = functools.partial(jax.jit, inline=True)
 
+
+@_traced_once
 def quat_mul(a: Float[Array, "4 *many"], b: Float[Array, "4 *many"]) -> Float[Array, "4 *many"]:
     """Hamilton product: the rotation ``b`` first, then ``a``. One of each, or many with the components in front."""
     # Written out: XLA fuses plain products into one kernel, but not the reductions and slices of dot and cross.
@@ -19,6 +26,7 @@ def quat_mul(a: Float[Array, "4 *many"], b: Float[Array, "4 *many"]) -> Float[Ar
     )
 
 
+@_traced_once
 def rotate(quat: Float[Array, "4 *many"], vec: Float[Array, "3 *many"]) -> Float[Array, "3 *many"]:
     """``vec`` turned by ``quat``. One of each, or many with the components in front."""
     w, x, y, z = quat

@@ -56,16 +56,27 @@ from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
+# With an old JAX, the learner's native programs have a fusion of XLA back that makes networks quicker (``physics.fusion``) and
+# their compilation three times as long. Tests compile more than they run: "=0" is "=false" for XLA, but not for ``fusion``. Nor
+# need XLA split its code between the cores: other tests run on them.
+if "xla_cpu_use_fusion_emitters=false" in os.environ.get("XLA_FLAGS", ""):
+    _flags = os.environ["XLA_FLAGS"].replace("xla_cpu_use_fusion_emitters=false", "xla_cpu_use_fusion_emitters=0")
+    os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_parallel_codegen_split_count=1"
+
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)
 jax.config.update("jax_default_matmul_precision", "highest")
 
+# Minutes of a core; other files are sorted by how many of their tests are slow.
+LONGEST = {"test_shipped": 3.0, "test_notebooks": 2.9, "test_putting": 1.4, "test_fixture_tasks": 1.5, "test_controllers": 1.5}
+LONGEST |= {"test_physics": 1.3, "test_guests": 1.2, "test_ppo": 1.2, "test_speed": 1.1}
+
 
 def pytest_collection_modifyitems(items):
-    """Files with most slow tests come first, so that no worker is left with one at the end. GPU tests skip themselves."""
+    """The longest files come first, so that no worker is left with one at the end. GPU tests skip themselves."""
     slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
+    items.sort(key=lambda item: (LONGEST.get(item.path.stem, 0), slow[item.path]), reverse=True)
     if any(item.get_closest_marker("gpu") for item in items) and jax.default_backend() != "gpu":
         for item in items:
             if item.get_closest_marker("gpu"):

@@ -266,6 +266,20 @@ def test_public_names_are_there():
     assert all(getattr(mjx_nero, name) is not None for name in mjx_nero.__all__)
 
 
+def test_an_evaluation_in_mujocos_library_leaves_alone_what_it_does_not_need():
+    """Warp and MuJoCo Warp take longer to import than all the rest together. Both can still be imported afterwards."""
+    code = (
+        "import atexit, sys; atexit.register(lambda: print(*sys.modules)); import mjx_nero.__main__ as all; all.program('eval')"
+    )
+    found = _python("-c", code, "--env", "nero_reach", "--impl", "native", "--episodes", "2", "--env.episode_length_s", "0.2")
+    assert found.returncode == 0 and "success rate" in found.stdout, found.stderr
+    modules = set(found.stdout.splitlines()[-1].split())
+    assert {"jax", "mujoco.mjx", "mjx_nero.sim.physics.native"} <= modules
+    assert not {"warp", "mujoco.mjx.third_party.mujoco_warp", "torch", "onnx", "matplotlib", "viser", "gymnasium"} & modules
+    both = "from mujoco.mjx.third_party import mujoco_warp; import warp; warp.kernel, mujoco_warp.step"
+    assert _python("-c", f"import mjx_nero.learn.policy; {both}").returncode == 0
+
+
 def _seconds(*args: str) -> float:
     """Of all imports, as Python itself counts it."""
     lines = _python("-X", "importtime", *args).stderr.splitlines()

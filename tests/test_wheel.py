@@ -60,10 +60,10 @@ def test_a_wheel_trains(run):
 
 
 @pytest.mark.slow
-def test_a_wheel_lists_plays_and_views(run):
+def test_a_wheel_inspects_plays_and_views(run):
     """``mjx-nero`` is the program of the entry point; the viewer says in a line if its extra is lacking."""
-    found = run(PROGRAM, "list-envs")
-    assert found.returncode == 0 and "nero_lift" in found.stdout and "ships" in found.stdout, found.stderr
+    found = run(PROGRAM, "inspect", "nero")
+    assert found.returncode == 0 and "joints of nero" in found.stdout, found.stderr
     found = run(PROGRAM, "eval", "--env", "nero_reach", "--episodes", "4")
     assert found.returncode == 0 and "success rate" in found.stdout, found.stderr
     found = run("import mjx_nero.tools.view.command as c, mjx_nero.tools.view.session; print(c.__file__)")

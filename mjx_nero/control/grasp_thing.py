@@ -70,11 +70,11 @@ class GraspThing(PickUp):
         """Chooses a grasp and starts the first phase."""
         q = view.joint_pos[: self._n]
         middles, angles, gaps, costs = self._ways(view)
-        quats = jax.vmap(self._hand)(angles)
+        quats = jax.vmap(self.hand)(angles)
         picks = jax.vmap(self._over, (None, 0, 0, 0))(view, middles, angles, gaps)
         starts = jnp.broadcast_to(q, (len(angles), self._n))
-        over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
-        low = jax.vmap(self._ik.local)(picks, quats, over.q)
+        over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
+        low = jax.vmap(self.ik.local)(picks, quats, over.q)
         way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
         best = jnp.argmin(way + _COST_COUNTS * costs)
         zero, pick = jnp.zeros((), jnp.int32), picks[best]
@@ -98,15 +98,15 @@ class GraspThing(PickUp):
         assert isinstance(memory, GraspThingMemory)
         after, targets = super().step(memory, view)
         ends = jnp.where(memory.phase >= CLOSE, jnp.asarray(self.gripper.closed), memory.opened)
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
         return after, jnp.concatenate([targets[: self._n], fingers])
 
-    def _off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
+    def off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
         assert isinstance(memory, GraspThingMemory)
         seen = view.objects[self.cfg.object]
         return jnp.linalg.norm(view.ee_pos_w - seen.pos_w - math.rotate(seen.quat_w, memory.middle))
 
-    def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
+    def again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
         """Plans again for a lost thing, turning the hand as little as possible, without a search."""
         assert isinstance(memory, GraspThingMemory)
         middles, angles, gaps, costs = self._ways(view)
@@ -114,7 +114,7 @@ class GraspThing(PickUp):
         best = jnp.argmin(jnp.abs(off) + _COST_COUNTS * costs)
         yaw = memory.yaw + off[best]
         pick = self._over(view, middles[best], yaw, gaps[best])
-        above = self._ik.local(pick + self._up, self._hand(yaw), memory.above).q
+        above = self.ik.local(pick + self._up, self.hand(yaw), memory.above).q
         new = {"pick": pick, "yaw": yaw, "above": above, "opened": self._open(gaps[best])}
         new["middle"] = self._local(view, middles[best])
         return dataclasses.replace(memory, **{name: jnp.where(lost, new[name], getattr(memory, name)) for name in new})
@@ -142,7 +142,7 @@ class GraspThing(PickUp):
         """Computes the place of the grasp point with the pads' middle there, but not too near the table."""
         height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         aside = jnp.interp(gap, self._opened, self._aside)
-        return middle.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
+        return middle.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _local(self, view: View, place: Float[Array, "3"]) -> Float[Array, "3"]:
         seen = view.objects[self.cfg.object]

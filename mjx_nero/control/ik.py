@@ -94,6 +94,8 @@ class InverseKinematics:
         lower = np.where(np.isfinite(self.chain.lower), self.chain.lower, -unlimited)
         upper = np.where(np.isfinite(self.chain.upper), self.chain.upper, unlimited)
         self._center, self._half = (lower + upper) / 2, cfg.spread * (upper - lower) / 2
+        # A controller solves at several places of a step: Python traces it once for all of them.
+        self._solve = jax.jit(self._solved, static_argnums=4)
 
     def solve(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"], key: Key) -> Solution:
         """One pose, from ``q0`` first, then from random starts; of several solutions in a round the one closest to ``q0``.
@@ -114,7 +116,7 @@ class InverseKinematics:
         """``solve`` for many poses at once. Quicker than ``vmap``: the starts go to the poses that are still unsolved."""
         return self._solve(pos, quat, q0, key, self.cfg.restarts)
 
-    def _solve(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int) -> Solution:
+    def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int) -> Solution:
         # On a GPU the default precision of products is too coarse for kinematics.
         with jax.default_matmul_precision("highest"):
             norm = jnp.linalg.norm(quat, axis=-1)

@@ -89,6 +89,13 @@ class PickUp:
         dt: control step [s].
         cfg: see ``PickUpCfg``.
 
+    Attributes:
+        gripper, ik: the hand's fingers, and the arm's kinematics.
+        lead: how far the arm's targets go ahead of its set-point, by joint [s].
+        gentle: greatest acceleration of the arm with the object in its hand [rad/s2].
+        closed, finger_step: when the fingers have closed [s], and how far they move in a step.
+        lost: distance of the object from its place in the hand from which on it counts as lost [m].
+
     Raises:
         UserError: ``heading``, ``turns`` or ``aside`` differ in length, or name no axis.
     """
@@ -99,18 +106,18 @@ class PickUp:
         if cfg.aside and len(cfg.aside) != len(cfg.turns):
             raise UserError(f"aside takes one value an object, got {cfg.aside} for {len(cfg.turns)}")
         self.dt, self.cfg = dt, cfg
-        self.gripper, self._ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
+        self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
         self._n = len(robot.arm.joints)
         self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
         self._opening = np.array(grasp.opening(robot), np.float32)
-        self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
-        self._gentle = setpoint.gentle(robot.arm.lead)
+        self.lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
+        self.gentle = setpoint.gentle(robot.arm.lead)
         travel = np.abs(self.gripper.opened - self.gripper.closed)
         # Drives that lag are slow to press, and their heavy rotors throw what they meet at speed.
         lag = float(np.max(robot.gripper.lead, initial=0.0))
-        self._closed = cfg.closing + 2 * lag + PRESS
-        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
-        self._lost = float(np.linalg.norm(robot.grip)) + _LOST
+        self.closed = cfg.closing + 2 * lag + PRESS
+        self.finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
+        self.lost = float(np.linalg.norm(robot.grip)) + _LOST
         self._reach = robot.opening / 2  # of a finger from the grasp point
         # From an object's heading; a round one has none.
         angles = [np.arange(_CHOICES) * 2 * np.pi / (turns or _CHOICES) for turns in cfg.turns]
@@ -120,11 +127,11 @@ class PickUp:
         """Starts the first phase."""
         q, zero = view.joint_pos[: self._n], jnp.zeros((), jnp.int32)
         angles = self._angles(view)
-        quats = jax.vmap(self._hand)(angles)
+        quats = jax.vmap(self.hand)(angles)
         picks = jax.vmap(self._pick, (None, 0))(view, angles)
         starts = jnp.broadcast_to(q, (_CHOICES, self._n))
-        over = self._ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
-        low = jax.vmap(self._ik.local)(picks, quats, over.q)
+        over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
+        low = jax.vmap(self.ik.local)(picks, quats, over.q)
         way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
         best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
         above, pick, yaw = over.q[best], picks[best], angles[best]
@@ -143,17 +150,17 @@ class PickUp:
         way = wanted - memory.pos
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
-        found = self._ik.local(pos, self._hand(memory.yaw), memory.q).q
+        found = self.ik.local(pos, self.hand(memory.yaw), memory.q).q
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
-        fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self._gentle)
+        fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self.gentle)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
         ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
 
-        lost = (phase >= UP) & (self._off(memory, view) > self._lost)
+        lost = (phase >= UP) & (self.off(memory, view) > self.lost)
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - wanted), far < 1e-3)
         memory = dataclasses.replace(
-            self._again(memory, view, lost),
+            self.again(memory, view, lost),
             phase=jnp.where(lost, ABOVE, phase + ended),
             count=jnp.where(lost | ended, 0, memory.count + 1),
             q=q,
@@ -162,9 +169,9 @@ class PickUp:
             grip=grip,
             tries=memory.tries + lost,
         )
-        return memory, jnp.concatenate([q + self._lead * qd, fingers])
+        return memory, jnp.concatenate([q + self.lead * qd, fingers])
 
-    def _off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
+    def off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
         """Distance of the grasp point from where the object is to be held [m]."""
         return jnp.linalg.norm(view.ee_pos_w - view.objects[self.cfg.object].pos_w)
 
@@ -182,19 +189,19 @@ class PickUp:
             [
                 still & (error < 0.01) | (time > 2.5),
                 arrived & still & (error < 0.004) | (time > 0.8),
-                time > self._closed,
+                time > self.closed,
                 arrived | (time > 1.0),
             ],
             False,
         )
 
-    def _again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
+    def again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
         """Plans again for a lost object, turning the hand as little as possible, without a search."""
         angles = self._angles(view)
         off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
         yaw = memory.yaw + off[jnp.argmin(jnp.abs(off))]
         pick = self._pick(view, yaw)
-        new = pick, yaw, self._ik.local(pick + self._up, self._hand(yaw), memory.above).q
+        new = pick, yaw, self.ik.local(pick + self._up, self.hand(yaw), memory.above).q
         pick, yaw, above = (jnp.where(lost, a, b) for a, b in zip(new, (memory.pick, memory.yaw, memory.above), strict=True))
         return dataclasses.replace(memory, pick=pick, yaw=yaw, above=above)
 
@@ -214,7 +221,7 @@ class PickUp:
         seen = view.objects[self.cfg.object].pos_w
         height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
-        return seen.at[2].set(height) - math.rotate(self._hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
+        return seen.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
         """Distance from the open fingers to the nearest of the other objects' centres [m], at most the hand's width."""
@@ -225,7 +232,8 @@ class PickUp:
         itself = jnp.linalg.norm(others, axis=1) < 1e-3
         return jnp.min(jnp.where(itself[:, None, None], jnp.inf, far), axis=(0, 1), initial=self._reach)
 
-    def _hand(self, yaw: Float[Array, ""]) -> Float[Array, "4"]:
+    def hand(self, yaw: Float[Array, ""]) -> Float[Array, "4"]:
+        """The hand's orientation in the world: it points down, turned by ``yaw`` [rad] about the vertical."""
         return math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw), jnp.asarray(self._down))
 
     def warning(self, memory: PickUpMemory) -> str:

@@ -108,7 +108,7 @@ class PutIn:
     def __init__(self, robot: RobotCfg, dt: float, cfg: PutInCfg = PutInCfg()):
         self.dt, self.cfg = dt, cfg
         self._pick = self.picker(robot, dt, cfg.pick)
-        self._n, self._speed, self._lead = len(robot.arm.joints), np.array(robot.arm.speed, np.float32), self._pick._lead
+        self._n, self._speed, self._lead = len(robot.arm.joints), np.array(robot.arm.speed, np.float32), self._pick.lead
         self._object = cfg.pick.object
 
     def init(self, view: View) -> PutInMemory:
@@ -139,7 +139,7 @@ class PutIn:
         stage, pick, seen = memory.stage, memory.pick, view.objects[self._object]
         slow = jnp.max(jnp.abs(pick.qd)) < _SLOW
         # Above the goal, turns are made up for from where the hand is told to be: it is on its way there, and lags.
-        told = math.quat_mul(math.quat_mul(memory.upright, self._pick._hand(pick.yaw)), math.quat_conj(view.ee_quat_w))
+        told = math.quat_mul(math.quat_mul(memory.upright, self._pick.hand(pick.yaw)), math.quat_conj(view.ee_quat_w))
         turned = jnp.where(stage == OVER, math.quat_mul(told, seen.quat_w), seen.quat_w)
         off, lacks = self._off(view, seen.quat_w), self._off(view, turned)
         end = self._end(view)
@@ -153,18 +153,18 @@ class PutIn:
         yaw = pick.yaw + jnp.where(steers, turn, 0.0)
         pos, sought = self._position(memory, view, grip, end)
 
-        found = self._pick._ik.local(pos, math.quat_mul(upright, self._pick._hand(yaw)), pick.q).q
+        found = self._pick.ik.local(pos, math.quat_mul(upright, self._pick.hand(yaw)), pick.q).q
         wanted = jnp.where(stage == OPEN, pick.q, found)
-        fastest = jnp.where(stage == AWAY, setpoint.FASTEST, self._pick._gentle)
+        fastest = jnp.where(stage == AWAY, setpoint.FASTEST, self._pick.gentle)
         q, qd = setpoint.follow(pick.q, pick.qd, wanted, jnp.asarray(self._speed), self.dt, fastest)
         fingers = self._fingers(pick, view, stage >= OPEN)
 
-        lost = ((stage == OVER) | (stage == IN)) & (self._pick._off(pick, view) > self._pick._lost)
+        lost = ((stage == OVER) | (stage == IN)) & (self._pick.off(pick, view) > self._pick.lost)
         again = (stage == IN) & ((memory.count + 1) * self.dt > self.cfg.patience)
         ended = self._ended(memory, way, off)
         following = jnp.where(lost, PICK, jnp.where(ended, stage + 1, jnp.where(again, OVER, stage)))
         pick = dataclasses.replace(
-            self._pick._again(pick, view, lost),
+            self._pick.again(pick, view, lost),
             phase=jnp.where(lost, ABOVE, pick.phase),
             count=jnp.where(lost, 0, pick.count),
             q=q,
@@ -220,7 +220,7 @@ class PutIn:
         there = (jnp.linalg.norm(way[:2]) < _CLOSE) & (jnp.abs(off) < _ALIGNED)
         return jnp.select(
             [memory.stage == OVER, memory.stage == IN, memory.stage == OPEN],
-            [there | (time > 4.0), -way[2] < self.cfg.done, time > self._pick._closed],
+            [there | (time > 4.0), -way[2] < self.cfg.done, time > self._pick.closed],
             False,
         )
 
@@ -235,7 +235,7 @@ class PutIn:
     def _fingers(self, pick: PickUpMemory, view: View, opens: Bool[Array, ""]) -> Float[Array, " ng"]:
         opened = getattr(pick, "opened", self._pick.gripper.opened)
         ends = jnp.where(opens, jnp.asarray(opened), jnp.asarray(self._pick.gripper.closed))
-        return rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._pick._finger_step))
+        return rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._pick.finger_step))
 
     def warning(self, memory: PutInMemory) -> str:
         """Says how many objects were lost, or did not go in at once."""

@@ -22,7 +22,9 @@ def let_be(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
         UserError: the scene has none.
     """
     if "fingers" not in view.readings:
-        raise UserError("holes.let_be needs scene.fingers, and this task is without, or its backend cannot measure them")
+        raise UserError(
+            "holes.let_be needs 'fingers' among scene.sensors, and this task is without, or its backend cannot measure them"
+        )
     return towers.built(view, place=place, max_speed=max_speed) & (jnp.max(view.readings["fingers"]) == 0)
 
 

@@ -32,7 +32,7 @@ def reading(view: View, *, name: str) -> Float[Array, " n"]:
     """
     if name not in view.readings:
         there = ", ".join(view.readings) or "none"
-        raise UserError(f"the scene measures no {name!r}: its readings are {there} (scene.wrist, scene.fingers, scene.hand)")
+        raise UserError(f"the scene measures no {name!r}: its readings are {there} (scene.sensors)")
     return jnp.atleast_1d(view.readings[name])
 
 

@@ -5,19 +5,18 @@ rewards of a held one, so letting go costs nothing.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial.transform import Rotation
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive, Range
 from mjx_nero.mdp.rewards import held
 from mjx_nero.types import Key, Start, UserError, View
 
-TURNS = np.roll(Rotation.create_group("O").as_quat(), 1, axis=1).astype(np.float32)  # the 24 of a cube onto itself, wxyz
 NORMALS = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 
 
@@ -41,6 +40,14 @@ class Lying:
     clearance: NonNegative
 
 
+@functools.cache
+def cube_turns() -> np.ndarray:
+    """The 24 turns of a cube onto itself, wxyz [24, 4]."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    return np.roll(Rotation.create_group("O").as_quat(), 1, axis=1).astype(np.float32)
+
+
 # Commands and reset events.
 
 
@@ -57,7 +64,7 @@ def other_side_up(key: Key, start: Start, *, base: tuple[float, float, float], y
     """
     k_turn, k_yaw = jax.random.split(key)
     wanted = start.goal_pos_w - jnp.array(base)
-    turns = jnp.asarray(TURNS)
+    turns = jnp.asarray(cube_turns())
     up = jax.vmap(lambda turn: math.rotate(turn, wanted)[2])(turns)
     index = jax.random.categorical(k_turn, jnp.where(up < 0.5, 0.0, -jnp.inf))
     about = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jax.random.uniform(k_yaw, (), minval=yaw[0], maxval=yaw[1]))
@@ -118,7 +125,9 @@ def turned_up(view: View, *, lying: Lying, max_speed: Positive) -> Bool[Array, "
         UserError: the scene has no sensors of the fingers.
     """
     if "fingers" not in view.readings:
-        raise UserError("sides.turned_up needs scene.fingers, and this task is without, or its backend cannot measure them")
+        raise UserError(
+            "sides.turned_up needs 'fingers' among scene.sensors, and this task is without, or its backend cannot measure them"
+        )
     seen = view.objects[lying.object]
     still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
     return stands(view, lying) & still & (_away(view, lying) > lying.clearance) & (jnp.max(view.readings["fingers"]) == 0)

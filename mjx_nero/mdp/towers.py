@@ -131,7 +131,7 @@ def left_alone(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, 
         UserError: the scene has none.
     """
     if "hand" not in view.readings:
-        raise UserError("towers.left_alone needs scene.hand, and this task is without")
+        raise UserError("towers.left_alone needs 'hand' among scene.sensors, and this task is without")
     return built(view, place=place, max_speed=max_speed) & (view.readings["hand"] == 0)
 
 

@@ -5,7 +5,7 @@ weight and inertia. A pad's is the net force of its contacts. A real sensor's er
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import mujoco
@@ -18,23 +18,23 @@ WRIST, FINGERS = "wrist", "fingers"  # the readings, and the prefixes of their s
 _NET = 3  # of a contact sensor: one force for all contacts, in the world's axes
 
 
-def add(spec: mujoco.MjSpec, robot: RobotCfg, wrist: bool, fingers: bool) -> None:
-    """Adds the sensors of the robot's wrist and of its pads.
+def add(spec: mujoco.MjSpec, robot: RobotCfg, names: Collection[str]) -> None:
+    """Adds the sensors of the robot's wrist and of its pads, if they are named.
 
     Raises:
         UserError: the robot has no pads to measure at.
     """
-    if wrist:
+    if WRIST in names:
         site = _hand(spec, robot).add_site(name=WRIST, size=[1e-3, 1e-3, 1e-3], rgba=[0, 0, 0, 0], group=5)
         for kind in ("force", "torque"):
             measures = getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")
             spec.add_sensor(name=f"{WRIST}:{kind}", type=measures, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name)
-    if not fingers:
+    if FINGERS not in names:
         return
     base = spec.body(robot.base_link)
     pads = [geom for geom in base.find_all(mujoco.mjtObj.mjOBJ_GEOM) if "pad" in geom.name and geom.conaffinity]
     if not pads:
-        raise UserError(f"scene.fingers measures at shapes with 'pad' in their names, and {robot.name} has none")
+        raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, and {robot.name} has none")
     for geom in pads:
         spec.add_sensor(
             name=f"{FINGERS}:{geom.name}",

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_nero import math
 from mjx_nero.sim import linkage
 from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.robot import RobotCfg
@@ -62,7 +61,7 @@ def beyond(robot: RobotCfg, gap: float) -> float:
     hand = _Hand(robot)
     hand.move(hand.share(gap))
     site = hand.data.site(robot.ee_site)
-    approach = math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 0.0, -1.0]))
+    approach = _in_hand(robot, (0.0, 0.0, -1.0))
     centres = [hand.data.geom(i).xpos for i in hand.pads]
     off = (np.mean(centres, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if centres else np.zeros(3)
     return round(max(0.0, float(off @ approach)), 4)
@@ -70,7 +69,15 @@ def beyond(robot: RobotCfg, gap: float) -> float:
 
 def opening(robot: RobotCfg) -> np.ndarray:
     """The direction in which the fingers open, in the frame of ``ee_site``."""
-    return np.asarray(math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 1.0, 0.0])))
+    return _in_hand(robot, (0.0, 1.0, 0.0))
+
+
+def _in_hand(robot: RobotCfg, way: tuple[float, float, float]) -> np.ndarray:
+    """A direction in the world, as the hand sees it that points down: ``math.rotate`` without JAX, which takes long to start."""
+    w, x, y, z = np.array(robot.down, np.float32) * np.array([1, -1, -1, -1], np.float32)
+    vx, vy, vz = np.array(way, np.float32)
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return np.array([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx], np.float32)
 
 
 def aside(robot: RobotCfg, gap: float) -> float:

@@ -39,9 +39,8 @@ class SceneCfg:
         fixtures: things with joints of their own by name, such as a cabinet (``sim.fixtures``).
         robots: further robots by name, beside the task's own (``sim.team``).
         self_collision: a robot's links collide with one another; ``sim.touch`` measures those forces, too.
-        hand: ``sim.touch`` measures the force with which robots press objects.
-        wrist, fingers: ``sim.forces`` measures force and torque between arm and hand, and the forces at the pads, of the task's
-            own robot.
+        sensors: names of ``Sim.readings`` beside ``touch``. ``hand``: the force with which robots press objects; ``wrist`` and
+            ``fingers``: force and torque between arm and hand, and the forces at the pads, of the task's own robot.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
@@ -64,9 +63,7 @@ class SceneCfg:
     fixtures: Mapping[str, FixtureCfg] = dataclasses.field(default_factory=dict)
     robots: Mapping[str, RobotCfg] = dataclasses.field(default_factory=dict)
     self_collision: bool = False
-    hand: bool = False
-    wrist: bool = False
-    fingers: bool = False
+    sensors: tuple[Annotated[str, OneOf(touch.HAND, forces.WRIST, forces.FINGERS)], ...] = ()
     goal: str = "sphere"
     goal_edge: Positive = 0.03
     look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
@@ -148,9 +145,9 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     for name, each in every.items():
         if scene.self_collision:
             touch.add_pairs(spec, scene.robots.get(name, robot), name)
-        if scene.hand:
+        if touch.HAND in scene.sensors:
             touch.add_hand(spec, each.base_link, tuple(scene.objects))
-    forces.add(spec, robot, scene.wrist, scene.fingers)
+    forces.add(spec, robot, scene.sensors)
     if visuals:
         drawn.add(spec, scene, goal, robot)
         cameras.add(spec, scene.cameras)

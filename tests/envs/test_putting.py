@@ -105,11 +105,9 @@ def test_success_is_a_peg_on_the_ground_of_the_hole(env, functions, height, succ
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "preset"), [("nero_insert_peg", "default"), ("cobotta_insert_peg", "round"), ("nero_hang_ring", "default")]
-)
+@pytest.mark.parametrize(("name", "preset"), [("cobotta_insert_peg", "round"), ("nero_hang_ring", "default")])
 def test_the_script_does_it(name, preset):
-    """Over 200 episodes: docs/guides/putting.md."""
+    """Over 200 episodes: docs/guides/putting.md. ``every_expert.py`` has more of them."""
     cfg = evaluation.EvalCfg(name, preset=preset, controller="expert", episodes=24, backend="mujoco")
     assert evaluation.play(cfg).result["success_rate"] >= 0.8
 

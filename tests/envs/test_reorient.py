@@ -57,8 +57,7 @@ def test_success_is_the_side_up_for_half_a_second(env, functions, degrees, succe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, least", [("nero_reorient", 0.75), ("cobotta_reorient", 0.5)])
-def test_the_script_does_it(name, least):
-    """Over more episodes: docs/guides/putting.md. Few leave room for chance."""
-    cfg = evaluation.EvalCfg(name, controller="expert", episodes=24, backend="mujoco")
-    assert evaluation.play(cfg).result["success_rate"] >= least
+def test_the_script_does_it():
+    """The Nero's: ``every_expert.py``. Over more episodes: docs/guides/putting.md. Few leave room for chance."""
+    cfg = evaluation.EvalCfg("cobotta_reorient", controller="expert", episodes=24, backend="mujoco")
+    assert evaluation.play(cfg).result["success_rate"] >= 0.5

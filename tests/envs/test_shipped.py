@@ -1,14 +1,14 @@
-"""The policies that ship, in MuJoCo's C library. Figures over 1,000 episodes: docs/benchmarks.md."""
+"""The bundled policies: each fits its environment, and one a task and kind of arm succeeds. ``every_policy.py`` plays all."""
 
+import every_policy
+import jax
 import pytest
+from every_policy import NAMES, REAL, SIGHT
 
-from mjx_nero import list_envs
+from mjx_nero import make
 from mjx_nero.learn import policy
-from mjx_nero.learn.play import evaluation
+from mjx_nero.sim.robot import ASSETS
 from mjx_nero.tools import results
-
-NAMES = [name for name in list_envs() if policy.shipped(name).exists()]
-
 
 # Nobody has trained these by the default command.
 ARMS = ("nero", "cobotta", "piper", "so100", "so101")
@@ -22,38 +22,56 @@ MISSING = {
 }
 
 
+def some(names):
+    """One name a task and kind of arm (an SO-ARM or not), every arm in its turn."""
+    kinds = {}
+    for name in names:
+        arm, task = name.split("_", 1)
+        kinds.setdefault((task, arm.startswith("so10")), []).append(name)
+    return [found[turn % len(found)] for turn, found in enumerate(kinds.values())]
+
+
+PLAYED = some(NAMES)
+FILES = [(name, preset) for preset, names in (("default", NAMES), ("sim2real", REAL), ("rgb", SIGHT)) for name in names]
+
+
 def test_every_task_that_is_to_be_learnt_has_one():
     """But for those that are known to be missing, none of which is there."""
     assert set(results.learnable()) == set(NAMES) | MISSING and not MISSING & set(NAMES)
-
-
-REAL = [name for name in NAMES if policy.shipped(name, "sim2real") != policy.shipped(name)]
 
 
 def test_lifts_and_reaches_have_one_for_the_real_arm():
     assert set(REAL) == {*(f"{arm}_lift" for arm in ("nero", "cobotta", "piper", "so101")), "nero_reach", "cobotta_reach"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
-def test_it_succeeds_where_everything_differs(name):
-    found = evaluation.play(evaluation.EvalCfg(name, preset="sim2real", agent="policy", episodes=64, backend="mujoco")).result
-    assert found["success_rate"] >= (0.7 if name.startswith("so101") else 0.85)
+def test_no_file_is_left_out():
+    files = {path.stem for path in (ASSETS / "policies").glob("*.safetensors")}
+    assert files == {name + ("" if preset == "default" else f"_{preset}") for name, preset in FILES}
+    assert {name.split("_")[0] for name in PLAYED} == set(ARMS)
+    assert {name.split("_", 1)[1] for name in PLAYED} == {name.split("_", 1)[1] for name in NAMES}
+
+
+@pytest.mark.parametrize(("name", "preset"), [file for file in FILES if file not in {(name, "default") for name in PLAYED}])
+def test_it_fits(name, preset):
+    """The file is whole, was trained for this model of the robot and these observations, and acts on them."""
+    env = make(name, preset, impl="native")
+    trained = policy.load_for(env, name, None, preset=preset)
+    assert trained.meta["preset"] == preset and trained.meta["robot"] == env.cfg.robot.name and trained.meta["fingerprint"]
+    seen = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
+    assert jax.eval_shape(trained.act, seen).shape == (env.action_size,)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PLAYED)
 def test_it_succeeds(name):
-    """Over 1,000 episodes they do 91% and more, reaches 98% and more; few leave room for chance."""
-    few = 64 if name.endswith(("_reach", "_lift")) else 24
-    found = evaluation.play(evaluation.EvalCfg(name, agent="policy", episodes=few, backend="mujoco")).result
-    assert found["success_rate"] >= (0.93 if name.endswith("_reach") else 0.8)
+    every_policy.test_it_succeeds(name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nero_lift", "piper_lift"])
-def test_it_succeeds_by_sight(name):
-    """Every episode looks different. MuJoCo Warp's ray tracer draws, as in training: OpenGL in software would take minutes."""
-    fields = {"scene.renderer": "warp"}
-    cfg = evaluation.EvalCfg(name, preset="rgb", agent="policy", episodes=16, backend="mujoco", env_fields=fields)
-    assert evaluation.play(cfg).result["success_rate"] >= 0.7
+def test_it_succeeds_where_everything_differs():
+    every_policy.test_it_succeeds_where_everything_differs("so101_lift")
+
+
+@pytest.mark.slow
+def test_it_succeeds_by_sight():
+    every_policy.test_it_succeeds_by_sight("nero_lift")

@@ -193,11 +193,11 @@ def test_the_expert_does_it(play, env):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("robot", "least"), [("piper", 8), ("so_arm100", 6)])
-def test_the_expert_stacks_with_small_arms(robot, least):
-    """Their hands point down no higher than 10 cm: over the tower they lean."""
-    result = evaluation.play(evaluation.EvalCfg("stack", robot=robot, controller="expert", episodes=8, backend="mujoco")).result
-    assert result["success_rate"] * 8 >= least and result["nan_count"] == 0
+def test_the_expert_stacks_with_a_small_arm():
+    """Its hand points down no higher than 10 cm: over the tower it leans, and so does the PiPER's (``every_expert.py``)."""
+    cfg = evaluation.EvalCfg("stack", robot="so_arm100", controller="expert", episodes=8, backend="mujoco")
+    result = evaluation.play(cfg).result
+    assert result["success_rate"] * 8 >= 6 and result["nan_count"] == 0
 
 
 @pytest.mark.slow

@@ -74,7 +74,8 @@ def test_two_processes_learn_what_one_does(tmp_path):
     pair = [start(tmp_path, "--out", "two", *run, JAX_PROCESS_ID=str(i), **joined) for i in range(2)]
     first, second = ended(*pair)
     assert "8 environments on 2 devices" in first and "success" not in second  # the second says nothing
-    ended(start(tmp_path, "--out", "one", *run, "--num-devices", "2", XLA_FLAGS="--xla_force_host_platform_device_count=2"))
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    ended(start(tmp_path, "--out", "one", *run, "--num-devices", "2", XLA_FLAGS=flags))
     found = [checkpoints(tmp_path / name) for name in ("one", "two")]
     assert [name for name, _ in found] == ["000000000320.safetensors"] * 2
     for name, value in found[0][1].items():

@@ -92,7 +92,7 @@ def test_success_is_a_peg_that_is_in_and_left(changed, wanted):
 
 
 def test_success_needs_fingers_that_feel():
-    with pytest.raises(UserError, match="needs scene.fingers"):
+    with pytest.raises(UserError, match="needs 'fingers' among scene.sensors"):
         holes.let_be(view(IN, fingers=None), place=PLACE, max_speed=0.005)
 
 

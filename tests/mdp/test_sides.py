@@ -88,7 +88,7 @@ def test_success_is_a_box_that_lies_and_is_left(changed, wanted):
 
 
 def test_success_needs_fingers_that_feel():
-    with pytest.raises(UserError, match="needs scene.fingers"):
+    with pytest.raises(UserError, match="needs 'fingers' among scene.sensors"):
         sides.turned_up(view(UP, fingers=None), lying=LYING, max_speed=0.005)
 
 

@@ -194,7 +194,7 @@ def test_a_tower_that_is_touched_is_not_left_alone():
     for at, force, met in ((ON, 0.0, True), (ON, 0.01, False), (LYING, 0.0, False)):
         seen = dataclasses.replace(view(at), readings={"hand": jnp.array(force)})
         assert bool(towers.left_alone(seen, **placed(BUILT))) is met
-    with pytest.raises(UserError, match=r"towers.left_alone needs scene.hand"):
+    with pytest.raises(UserError, match=r"towers.left_alone needs 'hand' among scene.sensors"):
         towers.left_alone(view(ON), **placed(BUILT))
 
 

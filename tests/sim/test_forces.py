@@ -27,7 +27,7 @@ LIFT = """
 """
 ROBOT = slides.robot("lift", "z", LIFT, 5000.0, 200.0, 500.0)
 BALL = ObjectCfg(shape="sphere", size=(0.02,), mass=0.2, condim=6, friction=(1.0, 0.01, 0.01))
-SCENE = SceneCfg(objects={"ball": BALL}, table=False, goal="none", wrist=True, fingers=True)
+SCENE = SceneCfg(objects={"ball": BALL}, table=False, goal="none", sensors=("wrist", "fingers"))
 CFG = SimCfg(dt=0.002, decimation=5, iterations=50)
 G = 9.81
 
@@ -102,7 +102,7 @@ def test_mjx_says_that_it_has_no_net_forces(model):
 @pytest.mark.parametrize(("robot", "hand", "pads"), [(NERO, "gripper_flange", 2), (COBOTTA_PRO_900, None, 2)])
 def test_the_wrist_is_where_the_hand_is_mounted(robot, hand, pads):
     """Beyond the last joint of the arm, which no drive of the gripper moves."""
-    model = scene.build(robot, SceneCfg(wrist=True, fingers=True), SimCfg(), visuals=False, fuse=True)
+    model = scene.build(robot, SceneCfg(sensors=("wrist", "fingers")), SimCfg(), visuals=False, fuse=True)
     body, last = model.site_bodyid[model.site("wrist").id], model.joint(robot.arm.joints[-1]).bodyid[0]
     assert model.body_parentid[body] == last and (hand is None or model.body(body).name == hand)
     gauges = forces.gauges(model)
@@ -116,5 +116,5 @@ def test_a_scene_without_them_has_none():
 
 def test_a_robot_without_pads_is_told():
     bare = dataclasses.replace(ROBOT, name="bare", mjcf=ROBOT.mjcf.replace('name="pad"', 'name="plate"'))
-    with pytest.raises(UserError, match="scene.fingers measures at shapes with 'pad' in their names, and bare has none"):
-        scene.build(bare, SceneCfg(fingers=True), SimCfg(), visuals=False)
+    with pytest.raises(UserError, match="the sensor 'fingers' measures at shapes with 'pad' in their names, and bare has none"):
+        scene.build(bare, SceneCfg(sensors=("fingers",)), SimCfg(), visuals=False)

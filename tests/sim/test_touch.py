@@ -148,7 +148,7 @@ def test_backends_agree(backend, model, worlds, native):
 
 def test_what_the_robot_presses_an_object_with_is_read_and_nothing_else():
     """A cube on the table, an arm's length away; the same on the inside of a finger."""
-    model = scene.build(NERO, SceneCfg(hand=True), SimCfg(), visuals=False, fuse=True)
+    model = scene.build(NERO, SceneCfg(sensors=("hand",)), SimCfg(), visuals=False, fuse=True)
     plain = scene.build(NERO, SceneCfg(), SimCfg(), visuals=False, fuse=True)
     (name, reader), data = next(iter(touch.readers(model).items())), mujoco.MjData(model)
     assert name == touch.HAND and len(touch.readers(model)) == 1 and not touch.readers(plain)

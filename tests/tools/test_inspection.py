@@ -16,7 +16,7 @@ from mjx_nero.sim.cameras import opengl
 from mjx_nero.sim.robot import GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools import inspection
-from mjx_nero.tools.inspection import cameras, command, report
+from mjx_nero.tools.inspection import cameras, command
 from mjx_nero.types import UserError
 
 NERO, COBOTTA = (registry.robot(name) for name in ("nero", "cobotta_pro_900"))
@@ -32,8 +32,14 @@ def cobotta():
     return inspection.inspect("cobotta_pro_900")
 
 
-def test_list_envs_at_eighty_columns():
-    rows, screen = inspection.environments(), Console(width=80)
+@pytest.fixture(scope="module")
+def environments():
+    """Once: it traces every environment."""
+    return inspection.environments()
+
+
+def test_list_envs_at_eighty_columns(environments):
+    rows, screen = environments, Console(width=80)
     with screen.capture() as said:
         screen.print(inspection.environment_table(rows))
     words = said.get().split()
@@ -181,8 +187,8 @@ def test_presets_and_controllers_actions():
     assert "one entry per drive: its position target [rad or m]" in task.action and task.action_size == 8
 
 
-def test_environments():
-    rows = {row.name: row for row in inspection.environments()}
+def test_environments(environments):
+    rows = {row.name: row for row in environments}
     assert tuple(rows) == registry.list_envs()
     lift, goal = rows["nero_lift"], rows["cobotta_follow_target"]
     assert (lift.task, lift.robot, lift.presets, lift.action_size, lift.policy) == (
@@ -241,9 +247,8 @@ def test_program_takes_the_folder_of_an_imported_robot(call, tmp_path):
     assert code == 0 and "joints of cobotta_pro_900" in out
 
 
-def test_list_envs(call, monkeypatch):
-    found = report.environments()  # once: it traces every environment
-    monkeypatch.setattr(command, "environments", lambda: found)
+def test_list_envs(call, monkeypatch, environments):
+    monkeypatch.setattr(command, "environments", lambda: environments)
     code, out, err = call(program="list-envs")
     assert (code, err) == (0, "") and "state 47, privileged_state 57" in out
     monkeypatch.setenv("COLUMNS", "80")  # names stay whole however narrow the terminal

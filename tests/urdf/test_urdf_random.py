@@ -140,14 +140,14 @@ def same_kinematics(path: pathlib.Path, model: mujoco.MjModel, data: mujoco.MjDa
 
 
 @pytest.mark.slow
-@settings(max_examples=40, **COMMON)
+@settings(max_examples=20, **COMMON)
 @given(robots())
 def test_random_trees(urdf):
     assert check(urdf)
 
 
 @pytest.mark.slow
-@settings(max_examples=30, **COMMON)
+@settings(max_examples=10, **COMMON)
 @given(st.binary(max_size=300), st.sampled_from(("stl", "obj", "dae")), st.booleans())
 def test_mutated_meshes(noise, kind, append):
     """A mesh of noise, or one with noise in it, is left out with a warning, or is read."""

@@ -20,7 +20,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     """Success: the ring lies around the post on the bars, at rest, and the pads touch nothing."""
     robot = grasp.shut(robot, WALL)
     ring = ObjectCfg(shape="mesh", file="ring", **lift_any.GRIP)
-    scene = SceneCfg(objects={"ring": ring}, fixtures={"stand": FixtureCfg("stand")}, wrist=True, fingers=True, goal="none")
+    scene = SceneCfg(objects={"ring": ring}, fixtures={"stand": FixtureCfg("stand")}, sensors=("wrist", "fingers"), goal="none")
     task = Putting(
         robot,
         scenes.around(robot, scene),

@@ -36,7 +36,7 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
     width = round(HOLE - clearance, 6)
     robot, file = putting.hand(robot, width), "socket_square" if square else "socket_round"
     scene = SceneCfg(
-        objects={"peg": peg(width, square)}, fixtures={"socket": FixtureCfg(file)}, wrist=True, fingers=True, goal="none"
+        objects={"peg": peg(width, square)}, fixtures={"socket": FixtureCfg(file)}, sensors=("wrist", "fingers"), goal="none"
     )
     task = Putting(
         robot,

@@ -24,7 +24,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     there, turns = regions.of(robot), regions.turns(robot)
     box = _box(robot, LONG if turns else 1.0)
     yaw, rest = TURN if turns else STILL, box.rest_height - robot.base_pos[2]
-    scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box", hand=True))
+    scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box", sensors=("hand",)))
     angle = math.radians(15) if turns else math.pi  # a hand that cannot turn freely is not asked to
     tower = Tower(robot, scene, (towers.GOAL, "box"), box.size[2], aside=0.02, angle=angle, lifted=_lifted(box))
     named = {"object": "box"}

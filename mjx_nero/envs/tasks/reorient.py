@@ -51,7 +51,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     there, box, one = regions.of(robot), grasp.cube_for(robot), {"object": BOX}
     edge = box.size[0]
     robot = dataclasses.replace(grasp.opened(robot, WIDER * edge), gravity_compensation=True)
-    scene = scenes.around(robot, SceneCfg(objects={BOX: box}, fingers=True, goal="none"))
+    scene = scenes.around(robot, SceneCfg(objects={BOX: box}, sensors=("fingers",), goal="none"))
     lying = Lying(
         object=BOX,
         rest=box.rest_height,

@@ -32,7 +32,7 @@ def three(robot: RobotCfg) -> EnvCfg:
 def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
     cube, there = grasp.cube_for(robot), regions.of(robot)
     edge, objects = cube.size[0], {name: dataclasses.replace(cube, rgba=COLORS[name]) for name in list(COLORS)[:count]}
-    scene = scenes.around(robot, SceneCfg(objects=objects, goal="none", hand=True))
+    scene = scenes.around(robot, SceneCfg(objects=objects, goal="none", sensors=("hand",)))
     # A cube counts as on the other, and may come straight down, with its centre above the face below. It counts as held from a
     # height that a cube leaning on its edge never reaches.
     tower = Tower(robot, scene, tuple(objects), edge, aside=edge / 2, lifted=max(LIFTED, edge / 4))

@@ -5,7 +5,7 @@ A backend is one module with one class; ``make_physics`` picks it by name. All b
 
 import contextlib
 import dataclasses
-import importlib
+import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
@@ -91,9 +91,7 @@ def impls() -> tuple[str, ...]:
 
 def warp_available() -> bool:
     """True if MJX-Warp is installed and JAX runs on an NVIDIA GPU."""
-    import mujoco.mjx.warp as mjxw
-
-    return bool(mjxw.WARP_INSTALLED) and jax.default_backend() == "gpu"
+    return importlib.util.find_spec("warp") is not None and jax.default_backend() == "gpu"
 
 
 def resolve_impl(impl: str) -> str:
