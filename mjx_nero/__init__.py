@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mjx_nero.errors import UserError
     from mjx_nero.guests import register
 
-__version__ = "0.5.0"
+__version__ = "0.6.0.dev0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make", "register"]
 
 # Public name -> the module that has it. Loaded at its first use: JAX, MuJoCo and Brax take seconds.
