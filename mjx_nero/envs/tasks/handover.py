@@ -212,15 +212,11 @@ def pair(giver: RobotCfg, taker: RobotCfg) -> Pair:
 def both_arms() -> dict[str, Term]:
     """Lists action terms: velocities and a continuous gripper for each robot (``tasks.building.lets_go``)."""
     own = {"arm": "arm", "gripper": "gripper", "taker_arm": f"{TAKER}/arm", "taker_gripper": f"{TAKER}/gripper"}
-    kinds: dict[str, tuple[Callable, dict]] = {
-        "arm": (actions.JointVelocity, {"follows": True}),  # the script times two arms: neither may come late
-        "gripper": (actions.ContinuousGripper, {}),
-    }
-    terms = {name: (*kinds[name.removeprefix("taker_")], group) for name, group in own.items()}
+    kinds: dict[str, Callable] = {"arm": actions.JointVelocity, "gripper": actions.ContinuousGripper}
     grippers = {name: group for name, group in own.items() if name.endswith("gripper")}
     return {
         "delay": Term(actions.Delay, params={"steps": (0, 1)}),
-        **{name: Term(func, params={"group": group, **params}) for name, (func, params, group) in terms.items()},
+        **{name: Term(kinds[name.removeprefix("taker_")], params={"group": group}) for name, group in own.items()},
         **{f"{name}_anti_windup": Term(actions.AntiWindup, params={"group": group}) for name, group in grippers.items()},
         **{f"{name}_speed_limit": Term(actions.SpeedLimit, params={"group": group}) for name, group in grippers.items()},
     }
