@@ -89,7 +89,7 @@ def test_warp_agrees(model, native):
 @pytest.mark.slow
 def test_mjx_weighs_the_same_at_the_wrist(native):
     """Only at rest: a drive at its limit damps otherwise there."""
-    model = scene.build(ROBOT, dataclasses.replace(SCENE, fingers=False), CFG, visuals=False, fuse=True)
+    model = scene.build(ROBOT, dataclasses.replace(SCENE, sensors=("wrist",)), CFG, visuals=False, fuse=True)
     _, found = play(JaxPhysics(model, CFG), fingers=False)
     np.testing.assert_allclose(found["wrist"][-1], native["wrist"][-1], atol=0.05)
 
