@@ -21,6 +21,8 @@ from mjx_nero.types import View
 
 ABOVE, DOWN, CLOSE, UP, TURN, SET, OPEN, BACK, REST = range(9)
 _LOST = 0.05  # [m] further than this from the grasp point, the cube has been lost
+_CLEAR = 0.01  # [m] of a cube's edge above the table while it is turned
+_UNDER = 0.01  # [m] the cube is at most so far below the height to which it is lifted, when the hand begins to turn
 _LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] a phase has so much time
 
 
@@ -115,8 +117,9 @@ class TurnOver:
         wanted_q = jnp.where(stays, memory.q, found)
         closed = (phase >= CLOSE) & (phase <= SET)
         fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
-        # Straight, as the hand may dip until the cube strikes the table if some joints are there before the others.
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest, phase == TURN)
+        q = jnp.where(phase == TURN, self._above(q), q)
+        qd = jnp.where(phase == TURN, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
         ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
@@ -138,6 +141,12 @@ class TurnOver:
             tries=memory.tries + begins,
         )
         return memory, jnp.concatenate([q + self._lead * qd, fingers])
+
+    def _above(self, q: Float[Array, " nj"]) -> Float[Array, " nj"]:
+        """Lifts the hand where a cube in it would strike the table with an edge: straight ways of joints may dip."""
+        pos, quat = (x[0] for x in self._ik.chain.poses(q))
+        lacks = jnp.maximum(0.0, np.sqrt(2) * self.cfg.rest + _CLEAR - self._turns.held(pos, quat)[2])
+        return self._ik.local(pos + lacks * jnp.array([0.0, 0.0, 1.0]), quat, q).q
 
     def _wanted(self, memory: TurnOverMemory, cube: Float[Array, "3"]) -> Float[Array, "3"]:
         """The place where the grasp point has to be at the end of the phase."""
@@ -164,7 +173,7 @@ class TurnOver:
         phase, time = memory.phase, (memory.count + 1) * self.dt
         still = jnp.max(jnp.abs(memory.qd)) < 0.2
         careful = (phase == ABOVE) | (phase == TURN) | (phase == DOWN) | (phase == SET)
-        done = jnp.where(careful, arrived & still & (error < 0.008), arrived)
+        done = jnp.where(careful, arrived & still & (error < 0.008), arrived & ((phase != UP) | (error < _UNDER)))
         done = jnp.where((phase == CLOSE) | (phase == OPEN), time > self._closed, done)
         late = jnp.select([phase == each for each in _LATE], [time > most for most in _LATE.values()], False)
         return (done | late) & (phase != REST)

@@ -76,6 +76,10 @@ class Turns:
         """Place of the grasp point with the cube's centre between the pads."""
         return cube - math.rotate(quat, jnp.asarray(self._grip)) - self._beyond * self.into(quat)
 
+    def held(self, pos: Float[Array, "3"], quat: Float[Array, "4"]) -> Float[Array, "3"]:
+        """Place of the centre of a cube between the pads, with the grasp point at ``pos``: the inverse of ``hold``."""
+        return pos + math.rotate(quat, jnp.asarray(self._grip)) + self._beyond * self.into(quat)
+
     def _hand(self, angle: Array, flip: Array, lean: float) -> Float[Array, "4"]:
         """Orientation of a hand that leans in a direction and closes across it, to either side (``flip`` 0 or 1)."""
         axis = jnp.stack([jnp.sin(angle), -jnp.cos(angle), jnp.zeros_like(angle)])
