@@ -15,10 +15,12 @@ ARMS = ("nero", "cobotta", "piper", "so100", "so101")
 MISSING = {
     *(f"{arm}_hang_ring" for arm in ARMS),
     *(f"{arm}_insert_peg" for arm in ARMS if arm != "cobotta"),
-    *(f"{arm}_reorient" for arm in ("nero", "cobotta", "piper")),
     *(f"{arm}_{task}" for arm in ("piper", "so100", "so101") for task in ("open_door", "turn_knob")),
     *(f"{arm}_{task}" for arm in ("so100", "so101") for task in ("open_drawer", "lift_any")),
     "piper_reach_obstacles",
+    "piper_reorient",
+    "nero_handover",
+    "nero_cobotta_handover",
 }
 
 
