@@ -307,7 +307,7 @@ def default(robot: RobotCfg, taker: RobotCfg | None = None) -> EnvCfg:
         robot=two.giver.robot,
         scene=scene,
         sim=contacts.sized(two.giver.robot, scene, SimCfg(ramp=slowest > 0)),
-        episode_length_s=12.0,
+        episode_length_s=15.0,
         actions=both_arms(),
         controllers={"hand_over": two.script()},
         command=_goal(two),
