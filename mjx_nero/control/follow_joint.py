@@ -24,6 +24,7 @@ from mjx_nero.types import UserError, View
 BEFORE, IN, CLOSE, MOVE = range(4)
 _SETTLING = 0.25  # [s] in about this time a handle that has slipped in the hand is brought the rest of its way
 _STILL = 0.05  # [rad/s]
+_STIFF = UNREACHABLE / 2  # a hand that does not turn with the handle counts as so many radians to move
 _LOST = 0.04  # [m] further than this from the grasp point, the handle has been lost
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
@@ -36,7 +37,7 @@ class FollowJointCfg:
         file: the fixture's (``FixtureCfg.file``).
         handle: what to take hold of, how, and where its joint has to go.
         beyond: how much farther than its target the joint is moved, as a share.
-        follow: share of the joint's turn that the hand makes. A round bar turns between the pads.
+        follow: share of the joint's turn that the hand makes; none if the arm cannot. A round bar turns between the pads.
         before: distance in front of the handle from which the hand comes [m].
         depth: how far the grasp point goes beyond the middle of the handle, in the hand's direction [m].
         speed: of the grasp point [m/s].
@@ -67,6 +68,7 @@ class FollowJointMemory:
     qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
     before: Float[Array, " nj"]  # the arm in front of the handle [rad]
     flip: Float[Array, ""]  # turn of the hand about the way in: 0 or half a turn [rad]
+    follow: Float[Array, ""]  # share of the joint's turn that the hand makes
     out: Float[Array, ""]  # how far in front of the handle the set-point is [m]
     joint: Float[Array, ""]  # where the set-point is on the joint's path [rad or m]
     slip: Float[Array, ""]  # how far it has to go beyond the target, so that the joint gets there [rad or m]
@@ -112,20 +114,24 @@ class FollowJoint:
         self._lost = float(np.linalg.norm(robot.grip)) + _LOST
 
     def init(self, view: View) -> FollowJointMemory:
-        """Chooses how to take hold: of both ways to turn the hand, the one that reaches the whole path with the least motion."""
+        """Chooses how to take hold: of both ways to turn the hand, the one that reaches the whole path with the least motion.
+
+        If neither does, and the hand was to turn with the handle, it does not.
+        """
         zero, q = jnp.zeros((), jnp.int32), view.joint_pos[: self._n]
-        now, flips = self._now(view), jnp.array([0.0, jnp.pi])
+        now, follows = self._now(view), jnp.array([self.cfg.follow, self.cfg.follow, 0.0, 0.0])
+        flips = jnp.array([0.0, jnp.pi, 0.0, jnp.pi])
         path = [(now, self.cfg.before), (now, 0.0), (self._target(view), 0.0)]
-        poses = [jax.vmap(lambda flip, at=at, out=out: self._pose(view, flip, at, out))(flips) for at, out in path]
-        start = jnp.broadcast_to(q, (2, self._n))
+        ways = jax.vmap(self._pose, (None, 0, 0, None, None))
+        poses = [ways(view, flips, follows, at, out) for at, out in path]
+        start = jnp.broadcast_to(q, (len(flips), self._n))
         found = [self._ik.solve_batch(*poses[0], start, jax.random.PRNGKey(0))]
         for pose in poses[1:]:
             found.append(jax.vmap(self._ik.local)(*pose, found[-1].q))
         way = jnp.linalg.norm(found[0].q - q, axis=1) + UNREACHABLE * sum(~one.success for one in found)
-        best = jnp.argmin(way)
-        out = jnp.asarray(self.cfg.before)
-        slip = jnp.zeros(())
-        return FollowJointMemory(zero, zero, q, jnp.zeros_like(q), found[0].q[best], flips[best], out, now, slip, zero)
+        best = jnp.argmin(way + _STIFF * (jnp.arange(len(flips)) >= 2))
+        out, slip, still = jnp.asarray(self.cfg.before), jnp.zeros(()), jnp.zeros_like(q)
+        return FollowJointMemory(zero, zero, q, still, found[0].q[best], flips[best], follows[best], out, now, slip, zero)
 
     def step(self, memory: FollowJointMemory, view: View) -> tuple[FollowJointMemory, Float[Array, " nu"]]:
         """Targets of all drives."""
@@ -140,7 +146,7 @@ class FollowJoint:
         there = holds & (jnp.abs(left) < self._step) & (jnp.max(jnp.abs(memory.qd)) < _STILL)
         slip = memory.slip + jnp.where(there, self.dt / _SETTLING, 0.0) * (target - now)
         joint = jnp.where(holds, jnp.clip(moved, now - ahead, now + ahead), now)
-        pos, quat = self._pose(view, memory.flip, joint, out)
+        pos, quat = self._pose(view, memory.flip, memory.follow, joint, out)
         found = self._ik.local(pos, quat, memory.q).q
         wanted = jnp.where(phase == BEFORE, memory.before, jnp.where(phase == CLOSE, memory.q, found))
         q, qd = setpoint.follow(memory.q, memory.qd, wanted, jnp.asarray(self._speed), self.dt)
@@ -149,7 +155,7 @@ class FollowJoint:
 
         lost = holds & (terms.distance(view, self.cfg.handle) > self._lost)
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - pos), out)
-        start = self._ik.local(*self._pose(view, memory.flip, now, self.cfg.before), memory.before).q
+        start = self._ik.local(*self._pose(view, memory.flip, memory.follow, now, self.cfg.before), memory.before).q
         memory = dataclasses.replace(
             memory,
             phase=jnp.where(lost, BEFORE, phase + ended),
@@ -197,12 +203,12 @@ class FollowJoint:
         low, high = view.fixtures[self.cfg.handle.fixture].joint_range[self.cfg.handle.joint]
         return jnp.clip(wanted, low, high)
 
-    def _pose(self, view: View, flip: Float[Array, ""], joint: Array, out: float | Array) -> Pose:
+    def _pose(self, view: View, flip: Float[Array, ""], follow: Float[Array, ""], joint: Array, out: float | Array) -> Pose:
         """Pose of the hand that fits the handle where its joint is at ``joint``, from ``out`` in front of it [m].
 
-        The hand turns along with the joint, by its share.
+        The hand turns along with the joint, by the share ``follow``.
         """
-        (pos, _), (_, turn) = self._site(view, joint), self._site(view, self.cfg.follow * joint)
+        (pos, _), (_, turn) = self._site(view, joint), self._site(view, follow * joint)
         site = math.quat_mul(turn, math.axis_angle(jnp.array([1.0, 0.0, 0.0]), flip))
         quat = math.quat_mul(site, jnp.array(self.cfg.handle.grip))
         into = math.rotate(quat, jnp.asarray(self._approach))

@@ -10,6 +10,7 @@ from mjx_nero.learn.play import evaluation
     [
         ("nero_insert_peg", "default", None, 24, 0.8),
         ("nero_open_drawer", "default", None, 24, 0.9),
+        ("piper_open_door", "default", None, 24, 0.85),
         ("nero_reorient", "default", None, 24, 0.75),
         ("nero_clutter", "default", None, 32, 28 / 32),
         ("stack", "default", "piper", 8, 1.0),

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero import env_cfg, make
+from mjx_nero import control, env_cfg, make
 from mjx_nero.envs import wrappers
+from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.task import for_controllers
 from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import resume, starts
 from mjx_nero.learn.runs.cfg import Asked
@@ -85,6 +87,16 @@ def test_the_script_does_it():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("arm", "follow"), [("nero", 0.5), ("piper", 0.0)])
+def test_a_hand_that_cannot_turn_with_a_door_does_not(arm, follow):
+    """Piper's wrist is straight in front of the handle, and has no way to the side."""
+    cfg = for_controllers(env_cfg(f"{arm}_open_door"))
+    env = ManipulationEnv(cfg, impl="native", num_envs=1)
+    expert = control.make("follow_joint", cfg.robot, env.dt, cfg.controllers["follow_joint"])
+    begun = jax.jit(lambda key: expert.init(env.view(env.reset(key))))(jax.random.PRNGKey(0))
+    assert float(begun.follow) == follow
+
+
 def test_a_learner_may_begin_where_the_script_was(env):
     """Half of the script's states have the drawer open by some centimetres, in the hand, and episodes begin there."""
     play = starts._player(env, 8)
