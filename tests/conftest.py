@@ -56,13 +56,6 @@ from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
-# With an old JAX, the learner's native programs have a fusion of XLA back that makes networks quicker (``physics.fusion``) and
-# their compilation three times as long. Tests compile more than they run: "=0" is "=false" for XLA, but not for ``fusion``. Nor
-# need XLA split its code between the cores: other tests run on them.
-if "xla_cpu_use_fusion_emitters=false" in os.environ.get("XLA_FLAGS", ""):
-    _flags = os.environ["XLA_FLAGS"].replace("xla_cpu_use_fusion_emitters=false", "xla_cpu_use_fusion_emitters=0")
-    os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_parallel_codegen_split_count=1"
-
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)

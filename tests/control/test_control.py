@@ -490,6 +490,7 @@ def test_make_by_name():
         "carry",
         "follow_joint",
         "grasp_thing",
+        "hand_over",
         "put_in",
         "put_thing",
         "turn_over",

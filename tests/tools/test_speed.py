@@ -6,7 +6,6 @@ dear.
 """
 
 import dataclasses
-import os
 import statistics
 import time
 
@@ -29,9 +28,7 @@ NUM_ENVS, ROUNDS = 128, 5
 class Still:
     """Physics that does nothing: what is left of a step is the MDP."""
 
-    @property
-    def compiler_options(self):
-        return fusion()  # as the other programs are compiled
+    compiler_options = fusion()  # as the other programs are compiled
 
     def step(self, sim, ctrl):
         return sim, jnp.zeros(())
@@ -42,9 +39,7 @@ def optimised():
     """XLA's optimisations, which the other tests do without."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace("emitters=0", "emitters=false"))  # for ``fusion``
-        yield
+    yield
     jax.config.update("jax_disable_most_optimizations", before)
 
 
