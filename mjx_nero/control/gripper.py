@@ -13,6 +13,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 Positions = Float[Array, " n"]
+PRESS = 0.15  # [s] the fingers press so long before the hand moves
 GRIP_FILTER = 0.05  # of how far the object is off in the grip: the share of a new measurement, a control step
 
 
@@ -65,6 +66,18 @@ class ParallelGripper:
     def step(self, positions: Positions, deltas) -> Positions:
         """Returns targets ``deltas`` away from the measured ``positions`` [rad or m]."""
         return self._clip(positions + jnp.asarray(deltas, jnp.float32))
+
+    def pace(self, closing: float, dt: float) -> tuple[float, Float[np.ndarray, " n"]]:
+        """Returns when a hand that closes without haste has closed and presses [s], and how far its fingers move in a step.
+
+        Drives that lag are slow to press, and their heavy rotors throw what they meet at speed.
+
+        Args:
+            closing: how long the fingers take [s], beside the lag of their drives.
+            dt: control step [s].
+        """
+        lag, travel = float(np.max(self._robot.gripper.lead, initial=0.0)), np.abs(self.opened - self.closed)
+        return closing + 2 * lag + PRESS, np.minimum(self._speed, travel / (closing + lag)).astype(np.float32) * dt
 
     def forward(self, closing: Bool[Array, ""], positions: Positions, targets: Positions, dt: float) -> Positions:
         """Moves ``targets`` towards open or closed for ``dt`` seconds at the drives' speed limit."""

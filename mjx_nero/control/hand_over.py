@@ -19,7 +19,6 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
 OVER, DOWN, CLOSE, UP, MEET, NEAR, REACH, GRIP, LET, LEAVE, BRING, HOLD = range(12)
-PRESS = 0.15  # [s] the fingers press so long before the hand moves
 _SLOW = 0.1  # [rad/s]
 _THERE = 0.05  # [rad] an arm so near to where it goes has arrived
 _LONGEST = 4.0  # [s] of a way across; and of a way up or down:
@@ -94,9 +93,7 @@ class _Arm:
         self.down, self.held = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
         self.lead, self.speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
         self.gentle = setpoint.gentle(robot.arm.lead)
-        lag, travel = float(np.max(robot.gripper.lead, initial=0.0)), np.abs(self.gripper.opened - self.gripper.closed)
-        self.closed = cfg.closing[place] + 2 * lag + PRESS
-        self.finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing[place] + lag)).astype(np.float32) * dt
+        self.closed, self.finger_step = self.gripper.pace(cfg.closing[place], dt)
         self.lowest, self.beyond = cfg.lowest[place], cfg.beyond[place]
         self.side = np.float32(cfg.along * (2 * place - 1))  # of its end of the object
 

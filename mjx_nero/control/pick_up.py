@@ -24,7 +24,6 @@ UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
-PRESS = 0.15  # [s] the fingers press so long before the hand lifts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,11 +111,7 @@ class PickUp:
         self._opening = np.array(grasp.opening(robot), np.float32)
         self.lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
         self.gentle = setpoint.gentle(robot.arm.lead)
-        travel = np.abs(self.gripper.opened - self.gripper.closed)
-        # Drives that lag are slow to press, and their heavy rotors throw what they meet at speed.
-        lag = float(np.max(robot.gripper.lead, initial=0.0))
-        self.closed = cfg.closing + 2 * lag + PRESS
-        self.finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
+        self.closed, self.finger_step = self.gripper.pace(cfg.closing, dt)
         self.lost = float(np.linalg.norm(robot.grip)) + _LOST
         self._reach = robot.opening / 2  # of a finger from the grasp point
         # From an object's heading; a round one has none.

@@ -12,7 +12,6 @@ from mjx_nero.config.bounds import Positive
 from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
-from mjx_nero.control.pick_up import PRESS
 from mjx_nero.control.turns import TOP, Plan, Table, Turns
 from mjx_nero.mdp import sides
 from mjx_nero.mdp.actions import rate_limit
@@ -90,9 +89,7 @@ class TurnOver:
         self._n = len(robot.arm.joints)
         self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
         self._gentle = setpoint.gentle(robot.arm.lead)
-        travel, lag = np.abs(self.gripper.opened - self.gripper.closed), float(np.max(robot.gripper.lead, initial=0.0))
-        self._closed = cfg.closing + 2 * lag + PRESS
-        self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / (cfg.closing + lag)).astype(np.float32) * dt
+        self._closed, self._finger_step = self.gripper.pace(cfg.closing, dt)
         self._lost = float(np.linalg.norm(robot.grip)) + abs(cfg.beyond) + _LOST
         self._turns = Turns(robot, self._ik, (*cfg.spot, cfg.rest), cfg.lean, cfg.beyond, cfg.before, cfg.lift)
 

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config.bounds import Positive
-from mjx_nero.mdp import towers
+from mjx_nero.mdp import success, towers
 from mjx_nero.mdp.towers import Place, Scalar
-from mjx_nero.types import UserError, View
+from mjx_nero.types import View
 
 
 def to_place(view: View, *, place: Place) -> Float[Array, "3"]:
@@ -21,11 +21,7 @@ def let_be(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
     Raises:
         UserError: the scene has none.
     """
-    if "fingers" not in view.readings:
-        raise UserError(
-            "holes.let_be needs 'fingers' among scene.sensors, and this task is without, or its backend cannot measure them"
-        )
-    return towers.built(view, place=place, max_speed=max_speed) & (jnp.max(view.readings["fingers"]) == 0)
+    return success.pads_are_free(view, "holes.let_be") & towers.built(view, place=place, max_speed=max_speed)
 
 
 def lowered(view: View, *, place: Place, top: Positive, std: Positive, flat: Positive) -> Scalar:

@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive, Range
+from mjx_nero.mdp import success
 from mjx_nero.mdp.rewards import held
-from mjx_nero.types import Key, Start, UserError, View
+from mjx_nero.types import Key, Start, View
 
 NORMALS = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 
@@ -124,13 +125,10 @@ def turned_up(view: View, *, lying: Lying, max_speed: Positive) -> Bool[Array, "
     Raises:
         UserError: the scene has no sensors of the fingers.
     """
-    if "fingers" not in view.readings:
-        raise UserError(
-            "sides.turned_up needs 'fingers' among scene.sensors, and this task is without, or its backend cannot measure them"
-        )
+    free = success.pads_are_free(view, "sides.turned_up")
     seen = view.objects[lying.object]
     still = (jnp.linalg.norm(seen.linvel_w) < max_speed) & (jnp.linalg.norm(seen.angvel_local) < 10 * max_speed)
-    return stands(view, lying) & still & (_away(view, lying) > lying.clearance) & (jnp.max(view.readings["fingers"]) == 0)
+    return stands(view, lying) & still & (_away(view, lying) > lying.clearance) & free
 
 
 # Rewards.

@@ -68,6 +68,21 @@ def touched(view: View) -> Bool[Array, ""]:
     return view.readings["touch"] > 0
 
 
+def pads_are_free(view: View, term: str) -> Bool[Array, ""]:
+    """True if the pads touch nothing, by the scene's sensors of the fingers.
+
+    Args:
+        term: who asks.
+
+    Raises:
+        UserError: the scene has none.
+    """
+    if "fingers" not in view.readings:
+        without = "this task is without, or its backend cannot measure them"
+        raise UserError(f"{term} needs 'fingers' among scene.sensors, and {without}")
+    return jnp.max(view.readings["fingers"]) == 0
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AtGoalUntouched:
     """Success at the goal, if nothing has been touched since the start (see ``View.readings``).

@@ -9,7 +9,7 @@ import pytest
 import views
 
 from mjx_nero import UserError, control
-from mjx_nero.control import pick_up
+from mjx_nero.control import gripper, pick_up
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
@@ -93,7 +93,7 @@ def test_a_jaw_that_turns_goes_beside_a_small_object_as_it_goes_beside_the_cube(
 def test_fingers_whose_drives_lag_get_time_to_press():
     """A third of a second, the jaw's damping over its stiffness: its targets take as much longer, and the hand waits as long."""
     slow, quick = (PickUp(robot, 0.02, PickUpCfg(closing=0.4)) for robot in (SO_ARM100, NERO))
-    assert slow.closed == pytest.approx(0.4 + 2 / 3 + pick_up.PRESS) and quick.closed == pytest.approx(0.4 + 0.05 + pick_up.PRESS)
+    assert slow.closed == pytest.approx(0.4 + 2 / 3 + gripper.PRESS) and quick.closed == pytest.approx(0.4 + 0.05 + gripper.PRESS)
     np.testing.assert_allclose(slow.finger_step, 0.5 * 0.02 / (0.4 + 1 / 3), rtol=1e-5)
     assert slow.gentle == 6.0 and quick.gentle == 1.5  # [rad/s2]: the SO-ARM's own drives hardly lag, Nero's by half a second
 
