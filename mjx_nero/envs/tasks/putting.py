@@ -71,7 +71,8 @@ class Putting(Tower):
         place, one = self.place, {"object": self.object}
         way = {**place, "top": self.top, "flat": self.aside}
         turned = Term(rewards.object_goal_turn, params={"std": 0.2, "fold": max(self.fold, 1), **one})
-        found = {name: term for name, term in super().rewards().items() if not name.startswith("approaching")}
+        # That a hand rests afterwards has been tried with place and stack alone.
+        found = {name: term for name, term in super().rewards().items() if not name.startswith(("approaching", "resting"))}
         return {
             **found,
             **nearer("lowering", holes.lowered, **way),
