@@ -32,6 +32,8 @@ EPISODES = 64
 # Greatest standard deviation of the noise on the expert's actions, if they are velocities or not: noisy positions shake the arm.
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
+# A controller of 64 arms is thousands of tiny operations. Shared among the threads of a large machine they take ten times as long.
+_ONE_THREAD = {"xla_cpu_multi_thread_eigen": False}
 COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
 _HOLD = "success.hold"
 
@@ -136,7 +138,7 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
     quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
     expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
     some = jax.random.split(jax.random.PRNGKey(0), count)
-    run = jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile()
+    run = jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile(_ONE_THREAD)
 
     def play(seed: int) -> tuple[Way, Shown]:
         found: Any = jax.device_get(run(jax.random.split(jax.random.PRNGKey(seed), count)))

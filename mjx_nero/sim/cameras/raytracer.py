@@ -102,7 +102,7 @@ class RayTracer:
             "depth_out": wp.array(dtype=float, ndim=2),
             "segmentation_out": wp.array(dtype=wp.vec2i, ndim=2),
         }
-        call = wp.jax_callable(draw, num_outputs=3, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
+        call = kernels.as_jax(draw, outputs=3)
 
         @jax.custom_batching.custom_vmap
         def batched(given, *due):

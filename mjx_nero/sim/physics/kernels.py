@@ -38,6 +38,21 @@ def make(
     return lambda: wp.launch(environments, dim=n * threads, inputs=[problem], block_dim=block)
 
 
+def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
+    """Makes a function of Warp's arrays a function of JAX's, which XLA calls on the stream that it computes on.
+
+    No graph mode of Warp's: it would capture the function for every set of addresses that XLA comes up with. And nothing is loaded
+    while JAX traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
+
+    Args:
+        function: takes arrays, annotated as Warp's; the last ``outputs`` of them are written.
+    """
+    import warp as wp
+
+    modes = {"graph_mode": wp.JaxCallableGraphMode.NONE, "module_preload_mode": wp.JaxModulePreloadMode.NONE}
+    return wp.jax_callable(function, num_outputs=outputs, vmap_method=None, **modes)
+
+
 def source(name: str) -> str:
     """A source of this folder."""
     return resources.files(__package__).joinpath(f"{name}.cu").read_text()

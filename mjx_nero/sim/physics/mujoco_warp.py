@@ -66,8 +66,6 @@ class WarpPhysics:
     def _as_jax(self) -> Callable:
         import warp as wp
 
-        # Called by XLA on the stream that it computes on. No graph mode of Warp's: it would capture these copies for every set of
-        # addresses that XLA comes up with, where one graph of the steps between them does.
         def control_step(qpos, qvel, given, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out, force_out):
             data, wanted, drawn, run, strongest, _ = self._get(qpos.shape[0])
             wp.copy(data.qpos, qpos)
@@ -91,7 +89,7 @@ class WarpPhysics:
             "overflow_out": wp.array(dtype=int),
             "force_out": wp.array(dtype=float, ndim=2),
         }
-        call = wp.jax_callable(control_step, num_outputs=5, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
+        call = kernels.as_jax(control_step, outputs=5)
         nq, nv = self.model.nq, self.model.nv
 
         @jax.custom_batching.custom_vmap
