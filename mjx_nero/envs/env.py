@@ -89,7 +89,7 @@ class ManipulationEnv(Env):
     """
 
     def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
-        cfg = things.applied(identified.applied(cfg))
+        cfg = things.laid(things.applied(identified.applied(cfg)))
         self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), values.read(bounds.Worlds, num_envs, "num_envs")
         self.dt = cfg.sim.dt * cfg.sim.decimation
         if cfg.episode_length_s / self.dt > _LONGEST:
