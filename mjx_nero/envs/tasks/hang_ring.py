@@ -11,7 +11,7 @@ from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 
 THICK, WALL = 0.018, 0.015  # [m] of the ring (assets/objects/make.py)
 TIP = 0.038  # [m] the post's, over the bars that the ring comes to lie on (assets/fixtures/stand)
-ROOM = 0.013  # [m] between the post and the ring, on each side
+ROOM = 0.016  # [m] from the post's middle to the ring's, at most, while it lies around the post: its play is 15 mm
 LIFTED = 0.003  # [m] with half its thickness, the height of the lowest point of a lifted ring
 PRESS = 0.008  # [m] on the post, which the ring seldom meets
 OFF = 0.003  # [m] the stand is so far from where it is said to be
