@@ -24,17 +24,20 @@ T = TypeVar("T", bound=Term)
 
 def places(condition: Term) -> bool:
     """True if the success of a task is one object at the goal, left alone."""
-    place = condition.params.get("place")
-    return bounds.unwrapped(condition.func) is towers.left_alone and place.tower[0] == towers.GOAL and len(place.tower) == 2
+    if bounds.unwrapped(condition.func) is not towers.left_alone:
+        return False
+    tower = condition.params["place"].tower
+    return tower[0] == towers.GOAL and len(tower) == 2
 
 
-def unturned(quat: np.ndarray) -> tuple[float, ...]:
+def unturned(quat: np.ndarray) -> tuple[float, float, float, float]:
     """The orientation without its turn about the vertical, which comes last (wxyz)."""
     w, x, y, z = quat
     half = -np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
     out = np.zeros(4)
     mujoco.mju_mulQuat(out, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), np.asarray(quat, float))
-    return tuple(round(float(v), 6) for v in out / np.linalg.norm(out))
+    w, x, y, z = (round(float(v), 6) for v in out / np.linalg.norm(out))
+    return w, x, y, z
 
 
 def applied(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:

@@ -65,7 +65,7 @@ def _part(cfg: EnvCfg) -> tuple[str, str]:
     return names[0], what
 
 
-def _stands(item: ObjectCfg, what: str) -> tuple[float, ...]:
+def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
     """How a thing stands: as its file has it, or, if it is not pushed, as it rests most often; about the vertical as its file.
 
     Raises:
