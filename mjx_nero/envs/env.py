@@ -48,7 +48,7 @@ from mjx_nero.types import (
     View,
 )
 
-_MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
+MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
 # Folded into an episode's key, so that one part's draws leave all others unchanged.
 _FIELDS, _MEMORY, _SENSORS, _FOLLOWING, _VISITED, _LOOK = 0xF1E1D5, 0x3E3087, 0x5E4504, 0xF0110E, 0x715173D, 0x1004
@@ -89,7 +89,7 @@ class ManipulationEnv(Env):
     """
 
     def __init__(self, cfg: EnvCfg, impl: str = "auto", num_envs: int = 1):
-        cfg = things.applied(identified.applied(cfg))
+        cfg = things.laid(things.applied(identified.applied(cfg)))
         self.cfg, self.impl, self.num_envs = cfg, resolve_impl(impl), values.read(bounds.Worlds, num_envs, "num_envs")
         self.dt = cfg.sim.dt * cfg.sim.decimation
         if cfg.episode_length_s / self.dt > _LONGEST:
@@ -480,7 +480,7 @@ class ManipulationEnv(Env):
 
     def _guard(self, state: State, action: Float[Array, " na"], sim: Sim) -> tuple[Sim, Float[Array, " na"], Bool[Array, ""]]:
         """Keeps a diverged environment at its last good state and marks it, so that nothing of the bad state spreads."""
-        bad = ~(jnp.all(jnp.abs(sim.qpos) < jnp.inf) & jnp.all(jnp.abs(sim.qvel) < _MAX_SPEED) & jnp.all(jnp.isfinite(action)))
+        bad = ~(jnp.all(jnp.abs(sim.qpos) < jnp.inf) & jnp.all(jnp.abs(sim.qvel) < MAX_SPEED) & jnp.all(jnp.isfinite(action)))
         sim = jax.tree.map(lambda old, new: jnp.where(bad, old, new), state.pipeline_state, sim)
         return sim, jnp.where(bad, state.info["carry"].action, action), bad
 

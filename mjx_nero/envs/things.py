@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mjx_nero.config import bounds
+from mjx_nero.envs import placing
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.tasks.lift_any import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import randomization, success
@@ -17,60 +18,108 @@ from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.types import UserError
 
 _UPRIGHT = np.cos(np.radians(3.0))
+SCRIPTS = ("pick_up", "grasp_thing")  # of tasks that lift one object
+LIFTS, PUSHES, PLACES = "lifts", "pushes", "places"
 T = TypeVar("T", bound=Term)
 
 
 def applied(cfg: EnvCfg) -> EnvCfg:
     """Returns the task with ``cfg.object`` in the place of its one object.
 
-    A lifted thing lies in any of its ways of resting; one that is pushed stands as its file does. Terms about heights and grasps
-    then count from its surface, and the script that picks up uses its grasps.
+    A lifted thing lies in any of its ways of resting; one that is pushed or placed stands as its file does, and one that does
+    not stand so is placed as it mostly rests. Terms about heights and grasps then count from its surface, and the script that
+    picks up uses its grasps.
 
     Raises:
-        UserError: the task has not one object that is lifted or pushed, the thing cannot be used, or does not stand.
+        UserError: the task has not one object that is lifted, pushed or placed, the thing cannot be used, or does not stand.
     """
     if not cfg.object.file:
         return cfg
-    names, script = tuple(cfg.scene.objects), next(iter(cfg.controllers), "")
-    pushed = any(bounds.unwrapped(term.func) is success.object_at_pose for term in (cfg.success.condition,))
-    if len(names) != 1 or not (pushed or script in ("pick_up", "grasp_thing")):
-        raise UserError(
-            "object takes the place of the one object that a task lifts or pushes, and this task has none: in others, write "
-            "scene.objects.NAME.shape=mesh and scene.objects.NAME.file=FILE"
-        )
-    (name,), thing = names, cfg.object
+    name, what = _part(cfg)
+    thing, was = cfg.object, cfg.scene.objects[name]
     item = ObjectCfg(shape="mesh", file=thing.file, scale=thing.scale, density=thing.density, **GRIP)
-    if cfg.scene.objects[name] == item:
+    item = dataclasses.replace(item, pos=was.pos, quat=(1.0, 0.0, 0.0, 0.0) if what == LIFTS else _stands(item, what))
+    if was == item:
         return cfg
-    (solid,) = item.solids
-    standing = [quat for quat in solid.rest_quat if rests.up(quat)[2] > _UPRIGHT]
-    if pushed and not standing:
-        raise UserError(f"{thing.file} does not stand as its file has it, and what is pushed has to: turn it in the file")
-    was = cfg.scene.objects[name]
-    scene = dataclasses.replace(cfg.scene, objects={name: dataclasses.replace(item, pos=was.pos)})
-    lies = (
-        {}
-        if pushed
-        else {"reset_object_shape": Term(events.at_rest, params={"files": (thing.file,), "scale": thing.scale, "object": name})}
-    )
-    new: dict[str, Any] = {
+    scene = dataclasses.replace(cfg.scene, objects={name: item})
+    changed: dict[str, Any] = {
         "scene": scene,
         "sim": contacts.crowded(cfg.robot, scene, cfg.sim),
-        "object": thing,
-        "events": {**cfg.events, **lies},
         "randomization": _kept(cfg.randomization, name, item),
-        "controllers": {} if pushed else {**expert(cfg.robot, name, item)},
     }
-    if pushed:
-        low, high = (round(item.rest_height - cfg.robot.base_pos[2], 4),) * 2
-        new["command"] = dataclasses.replace(cfg.command, params={**cfg.command.params, "z": (low, high)})
-    cfg = dataclasses.replace(cfg, **new)
+    cfg = _sizes(dataclasses.replace(cfg, **changed), name)
+    return {LIFTS: _lifted, PUSHES: _pushed, PLACES: placing.applied}[what](cfg, name, item)
+
+
+def _part(cfg: EnvCfg) -> tuple[str, str]:
+    """The task's one object, and what is done with it."""
+    names, script, judged = tuple(cfg.scene.objects), next(iter(cfg.controllers), ""), cfg.success.condition
+    what = PUSHES if bounds.unwrapped(judged.func) is success.object_at_pose else LIFTS if script in SCRIPTS else ""
+    what = PLACES if placing.places(judged) else what
+    if len(names) != 1 or not what:
+        several = "several objects of their own shapes" if len(names) > 1 else "none"
+        raise UserError(
+            f"object takes the place of the one object that a task lifts, pushes or places, and this task has {several}: there, "
+            "write scene.objects.NAME.shape=mesh and scene.objects.NAME.file=FILE"
+        )
+    return names[0], what
+
+
+def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
+    """How a thing stands: as its file has it, or, if it is not pushed, as it rests most often; about the vertical as its file.
+
+    Raises:
+        UserError: it does not stand, and is pushed.
+    """
+    (solid,) = item.solids
+    if any(rests.up(quat)[2] > _UPRIGHT for quat in solid.rest_quat):
+        return item.quat
+    if what == PUSHES:
+        raise UserError(f"{item.file} does not stand as its file has it, and what is pushed has to: turn it in the file")
+    return placing.unturned(solid.rest_quat[int(np.argmax(solid.rest_share))])
+
+
+def _lifted(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
+    lies = Term(events.at_rest, params={"files": (item.file,), "scale": item.scale, "object": name})
+    return dataclasses.replace(cfg, events={**cfg.events, "reset_object_shape": lies}, controllers=expert(cfg.robot, name, item))
+
+
+def _pushed(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
+    height = round(item.rest_height - cfg.robot.base_pos[2], 4)
+    command = dataclasses.replace(cfg.command, params={**cfg.command.params, "z": (height, height)})
+    return dataclasses.replace(cfg, command=command, controllers={})
+
+
+def _sizes(cfg: EnvCfg, name: str) -> EnvCfg:
+    """The task with terms that count from the thing's surface."""
     groups: dict[str, Any] = {each: _own_size(getattr(cfg, each), name) for each in ("rewards", "terminations", "metrics")}
     groups["success"] = dataclasses.replace(
         cfg.success, condition=_sized(cfg.success.condition, name), distance=_sized(cfg.success.distance, name)
     )
     groups["observations"] = {key: _seen(group, name) for key, group in cfg.observations.items()}
     return dataclasses.replace(cfg, **groups)
+
+
+def laid(cfg: EnvCfg) -> EnvCfg:
+    """Returns the task with events that know all shapes of what they lay down, in the scene's order.
+
+    Raises:
+        UserError: an event names a file that its object does not have.
+    """
+    found = {}
+    for key, event in cfg.events.items():
+        found[key] = event
+        item = cfg.scene.objects.get(event.params.get("object", ""))
+        if bounds.unwrapped(event.func) is not events.at_rest or item is None:
+            continue
+        bank, files = (item.file, *item.bank), event.params["files"]
+        if unknown := [file for file in files if file not in bank]:
+            name = event.params["object"]
+            has = f"file and bank of scene.objects.{name} are {', '.join(bank)}"
+            raise UserError(f"events.{key}.params.files names {', '.join(unknown)}, and {has}")
+        if files != bank:
+            found[key] = dataclasses.replace(event, params={**event.params, "bank": bank})
+    return cfg if found == cfg.events else dataclasses.replace(cfg, events=found)
 
 
 def _seen(group: ObservationGroup, name: str) -> ObservationGroup:

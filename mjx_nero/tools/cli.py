@@ -40,7 +40,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--env", default=default, help=f"environment: {', '.join(names)} (default: %(default)s)")
         self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
         self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
-        text = "thing to lift or push in place of the task's object: a mesh (.obj, .stl, .glb), a folder, or a name"
+        text = "thing to lift, push or place in place of the task's object: a mesh (.obj, .stl, .glb), a folder, or a name"
         self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; --env.object.scale: its scale)")
 
     def add_load(self) -> None:

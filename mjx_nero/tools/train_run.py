@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from mjx_nero import console
+from mjx_nero.envs.env import MAX_SPEED
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
 from mjx_nero.learn.runs import resume, track, training
@@ -81,9 +82,8 @@ def report(summary: dict[str, Any], films: bool) -> None:
     names = "policy.safetensors, best.safetensors, curve.png, metrics.jsonl, checkpoints/"
     print(f"{summary['folder']}: {names}{', video.mp4 (to be drawn now)' if films else ''}", flush=True)
     if summary["nan_count"] or summary["overflow_count"]:
-        print(
-            f"physics: {summary['nan_count']} environments reset after NaN, {summary['overflow_count']} steps with lost contacts"
-        )
+        diverged = f"{summary['nan_count']} episodes ended as they diverged (NaN, or faster than {MAX_SPEED:,.0f} rad/s or m/s)"
+        print(f"physics: {diverged}, {summary['overflow_count']} steps with lost contacts")
     if summary["lost"]:
         print(f"lost for want of a disk to write to: {', '.join(f'{n} x {name}' for name, n in summary['lost'].items())}")
 

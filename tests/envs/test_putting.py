@@ -15,7 +15,7 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import starts
-from mjx_nero.sim import fixtures, scene
+from mjx_nero.sim import fixtures, objects, scene
 from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -70,6 +70,15 @@ def test_every_arm_has_a_peg_that_fits_the_hole(robot, preset):
     assert 0.025 + cfg.robot.pad[0] / 2 < fields["pick.lowest"] < 0.065  # the pads stay over the block, and on the peg
     assert fields["turns"] == (0 if shape == "can" else 4)
     assert cfg.command.params["z"][0] == pytest.approx(0.0325) and list_presets("insert_peg") == tuple(PEGS)
+
+
+def test_a_ring_around_the_post_hangs_wherever_it_lies_there():
+    """Its hole leaves it a play, and beside the post it would lie far outside of that."""
+    place = env_cfg("nero_hang_ring").success.condition.params["place"]
+    around = np.linalg.norm(objects.find("ring").vertices[:, :2], axis=1)
+    post = next(geom for geom in fixtures.read("stand").geoms if geom.name == "post")
+    play, beside = around.min() - post.size[0], around.max() + post.size[0]
+    assert 0.014 < play < place.within[0] < 0.5 * beside
 
 
 def test_hands_that_cannot_are_told_in_one_line():

@@ -17,7 +17,7 @@ from mjx_nero.learn.runs import logs, training
 from mjx_nero.sim import render
 from mjx_nero.sim.physics import host
 from mjx_nero.sim.physics.native import NativePhysics
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, train_run
 from mjx_nero.types import UserError
 
 
@@ -128,6 +128,14 @@ def test_what_a_run_came_to_is_said_before_its_video_is_drawn(call, monkeypatch)
     assert first == "1,000 env steps in 2 s (500 steps/s), success 75.0%"
     assert second.startswith("run: policy.safetensors, ") and second.endswith("video.mp4 (to be drawn now)")
     assert third == "film of run"
+
+
+def test_a_run_tells_what_its_physics_lost(capsys):
+    """A thing that is thrown too fast is no NaN, but ends the episode in the same way."""
+    summary = {"env_steps": 1000, "train_s": 2.0, "steps_per_s": 500, "evaluation": {"success_rate": 0.75}, "folder": "run"}
+    train_run.report({**summary, "nan_count": 1, "overflow_count": 2, "lost": {}}, films=False)
+    says = "physics: 1 episodes ended as they diverged (NaN, or faster than 1,000 rad/s or m/s), 2 steps with lost contacts"
+    assert capsys.readouterr().out.splitlines()[-1] == says
 
 
 def test_eval_of_the_shipped_policy(call, tmp_path):

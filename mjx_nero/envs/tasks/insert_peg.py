@@ -22,6 +22,9 @@ LOOSE, TIGHT = 0.002, 0.0005  # [m] the hole is so much wider than the peg
 OFF, TURN = 0.001, 0.01  # [m, rad] the block stands so far from where it is said to stand
 DENSITY = 1000.0  # [kg/m3]
 OVER = 0.01  # [m] the script carries the peg so high over the block
+ABOVE = 0.025  # [m] a hand that lags comes from so high above the peg, which it would knock over
+PRESS = 0.002  # [m] on the rim
+AWAY = 0.08  # [m] the hand rises so far once it has let go
 
 
 def peg(width: float, square: bool) -> ObjectCfg:
@@ -50,8 +53,9 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
         turn=TURN if square else 0.0,
         fold=4 if square else 0,
     )
-    grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), DEEP + 2 * OVER, object="peg", turns=(task.fold,))
+    grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), LONG + ABOVE, object="peg", turns=(task.fold,))
     put = {**grip, "foot": LONG / 2, "over": DEEP + OVER, "top": DEEP, "turns": task.fold, "reach": 0.002}
+    put |= {"press": PRESS, "away": AWAY}
     return task.cfg({"put_in": put})
 
 

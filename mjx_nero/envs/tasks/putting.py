@@ -19,6 +19,7 @@ from mjx_nero.types import UserError
 
 OPEN = 0.06  # [m] the hand opens no further
 CLOSING = 0.4  # [s] least closing time of the script's fingers
+LENGTH = 15.0  # [s] of an episode: a learner's velocities, which approach what the script wants, make the script slow
 APART = 0.08  # [m] least distance from the object's start to the fixture, along the table
 WRIST = {"offset": (0.5, 0.5, 0.5, 0.02, 0.02, 0.02), "noise": (0.2, 0.2, 0.2, 0.01, 0.01, 0.01), "scale": 0.05, "delay": (0, 1)}
 FINGERS = {"offset": (0.0,), "noise": (0.2,), "scale": 0.1, "delay": (0, 1)}
@@ -154,7 +155,7 @@ class Putting(Tower):
             "curriculum": CurriculumCfg(expert_starts=0.5),
             "budget": Budget(steps=200_000_000),
         }
-        return self.task(**{"length_s": 10.0, **shared, **own})
+        return self.task(**{"length_s": LENGTH, **shared, **own})
 
 
 def hand(robot: RobotCfg, width: float) -> RobotCfg:

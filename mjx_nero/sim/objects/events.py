@@ -14,24 +14,33 @@ from mjx_nero.types import Key, Start
 
 
 def at_rest(
-    key: Key, start: Start, *, files: tuple[str, ...], scale: Positive = 1.0, yaw: Range = (-np.pi, np.pi), object: str = "cube"
+    key: Key,
+    start: Start,
+    *,
+    files: tuple[str, ...],
+    scale: Positive = 1.0,
+    yaw: Range = (-np.pi, np.pi),
+    object: str = "cube",
+    bank: tuple[str, ...] = (),
 ) -> Start:
     """Gives the object one of its shapes, lays it in one of the ways in which that rests, and turns it about the vertical.
 
     All shapes are equally likely. Ways of resting are as likely as a throw ends in them.
 
     Args:
-        files: of the object's shapes: its ``file`` and its ``bank``.
+        files: of the shapes that it may have, all or some of its own.
         scale: of the meshes.
         yaw: range of the turn [rad].
+        bank: all its shapes in the scene's order, its ``file`` and its ``bank``; empty: ``files``. Environments fill it in.
     """
     quats, heights, shares = (jnp.asarray(x) for x in _rests(files, scale))
     k_shape, k_rest, k_yaw = jax.random.split(key, 3)
-    shape = jax.random.randint(k_shape, (), 0, len(files))
-    rest = jax.random.categorical(k_rest, jnp.log(shares[shape]))
+    drawn = jax.random.randint(k_shape, (), 0, len(files))
+    rest = jax.random.categorical(k_rest, jnp.log(shares[drawn]))
     angle = jax.random.uniform(k_yaw, (), minval=yaw[0], maxval=yaw[1])
-    quat = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), angle), quats[shape, rest])
-    pos = start.object_pos_w[object].at[2].set(heights[shape, rest])
+    quat = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), angle), quats[drawn, rest])
+    pos = start.object_pos_w[object].at[2].set(heights[drawn, rest])
+    shape = jnp.array([(bank or files).index(file) for file in files])[drawn]
     return dataclasses.replace(
         start,
         object_pos_w={**start.object_pos_w, object: pos},
