@@ -350,6 +350,16 @@ def test_warp_physics_is_made_without_a_change_of_device(env, monkeypatch):
     mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
 
 
+def test_nothing_of_warp_is_loaded_while_jax_traces(env, monkeypatch):
+    """Another thread may be adding kernels to the module that would be loaded."""
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+    made, loads = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim), []
+    sim = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
+    monkeypatch.setattr(warp.Module, "load", lambda module, *args: loads.append(module.name))
+    text = jax.jit(made.step).lower(sim, sim.ctrl).as_text()
+    assert "custom_call" in text and not loads
+
+
 def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
     """A run of four devices on two machines: two are here."""
     warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")

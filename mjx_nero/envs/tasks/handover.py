@@ -39,8 +39,7 @@ SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the 
 YAW = 0.25  # [rad] greatest turn of the bar at the start, from straight away from the first arm
 WIDER = 2.0  # opening of the hands, in widths of the bar
 CLOSING = 0.4  # [s] least closing time of the script's fingers
-# [m, m/s] tolerances at the goal. At half an arm's length a learner's noise alone, 0.1 of full speed, moves the bar at 5 cm/s.
-THERE, STILL = 0.03, 0.25
+THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
 AWAY = 0.05  # [m] a hand so far from the bar's axis has left it
 CLASH = 0.09  # [m] grasp points so near to one another: the hands, 7 cm wide each way, would run into one another
 JOINTS = 6  # of an arm that can point its hand down anywhere around it

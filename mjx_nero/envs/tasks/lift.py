@@ -12,6 +12,7 @@ from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import (
     CALM,
+    SHOWN,
     CurriculumCfg,
     EnvCfg,
     Presets,
@@ -173,11 +174,8 @@ def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
 
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``.
-
-    Its gripper has no hysteresis, because its policies were trained without.
-    """
-    return sim2reals.randomized(dataclasses.replace(default(robot, setup), actions=velocity_actions()))
+    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
+    return dataclasses.replace(sim2reals.randomized(default(robot, setup)), training=SHOWN)
 
 
 def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.cameras.look import nominal
-from mjx_nero.sim.physics import possible
+from mjx_nero.sim.physics import kernels, possible
 from mjx_nero.sim.physics.mujoco_warp import WARP, world_fields
 from mjx_nero.types import Picture
 

@@ -41,8 +41,8 @@ def make(
 def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
     """Makes a function of Warp's arrays a function of JAX's, which XLA calls on the stream that it computes on.
 
-    No graph mode of Warp's: it would capture the function for every set of addresses that XLA comes up with. And nothing is loaded
-    while JAX traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
+    Warp has no graph mode here: it would capture the function for every set of addresses that XLA comes up with. Nothing is
+    loaded while JAX traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
 
     Args:
         function: takes arrays, annotated as Warp's; the last ``outputs`` of them are written.
