@@ -66,7 +66,7 @@ def test_a_wheel_inspects_plays_and_views(run):
     assert found.returncode == 0 and "joints of nero" in found.stdout, found.stderr
     found = run(PROGRAM, "eval", "--env", "nero_reach", "--episodes", "4")
     assert found.returncode == 0 and "success rate" in found.stdout, found.stderr
-    found = run("import mjx_nero.tools.view.command as c, mjx_nero.tools.view.session; print(c.__file__)")
+    found = run("import mjx_nero.tools.view.opening as c, mjx_nero.tools.view.session; print(c.__file__)")
     assert found.returncode == 0 and "/site/mjx_nero/" in found.stdout, found.stderr
     found = run(f"import sys; sys.modules['viser'] = None; {PROGRAM}", "view", "--env", "nero_reach")
     assert (

@@ -25,10 +25,17 @@ LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 
 
 class Parser(argparse.ArgumentParser):
-    """Argparse whose mistakes are one line."""
+    """Argparse whose mistakes are one line.
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+    Args:
+        command: name of the command.
+        says: what it does, for its help.
+        ends: the end of its help.
+    """
+
+    def __init__(self, command: str, says: str = "", ends: str | None = None):
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=form)
 
     def add_environment(self, names: Iterable[str], default: str = "nero_lift") -> None:
         """``--load``, ``--env``, ``--preset`` and ``--robot``: what an environment is made of.

@@ -126,8 +126,8 @@ def main(argv: Sequence[str]) -> None:
         UserError: a file is missing or malformed, or the port is taken.
     """
     parser = cli.Parser(
-        prog=cli.called_as("replay"),
-        description="Shows a logged run of an arm in a browser, beside what the simulation makes of the same targets, and says "
+        "replay",
+        "Shows a logged run of an arm in a browser, beside what the simulation makes of the same targets, and says "
         "how far they differ.",
     )
     add = parser.add_argument

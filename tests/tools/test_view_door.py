@@ -13,8 +13,7 @@ import time
 import msgspec
 import pytest
 
-from mjx_nero.tools import view
-from mjx_nero.tools.view import request
+from mjx_nero.tools.view import opening, request
 
 pytest.importorskip("viser")
 
@@ -272,7 +271,7 @@ def test_a_page_of_another_origin_neither_steers_nor_shares(browser, evil, host,
 
     opened = []
     monkeypatch.setattr(_viser, "ViserTunnel", lambda *args, **kwargs: opened.append(args))
-    shown = view.open_view(env_name="nero_lift", agent="zero", port=18500, host=host)
+    shown = opening.open_view(env_name="nero_lift", agent="zero", port=18500, host=host)
     try:
         port = shown._door.port
         browser.get(f"http://127.0.0.1:{port}/?token={token_of(shown._door)}")

@@ -22,8 +22,8 @@ def main(argv: Sequence[str]) -> None:
         UserError: unknown names, a folder of something else, a package is missing, a full disk, or nobody succeeds.
     """
     parser = cli.Parser(
-        prog=cli.called_as("demos"),
-        description="Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
+        "demos",
+        "Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
     )
     parser.add_environment(registry.list_envs())
     parser.add_seed(0)

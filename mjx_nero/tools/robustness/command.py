@@ -22,8 +22,7 @@ _LARGEST = 1 << 20  # [bytes] of figures
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
-        prog=cli.called_as("robustness"),
-        description="Plays a policy over the range of each parameter of the world, one at a time and all at once.",
+        "robustness", "Plays a policy over the range of each parameter of the world, one at a time and all at once."
     )
     parser.add_environment(registry.list_envs())
     parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled one)")
