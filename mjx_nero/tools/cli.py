@@ -13,7 +13,7 @@ import sys
 import textwrap
 import traceback
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib import metadata
 from typing import Annotated, Any, NoReturn
 
@@ -37,17 +37,13 @@ class Parser(argparse.ArgumentParser):
         form = argparse.RawDescriptionHelpFormatter
         super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=form)
 
-    def add_environment(self, names: Iterable[str], default: str = "nero_lift") -> None:
-        """``--load``, ``--env``, ``--preset`` and ``--robot``: what an environment is made of.
-
-        Args:
-            names: of all environments.
-        """
+    def add_environment(self) -> None:
+        """``--load``, ``--env``, ``--preset``, ``--robot`` and ``--object``: what an environment is made of."""
         self.add_load()
-        self.add_argument("--env", default=default, help=f"environment: {', '.join(names)} (default: %(default)s)")
+        self.add_argument("--env", default="nero_lift", help="environment; list-envs names them all (default: %(default)s)")
         self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
         self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
-        text = "thing to lift, push or place in place of the task's object: a mesh (.obj, .stl, .glb), a folder, or a name"
+        text = "object to lift, push or place in place of the task's own: a mesh (.obj, .stl, .glb), a folder, or a name"
         self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; --env.object.scale: its scale)")
 
     def add_load(self) -> None:

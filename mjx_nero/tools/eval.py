@@ -76,7 +76,7 @@ def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("eval", "Plays episodes with a policy or a controller and reports success.")
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_seed(1)
     parser.add_impl()
     parser.add_fields(EvalCfg)

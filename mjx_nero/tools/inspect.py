@@ -19,9 +19,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
     parser.add_argument("--preset", help="preset of the environment (default: the first)")
     parser.add_argument("--robot", help="robot of the environment, or to inspect alone: a name, or an imported one's folder")
-    parser.add_argument("--object", metavar="FILE", help="show a thing of a mesh instead: a file, a folder, or a name")
+    parser.add_argument("--object", metavar="FILE", help="show an object made of meshes instead: a file, a folder, or a name")
     parser.add_argument(
-        "--scale", type=cli.positive_float, default=1.0, help="of the lengths in that file (default: %(default)s)"
+        "--scale", type=cli.positive_float, default=1.0, help="factor of the lengths in that file (default: %(default)s)"
     )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")

@@ -131,11 +131,11 @@ def main(argv: Sequence[str]) -> None:
         "how far they differ.",
     )
     add = parser.add_argument
-    add("log", type=cli.path(".csv"), help="of deploy --log, or of record")
+    add("log", type=cli.path(".csv"), help="log that deploy --log or record wrote")
     add("--robot", required=True, help="name, or folder of an imported robot")
     add("--identified", type=cli.path(".yaml", ".yml"), help="file of identify, whose drives the simulation takes")
     add("--dt", type=cli.positive_float, default=0.005, help="physics step, s (default: %(default)s)")
-    add("--no-view", action="store_true", help="say how far they differ, and no more")
+    add("--no-view", action="store_true", help="print how far they differ, and open no page")
     parser.add_address()
     args, _ = parser.parse(argv)
     robot = registry.robot(args.robot)

@@ -20,12 +20,12 @@ class EvalCfg:
 
     Attributes:
         robot: robot in place of the environment's own, by name or folder.
-        agent: policy, zero or random (default: the policy, or else the task's controller).
+        agent: policy, zero or random (default: the bundled policy, or the task's controller if there is none).
         policy: policy file (default: the bundled one of the environment).
         any_robot: play a policy that was trained for another model of the robot.
         controller: play one of the task's controllers, or expert for the first of them, instead of an agent.
         episodes: number of episodes, played side by side.
-        backend: mjx, or mujoco for the C library on the CPU; auto: see impl.
+        backend: mjx, or mujoco for the C library on the CPU; auto: as impl says.
         impl: physics, one of ``physics.impls()``.
         record: number of episodes whose steps are kept, for example for a video.
         env_fields, control_fields: fields of the environment's and the controller's config by dotted name.

@@ -94,7 +94,7 @@ def _parser() -> cli.Parser:
         "Measures what this machine does in a second, and how long it takes to learn.",
         ends=f"what can be measured:\n{lines}",
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_argument(
         "--num-envs",
         type=_sizes,

@@ -25,7 +25,7 @@ def main(argv: Sequence[str]) -> None:
         "demos",
         "Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_seed(0)
     parser.add_argument("--out", type=cli.path(), metavar="DIR", help="folder to write to, or to go on with")
     parser.add_fields(DemosCfg)

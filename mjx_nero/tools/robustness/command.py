@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> None:
     parser = cli.Parser(
         "robustness", "Plays a policy over the range of each parameter of the world, one at a time and all at once."
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled one)")
     parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting (default: %(default)s)")
     parser.add_seed(90210)

@@ -15,20 +15,29 @@ def main(argv: Sequence[str]) -> None:
         UserError: unknown names, a policy that does not fit, the extra ``view`` is missing, or the port is taken.
     """
     parser = cli.Parser("view", "Shows environments in a browser: watch them, and take part.")
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_argument("--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint; repeatable")
     parser.add_argument("--agent", help="first agent: a controller, zero, random, or 'joint sliders' (default: a policy)")
     parser.add_argument(
-        "--run", type=pathlib.Path, metavar="FOLDER", help="run folder to follow: its environment, with its newest checkpoint"
+        "--run",
+        type=pathlib.Path,
+        metavar="FOLDER",
+        help="run folder to follow: its newest checkpoint plays",
     )
     parser.add_argument(
-        "--demos", type=cli.path(), metavar="DIR", help="record demonstrations of your own: a data set, new or one to go on with"
+        "--demos",
+        type=cli.path(),
+        metavar="DIR",
+        help="data set to record your own demonstrations into, new or old",
     )
     parser.add_argument(
-        "--episode", type=cli.number(int), metavar="K", help="with --demos: replay that episode, from 0; its environment, too"
+        "--episode",
+        type=cli.number(int),
+        metavar="K",
+        help="with --demos: replay episode K, counted from 0, in its environment",
     )
     parser.add_argument("--leader", metavar="PORT", help="serial port of LeRobot's SO-101 leader arm, which the robot follows")
-    parser.add_argument("--calibration", type=cli.path(".json"), help="with --leader: its calibration file, LeRobot's")
+    parser.add_argument("--calibration", type=cli.path(".json"), help="with --leader: LeRobot's calibration file of that arm")
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
     parser.add_address()
