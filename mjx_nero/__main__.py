@@ -33,9 +33,9 @@ COMMANDS = {
 
 def main(argv: Sequence[str]) -> None:
     """Hands the arguments to a command."""
-    lines = "\n".join(f"  {name:<{max(map(len, COMMANDS))}}  {what}" for name, (_, _, what) in COMMANDS.items())
     if not argv or argv[0] in ("-h", "--help"):
-        print(f"usage: python -m mjx_nero COMMAND ...\n\ncommands:\n{lines}")
+        commands = cli.listed("commands", {name: what for name, (_, _, what) in COMMANDS.items()})
+        print(f"usage: python -m mjx_nero COMMAND ...\n\n{commands}")
         if not argv:
             raise UserError(f"name a command: {', '.join(COMMANDS)}")
         return

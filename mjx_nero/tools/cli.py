@@ -184,6 +184,12 @@ def _blamed(name: str) -> Iterator[None]:
         raise UserError(f"cannot load {name}: {kind}{' '.join(str(error).split())}{where}") from error
 
 
+def listed(title: str, meanings: Mapping[str, str]) -> str:
+    """Names with what each means, a line each, for a help text."""
+    width = max(map(len, meanings))
+    return "\n".join([f"{title}:", *(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())])
+
+
 def fields_help(cfgs: Mapping[str, Any]) -> str:
     """The dotted flags of the configs, each with its default and what it is, for the end of a help text."""
     lines = ["any config field, with its default:"]

@@ -125,11 +125,8 @@ def main(argv: Sequence[str]) -> None:
     Raises:
         UserError: a file is missing or malformed, or the port is taken.
     """
-    parser = cli.Parser(
-        "replay",
-        "Shows a logged run of an arm in a browser, beside what the simulation makes of the same targets, and says "
-        "how far they differ.",
-    )
+    says = "Shows a logged run of an arm in a browser, beside the simulation's prediction, and says how far they differ."
+    parser = cli.Parser("replay", says)
     add = parser.add_argument
     add("log", type=cli.path(".csv"), help="log that deploy --log or record wrote")
     add("--robot", required=True, help="name, or folder of an imported robot")

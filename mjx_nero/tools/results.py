@@ -38,11 +38,10 @@ alone on the GPU.
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
     parser = cli.Parser(
         "results",
         "Measures how every environment learns and what the bundled policies achieve, and writes the tables.",
-        ends=f"what can be measured:\n{lines}",
+        ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_load()
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")

@@ -203,7 +203,7 @@ def test_closed_form_of_the_cobotta_with_the_gripper_straight_down():
     quat = jnp.array(np.stack([0 * psi, -np.sin(psi / 2), np.cos(psi / 2), 0 * psi], axis=1), jnp.float32)
 
     solver = ik.InverseKinematics(COBOTTA_PRO_900, "flange", ik.IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-5))
-    at, turn = jax.vmap(solver.chain.poses)(jnp.array(exact, jnp.float32))
+    at, turn = jax.jit(jax.vmap(solver.chain.poses))(jnp.array(exact, jnp.float32))
     np.testing.assert_allclose(at[:, 0], pos, rtol=0, atol=2e-6)
     np.testing.assert_allclose(np.abs(np.sum(turn[:, 0] * quat, axis=1)), 1.0, rtol=0, atol=1e-6)
     start = jnp.array(exact + rng.uniform(-0.1, 0.1, exact.shape), jnp.float32)

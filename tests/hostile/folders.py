@@ -14,6 +14,7 @@ import fuzz
 import numpy as np
 import server
 
+from mjx_nero.envs import registry
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.learn.runs import checkpoints, logs, resume, training, trust

@@ -88,11 +88,10 @@ def command(argv: Sequence[str]) -> str:
 
 
 def _parser() -> cli.Parser:
-    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
     parser = cli.Parser(
         "benchmark",
         "Measures what this machine does in a second, and how long it takes to learn.",
-        ends=f"what can be measured:\n{lines}",
+        ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_environment()
     parser.add_argument(
