@@ -29,7 +29,7 @@ def seen(sensor, views, keys=KEYS):
             out.append(there.objects["cube"].pos_w)
         return jnp.stack(out)
 
-    return np.asarray(jax.jit(jax.vmap(episode))(keys))
+    return np.asarray(jax.vmap(episode)(keys))
 
 
 def test_an_offset_stays_for_an_episode_and_noise_does_not():
@@ -82,10 +82,10 @@ def test_a_force_sensor_is_off_noisy_and_late():
         return jnp.stack(out)
 
     felt = [view().replace(readings={"wrist": jnp.full(6, force)}) for force in (10.0, 10.0, 20.0)]
-    off = np.array(jax.jit(jax.vmap(lambda key: told(sensors.Gauge(offset=(2.0,)), key)))(KEYS)) - [[10.0], [10.0], [20.0]]
+    off = np.array(jax.vmap(lambda key: told(sensors.Gauge(offset=(2.0,)), key))(KEYS)) - [[10.0], [10.0], [20.0]]
     np.testing.assert_allclose(off[:, 0], off[:, 2], atol=1e-5)
     assert 1.95 < np.abs(off).max() <= 2.0 + 1e-5 and np.ptp(off[0, 0]) > 0.1
-    scaled = np.array(jax.jit(jax.vmap(lambda key: told(sensors.Gauge(scale=0.1), key)))(KEYS))
+    scaled = np.array(jax.vmap(lambda key: told(sensors.Gauge(scale=0.1), key))(KEYS))
     np.testing.assert_allclose(scaled[:, 2], 2 * scaled[:, 0], rtol=1e-5)
     assert 8.99 < scaled[:, 0].min() < 9.05 and 10.95 < scaled[:, 0].max() < 11.01
     np.testing.assert_allclose(told(sensors.Gauge(delay=(1, 1)), KEYS[0])[:, 0], [10, 10, 10])
@@ -111,7 +111,7 @@ def test_pushes_come_in_their_interval_and_not_between():
             out.append(speed)
         return jnp.stack(out)
 
-    speeds = np.asarray(jax.jit(jax.vmap(episode))(KEYS[:50]))
+    speeds = np.asarray(jax.vmap(episode)(KEYS[:50]))
     for hit in (np.abs(speeds) > 0).any(axis=2):
         at = times[hit]
         assert 0.09 < at[0] < 0.23 and (np.diff(at) > 0.09).all() and (np.diff(at) < 0.23).all()
