@@ -15,8 +15,7 @@ from mjx_nero.sim import contacts
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SimCfg
 
-# [m, m/s] tolerances at the goal. At half an arm's length a learner's noise alone, 0.1 of full speed, moves the bar at 5 cm/s.
-THERE, STILL = 0.03, 0.25
+THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
 CLASH = 0.09  # [m] grasp points so near to one another: the hands, 7 cm wide each way, would run into one another
 
 
