@@ -13,20 +13,16 @@ from mjx_nero.tools import cli
 COMMANDS = {
     "train": ("mjx_nero.tools.train", "main", "train a policy"),
     "eval": ("mjx_nero.tools.eval", "main", "play and measure a policy or a controller"),
-    "view": ("mjx_nero.tools.view", "main", "environments in a browser: watch them and take part"),
+    "view": ("mjx_nero.tools.view.command", "main", "environments in a browser: watch them and take part"),
     "demos": ("mjx_nero.tools.demos", "main", "a data set of demonstrations, for LeRobot or as arrays"),
     "export": ("mjx_nero.tools.export", "main", "a policy as ONNX, with all that a runtime has to know"),
     "deploy": ("mjx_nero.tools.deploy", "main", "an exported policy on an arm, real, emulated or simulated"),
     "robustness": ("mjx_nero.tools.robustness", "main", "a policy's success over the range of each parameter of the world"),
-    "benchmark": ("mjx_nero.tools.benchmark", "main", "what this machine does in a second"),
+    "benchmark": ("mjx_nero.tools.benchmark.command", "main", "what this machine does in a second"),
     "results": ("mjx_nero.tools.results", "main", "how every environment learns, and what the bundled policies achieve"),
     "public-robots": ("mjx_nero.tools.public_robots", "main", "public descriptions imported and tried: their table"),
-    "list-envs": ("mjx_nero.tools.inspection.command", "list_envs_main", "the environments: task, robot, sizes"),
-    "inspect": (
-        "mjx_nero.tools.inspection.command",
-        "main",
-        "a robot, a model folder or an environment: joints, gains, contacts",
-    ),
+    "list-envs": ("mjx_nero.tools.list_envs", "main", "the environments: task, robot, presets"),
+    "inspect": ("mjx_nero.tools.inspect", "main", "a robot, a model folder or an environment: joints, gains, contacts"),
     "import-urdf": ("mjx_nero.tools.import_urdf", "main", "a model folder from a URDF"),
     "tune-gains": ("mjx_nero.tools.tuning", "main", "stiffness and damping from step responses"),
     "record": ("mjx_nero.tools.identification", "record_main", "a log of an arm's drives, real or simulated"),
@@ -37,9 +33,9 @@ COMMANDS = {
 
 def main(argv: Sequence[str]) -> None:
     """Hands the arguments to a command."""
-    lines = "\n".join(f"  {name:<{max(map(len, COMMANDS))}}  {what}" for name, (_, _, what) in COMMANDS.items())
     if not argv or argv[0] in ("-h", "--help"):
-        print(f"usage: python -m mjx_nero COMMAND ...\n\ncommands:\n{lines}")
+        commands = cli.listed("commands", {name: what for name, (_, _, what) in COMMANDS.items()})
+        print(f"usage: python -m mjx_nero COMMAND ...\n\n{commands}")
         if not argv:
             raise UserError(f"name a command: {', '.join(COMMANDS)}")
         return

@@ -2,6 +2,7 @@
 
 import collections
 import functools
+import gc
 import getpass
 import os
 import pathlib
@@ -41,8 +42,11 @@ _CHECKED = (
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(_number) == signal.SIG_IGN:
         signal.signal(_number, _handler)
-# Most of the tests' time is XLA's. Set for the processes that tests start, too.
+# Most of the tests' time is XLA's. Set for the processes that tests start, too: what one has compiled, none compiles again, and
+# nothing gets into the cache of whoever runs the tests.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+_CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -56,14 +60,14 @@ from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
-_CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
-jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(_CACHE)))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)
 jax.config.update("jax_default_matmul_precision", "highest")
+# Tracing makes and drops millions of objects; looking through those that stay would take a sixteenth of the tests' time.
+gc.set_threshold(50_000, 10, 10)
 
 # Minutes of a core; other files are sorted by how many of their tests are slow.
 LONGEST = {"test_shipped": 3.0, "test_notebooks": 2.9, "test_putting": 1.4, "test_fixture_tasks": 1.5, "test_controllers": 1.5}
-LONGEST |= {"test_physics": 1.3, "test_guests": 1.2, "test_ppo": 1.2, "test_speed": 1.1}
+LONGEST |= {"test_physics": 1.3, "test_guests": 1.2, "test_ppo": 1.2}
 
 
 def pytest_collection_modifyitems(items):

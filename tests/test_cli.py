@@ -3,17 +3,18 @@
 import argparse
 import ast
 import dataclasses
+import json
 import os
 import pathlib
 import subprocess
 import sys
 from typing import Annotated
 
-import numpy as np
 import pytest
 
 import mjx_nero
 from mjx_nero import config, control, env_cfg, list_envs, list_presets
+from mjx_nero.__main__ import COMMANDS
 from mjx_nero.config import bounds
 from mjx_nero.envs import registry
 from mjx_nero.learn.play import evaluation
@@ -116,7 +117,7 @@ def test_what_flags_refuse(kind, text, message):
 
 
 def test_a_flag_and_its_fault_read_as_one_sentence():
-    parser = cli.Parser(prog="x")
+    parser = cli.Parser("x")
     parser.add_argument("--seed", type=cli.seed)
     with pytest.raises(mjx_nero.UserError, match=r"^--seed takes a whole number, got '1e99' \(see --help\)$"):
         parser.parse(["--seed", "1e99"])
@@ -140,7 +141,7 @@ class Asked:
 
 
 def test_flags_are_made_of_a_config():
-    parser = cli.Parser(prog="x")
+    parser = cli.Parser("x")
     parser.add_seed(5)
     parser.add_fields(Asked)
     assert config.marked(Asked) == ("minutes", "where", "how", "loudly", "seed") and config.marked(Asked, "free") == ("minutes",)
@@ -163,7 +164,7 @@ def test_flags_are_made_of_a_config():
     ],
 )
 def test_flags_of_a_config_keep_to_its_bounds(argv, message):
-    parser = cli.Parser(prog="x")
+    parser = cli.Parser("x")
     parser.add_fields(Asked)
     with pytest.raises(mjx_nero.UserError, match=message):
         parser.parse(argv)
@@ -178,7 +179,7 @@ def test_a_run_and_what_is_played_have_flags_for_their_fields():
 
 
 def test_an_empty_value_of_a_field_is_one():
-    assert cli.Parser(prog="x").parse(["--env.name=", "--env.a", ""], prefixes=("env",))[1] == {"env": {"name": "", "a": ""}}
+    assert cli.Parser("x").parse(["--env.name=", "--env.a", ""], prefixes=("env",))[1] == {"env": {"name": "", "a": ""}}
 
 
 @pytest.mark.parametrize("name", list_envs())
@@ -274,23 +275,34 @@ def test_an_evaluation_in_mujocos_library_leaves_alone_what_it_does_not_need():
     found = _python("-c", code, "--env", "nero_reach", "--impl", "native", "--episodes", "2", "--env.episode_length_s", "0.2")
     assert found.returncode == 0 and "success rate" in found.stdout, found.stderr
     modules = set(found.stdout.splitlines()[-1].split())
+    others = {"torch", "onnx", "matplotlib", "viser", "gymnasium"}
     assert {"jax", "mujoco.mjx", "mjx_nero.sim.physics.native"} <= modules
-    assert not {"warp", "mujoco.mjx.third_party.mujoco_warp", "torch", "onnx", "matplotlib", "viser", "gymnasium"} & modules
+    assert not ({"warp", "mujoco.mjx.third_party.mujoco_warp", "trimesh"} | others) & modules
     both = "from mujoco.mjx.third_party import mujoco_warp; import warp; warp.kernel, mujoco_warp.step"
     assert _python("-c", f"import mjx_nero.learn.policy; {both}").returncode == 0
 
 
-def _seconds(*args: str) -> float:
-    """Of all imports, as Python itself counts it."""
-    lines = _python("-X", "importtime", *args).stderr.splitlines()
-    spent = [line.split("|") for line in lines if line.startswith("import time:") and line.split("|")[1].strip().isdigit()]
-    return sum(int(own.removeprefix("import time:")) for own, _, _ in spent) / 1e6
+HELPS = """
+import contextlib, io, json, os, sys
+import mjx_nero.__main__ as all
+import mjx_nero.envs.registry  # once for all commands
+for command in all.COMMANDS:
+    if not os.fork():
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+            all.main([command, *(["--help"] if command != "list-envs" else [])])
+        print(json.dumps([command, *sys.modules]), flush=True)
+        os._exit(0)
+    os.wait()
+"""
+HEAVY = {"brax", "mujoco.mjx", "warp", "torch", "onnx", "matplotlib", "viser", "gymnasium", "pandas"}
+FITS = {"import-urdf", "tune-gains", "identify", "record", "replay"}  # with SciPy, which has hundreds of modules
 
 
-@pytest.mark.slow
-def test_imports_are_quick():
-    """Beside JAX's in the same seconds, the median of several: other processes take their share of the machine."""
-    programs = ("-c", "import jax"), ("-c", "import mjx_nero"), ("train.py", "--help")
-    times = np.array([[_seconds(*args) for args in programs] for _ in range(5)])
-    package, program = np.median(times[:, 1:] / times[:, :1], axis=0)
-    assert package < 1.3 and program < 2
+def test_help_and_list_envs_import_little():
+    """Modules are counted, as seconds are not the same on every machine. JAX and the configs are 1,050; MJX and Brax 500 more."""
+    found = _python("-c", HELPS)
+    modules = {command: set(names) for command, *names in map(json.loads, found.stdout.splitlines())}
+    assert modules.keys() == COMMANDS.keys(), found.stderr
+    assert not {command: HEAVY & names for command, names in modules.items() if HEAVY & names}
+    assert not {command: len(names) for command, names in modules.items() if len(names) > 1200 and command not in FITS}
+    assert "jax" not in _python("-c", "import sys, mjx_nero; print(*sys.modules)").stdout.split()

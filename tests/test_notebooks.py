@@ -17,8 +17,8 @@ ROOT = pathlib.Path(__file__).parents[1]
 NAMES = ("01_nero_lift", "02_cobotta_motion", "03_bring_your_own_arm", "04_onto_the_arm", "05_what_it_sees")
 NOTEBOOKS = tuple(ROOT / "notebooks" / f"{name}.ipynb" for name in NAMES)
 NERO_LIFT, COBOTTA_MOTION, OWN_ARM, ONTO_ARM, SEES = NOTEBOOKS
-STEPS = 12_288  # 8 iterations of PPO with the first notebook's 64 environments
-ARM_STEPS = 245_760  # 80 with the third's 128: most reaches succeed
+STEPS = 6_144  # 4 iterations of PPO with the first notebook's 64 environments
+ARM_STEPS = 122_880  # 40 with the third's 128: every reach succeeds
 
 
 def _run(path: pathlib.Path, folder: pathlib.Path, steps: int = STEPS) -> list:
@@ -204,7 +204,7 @@ def test_arm_of_the_notebook_learns_to_reach(arm_outputs):
     text = _text(arm_outputs)
     assert _figure(r"([\d,]+) env steps, success", text) == ARM_STEPS
     assert _figure(r"no action: success rate ([\d.]+)", text) < 0.05
-    assert _figure(r"the policy: success rate ([\d.]+)", text) > 0.3
+    assert _figure(r"the policy: success rate ([\d.]+)", text) > 0.8
     idle = _figure(r"no action: .* at the end ([\d.]+) cm", text)
     assert _figure(r"the policy: .* at the end ([\d.]+) cm", text) < idle / 3
 

@@ -44,13 +44,14 @@ def run(wheel, tmp_path_factory):
     return run
 
 
-PROGRAM = "import mjx_nero, sys; from mjx_nero.__main__ import program; print(mjx_nero.__file__); program()"
+PROGRAM = "import mjx_nero, sys; from mjx_nero.__main__ import main, program; print(mjx_nero.__file__); {}program()"
+VIEWER = "import mjx_nero.tools.view.opening, mjx_nero.tools.view.session; sys.modules['viser'] = None; "
 
 
 @pytest.mark.slow
 def test_a_wheel_trains(run):
     sizes = ["--impl", "native", "--num-envs", "64", "--num-timesteps", "1536", "--no-video"]
-    found = run(PROGRAM, "train", "--env", "nero_reach", *sizes, "--out", "run")
+    found = run(PROGRAM.format(""), "train", "--env", "nero_reach", *sizes, "--out", "run")
     assert found.returncode == 0, found.stderr
     package = pathlib.Path(found.stdout.splitlines()[0]).parent
     assert package.parent.name == "site"
@@ -62,13 +63,8 @@ def test_a_wheel_trains(run):
 @pytest.mark.slow
 def test_a_wheel_inspects_plays_and_views(run):
     """``mjx-nero`` is the program of the entry point; the viewer says in a line if its extra is lacking."""
-    found = run(PROGRAM, "inspect", "nero")
-    assert found.returncode == 0 and "joints of nero" in found.stdout, found.stderr
-    found = run(PROGRAM, "eval", "--env", "nero_reach", "--episodes", "4")
-    assert found.returncode == 0 and "success rate" in found.stdout, found.stderr
-    found = run("import mjx_nero.tools.view.command as c, mjx_nero.tools.view.session; print(c.__file__)")
-    assert found.returncode == 0 and "/site/mjx_nero/" in found.stdout, found.stderr
-    found = run(f"import sys; sys.modules['viser'] = None; {PROGRAM}", "view", "--env", "nero_reach")
-    assert (
-        found.returncode == 2 and found.stderr == "error: this needs viser, of the extra 'view': pip install 'mjx-nero[view]'\n"
-    )
+    found = run(PROGRAM.format("main(['inspect', 'nero']); "), "eval", "--env", "nero_reach", "--episodes", "4")
+    assert found.returncode == 0 and "joints of nero" in found.stdout and "success rate" in found.stdout, found.stderr
+    found = run(PROGRAM.format(VIEWER), "view", "--env", "nero_reach")
+    assert found.returncode == 2 and "/site/mjx_nero/" in found.stdout
+    assert found.stderr == "error: this needs viser, of the extra 'view': pip install 'mjx-nero[view]'\n"

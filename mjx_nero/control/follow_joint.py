@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive, Share
@@ -59,20 +59,15 @@ class FollowJointCfg:
 
 
 @struct.dataclass
-class FollowJointMemory:
+class FollowJointMemory(setpoint.Script):
     """The state of ``FollowJoint`` between two steps."""
 
-    phase: Int[Array, ""]
-    count: Int[Array, ""]  # steps made in this phase
-    q: Float[Array, " nj"]  # the arm's set-point [rad]
-    qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
     before: Float[Array, " nj"]  # the arm in front of the handle [rad]
     flip: Float[Array, ""]  # turn of the hand about the way in: 0 or half a turn [rad]
     follow: Float[Array, ""]  # share of the joint's turn that the hand makes
     out: Float[Array, ""]  # how far in front of the handle the set-point is [m]
     joint: Float[Array, ""]  # where the set-point is on the joint's path [rad or m]
     slip: Float[Array, ""]  # how far it has to go beyond the target, so that the joint gets there [rad or m]
-    tries: Int[Array, ""]
 
 
 class FollowJoint:
@@ -131,7 +126,7 @@ class FollowJoint:
         way = jnp.linalg.norm(found[0].q - q, axis=1) + UNREACHABLE * sum(~one.success for one in found)
         best = jnp.argmin(way + _STIFF * (jnp.arange(len(flips)) >= 2))
         out, slip, still = jnp.asarray(self.cfg.before), jnp.zeros(()), jnp.zeros_like(q)
-        return FollowJointMemory(zero, zero, q, still, found[0].q[best], flips[best], follows[best], out, now, slip, zero)
+        return FollowJointMemory(zero, zero, q, still, zero, found[0].q[best], flips[best], follows[best], out, now, slip)
 
     def step(self, memory: FollowJointMemory, view: View) -> tuple[FollowJointMemory, Float[Array, " nu"]]:
         """Targets of all drives."""

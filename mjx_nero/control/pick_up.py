@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
@@ -57,19 +57,14 @@ class PickUpCfg:
 
 
 @struct.dataclass
-class PickUpMemory:
+class PickUpMemory(setpoint.Script):
     """The state of ``PickUp`` between two steps."""
 
-    phase: Int[Array, ""]
-    count: Int[Array, ""]  # steps made in this phase
-    q: Float[Array, " nj"]  # the arm's set-point [rad]
-    qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
     above: Float[Array, " nj"]  # the arm over the object [rad]
     pos: Float[Array, "3"]  # where the grasp point is on its way from there
     pick: Float[Array, "3"]  # and has to be to grasp
     yaw: Float[Array, ""]  # how the hand is turned about the vertical [rad]
     grip: Float[Array, "3"]  # from the object to the set-point, while it is carried
-    tries: Int[Array, ""]
 
 
 class PickUp:
@@ -130,7 +125,7 @@ class PickUp:
         way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
         best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
         above, pick, yaw = over.q[best], picks[best], angles[best]
-        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), above, pick + self._up, pick, yaw, jnp.zeros(3), zero)
+        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
         """Targets of all drives."""

@@ -1,10 +1,11 @@
-"""The set-point of an arm: it follows joint positions that jump, without jumps of its own."""
+"""The set-point of an arm: it follows joint positions that jump, without jumps of its own. And what a script of phases keeps."""
 
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero.mdp.actions import rate_limit
 
@@ -15,6 +16,17 @@ _SMOOTH = 0.15  # [s] the set-point comes to rest in about this time
 FASTEST = 6.0
 _GENTLE = 1.5
 _JUMP = 0.75  # [rad/s] of a target, by a second's acceleration
+
+
+@struct.dataclass
+class Script:
+    """The state of a script of phases between two steps; each script adds its own."""
+
+    phase: Int[Array, ""]
+    count: Int[Array, ""]  # steps made in this phase
+    q: Float[Array, " nj"]  # the arm's set-point [rad]
+    qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
+    tries: Int[Array, ""]  # how often the script has begun anew
 
 
 def gentle(lead: Sequence[float]) -> float:

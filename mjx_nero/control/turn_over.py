@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config.bounds import Positive
 from mjx_nero.control import setpoint
@@ -55,17 +55,12 @@ class TurnOverCfg:
 
 
 @struct.dataclass
-class TurnOverMemory:
+class TurnOverMemory(setpoint.Script):
     """The state of ``TurnOver`` between two steps."""
 
-    phase: Int[Array, ""]
-    count: Int[Array, ""]  # steps made in this phase
-    q: Float[Array, " nj"]  # the arm's set-point [rad]
-    qd: Float[Array, " nj"]
     pos: Float[Array, "3"]  # where the grasp point is on a straight way
     plan: Plan
     table: Table
-    tries: Int[Array, ""]  # turns begun
 
 
 class TurnOver:
@@ -98,7 +93,7 @@ class TurnOver:
         q, zero, table = view.joint_pos[: self._n], jnp.zeros((), jnp.int32), self._turns.table()
         here = self._turns.leaning(view.objects[self.cfg.object].pos_w, self.cfg.lean)
         plan = self._plan(view, table, q, here)
-        return TurnOverMemory(zero, zero, q, jnp.zeros_like(q), view.ee_pos_w, plan, table, zero)
+        return TurnOverMemory(zero, zero, q, jnp.zeros_like(q), zero, view.ee_pos_w, plan, table)
 
     def step(self, memory: TurnOverMemory, view: View) -> tuple[TurnOverMemory, Float[Array, " nu"]]:
         """Targets of all drives."""

@@ -18,7 +18,7 @@ from mjx_nero.mdp.terms import (
     ObservationTerm,
     RewardTerm,
     Term,
-    privileged,
+    groups,
 )
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -70,7 +70,7 @@ def nearer(name: str, func: Callable, **params: Any) -> dict[str, RewardTerm]:
 def observed(state: Mapping[str, ObservationTerm], **object: str) -> dict[str, ObservationGroup]:
     """Groups the observations of a policy, and those of a critic that also knows the object's velocity."""
     velocity = ObservationTerm(observations.object_velocity, params=object)
-    return {"state": ObservationGroup(state), "privileged_state": privileged(state, {"object_velocity": velocity})}
+    return groups(state, {"object_velocity": velocity})
 
 
 def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:

@@ -17,15 +17,15 @@ class RecordCfg:
     """Settings for recording a simulated arm.
 
     Attributes:
-        seconds: of the log.
-        rate: of the readings [Hz].
+        seconds: length of the log [s].
+        rate: readings a second [Hz].
         noise: standard deviation of a reading [rad or m].
-        resolution: of the encoders, one count [rad or m]; 0: as fine as numbers are.
+        resolution: one count of the encoders [rad or m]; 0: no rounding.
         scatter: the arm's parameters are the model's times factors up to this, drawn log-uniformly; 1: the model's.
-        offset: of the encoders, at most [rad or m].
-        delay: at most [s]; with a scatter above 1 it is drawn, too.
-        amplitude: of the swings, at most [rad or m].
-        seed: of all that is drawn.
+        offset: greatest offset of an encoder [rad or m].
+        delay: greatest delay of a target [s]; with a scatter above 1 it is drawn, too.
+        amplitude: greatest amplitude of the swings [rad or m].
+        seed: random seed.
     """
 
     seconds: Annotated[float, Bounds(0.0, 3600.0, above=True)] = 60.0

@@ -14,9 +14,9 @@ import jax
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
+from mjx_nero.learn.bundled import shipped
 from mjx_nero.learn.learner import Observation
 from mjx_nero.sim.fingerprint import fingerprint
-from mjx_nero.sim.robot import ASSETS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,9 +156,3 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
             "pass the --preset that it was trained with, or train again"
         )
     return ""
-
-
-def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
-    """Path of the package's own policy for an environment: the preset's, or else the default's."""
-    own = ASSETS / "policies" / f"{env_name}_{preset}.safetensors"
-    return own if own.is_file() else ASSETS / "policies" / f"{env_name}.safetensors"

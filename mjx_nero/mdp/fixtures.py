@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive, Range
+from mjx_nero.mdp.memory import Latch
 from mjx_nero.types import FixtureStart, FixtureView, Key, Start, View
 
 Quat = tuple[float, float, float, float]
@@ -203,16 +204,12 @@ def is_turned(view: View, *, handle: Handle, within: Positive) -> Float[Array, "
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Moved:
+class Moved(Latch):
     """1 if the joint has moved in the hand since the start: faster than ``speed`` [rad/s or m/s], the handle ``near`` it [m]."""
 
     handle: Handle
     speed: Positive
     near: Positive
-
-    def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Starts with False."""
-        return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Becomes true when the joint moves."""

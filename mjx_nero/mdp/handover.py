@@ -13,6 +13,7 @@ from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive
 from mjx_nero.mdp import success
 from mjx_nero.mdp.actions import opening
+from mjx_nero.mdp.memory import Latch
 from mjx_nero.types import Key, View
 
 Scalar = Float[Array, ""]
@@ -198,7 +199,7 @@ class HandedOver:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class HeldAtGoal:
+class HeldAtGoal(Latch):
     """True if the taker alone holds, still and at the goal, what the giver had held before.
 
     Attributes:
@@ -210,10 +211,6 @@ class HeldAtGoal:
     hands: Hands
     threshold: Positive
     max_speed: Positive
-
-    def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Starts before the giver has held it."""
-        return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Notes that the giver holds it, and returns whether this is success."""

@@ -1,14 +1,22 @@
-"""Delays and histories of actions and observations. They have ``init`` and ``step``, as all terms with memory do."""
+"""What terms remember: one truth, delays and histories. All have ``init`` and ``step``, as every term with memory does."""
 
 import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from mjx_nero.config.bounds import Share, Steps
-from mjx_nero.types import DelayMemory, Key
+from mjx_nero.types import DelayMemory, Key, View
+
+
+class Latch:
+    """Base of terms that remember one truth of the episode so far, false at its start."""
+
+    def init(self, key: Key, view: View) -> Bool[Array, ""]:
+        """Starts with False."""
+        return jnp.zeros((), bool)
 
 
 @dataclasses.dataclass(frozen=True)

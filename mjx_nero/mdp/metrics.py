@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config.bounds import Count, Positive
+from mjx_nero.mdp.memory import Latch
 from mjx_nero.mdp.rewards import Heights, held
 from mjx_nero.mdp.success import touched
 from mjx_nero.mdp.terms import MetricTerm
@@ -25,12 +26,8 @@ class _Holding:
         return held(view, **dataclasses.asdict(self))
 
 
-class Grasped(_Holding):
+class Grasped(Latch, _Holding):
     """1 if the object has been held since the start."""
-
-    def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Starts with False."""
-        return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Becomes true when the object is held."""
@@ -52,12 +49,8 @@ class GraspTime(_Holding):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Touched:
+class Touched(Latch):
     """1 if anything has touched an obstacle, or the robot has touched itself, since the start (``View.readings``)."""
-
-    def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Starts with False."""
-        return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Becomes true at the first touch."""

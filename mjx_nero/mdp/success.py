@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Count, Positive
+from mjx_nero.mdp.memory import Latch
 from mjx_nero.types import Key, UserError, View
 
 
@@ -84,7 +85,7 @@ def pads_are_free(view: View, term: str) -> Bool[Array, ""]:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class AtGoalUntouched:
+class AtGoalUntouched(Latch):
     """Success at the goal, if nothing has been touched since the start (see ``View.readings``).
 
     Attributes:
@@ -94,10 +95,6 @@ class AtGoalUntouched:
 
     threshold: Positive
     object: str | None = None
-
-    def init(self, key: Key, view: View) -> Bool[Array, ""]:
-        """Starts with nothing touched."""
-        return jnp.zeros((), bool)
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Records a touch, and returns whether this is success."""

@@ -138,6 +138,14 @@ def privileged(terms: Mapping[str, ObservationTerm], more: Mapping[str, Observat
     return ObservationGroup({**exact, **(more or {})}, sensed=False)
 
 
+Groups = dict[str, ObservationGroup]  # by name
+
+
+def groups(terms: Mapping[str, ObservationTerm], more: Mapping[str, ObservationTerm] | None = None) -> Groups:
+    """Makes the usual two groups: ``state`` for a policy, and ``privileged_state`` for its critic (see ``privileged``)."""
+    return {"state": ObservationGroup(terms), "privileged_state": privileged(terms, more)}
+
+
 @dataclasses.dataclass(frozen=True)
 class MetricTerm(Term):
     """One number per episode, and how to combine the numbers of many episodes.

@@ -13,7 +13,7 @@ import sys
 import textwrap
 import traceback
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib import metadata
 from typing import Annotated, Any, NoReturn
 
@@ -25,22 +25,25 @@ LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
 
 
 class Parser(argparse.ArgumentParser):
-    """Argparse whose mistakes are one line."""
+    """Argparse whose mistakes are one line.
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+    Args:
+        command: name of the command.
+        says: what it does, for its help.
+        ends: the end of its help.
+    """
 
-    def add_environment(self, names: Iterable[str], default: str = "nero_lift") -> None:
-        """``--load``, ``--env``, ``--preset`` and ``--robot``: what an environment is made of.
+    def __init__(self, command: str, says: str = "", ends: str | None = None):
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=form)
 
-        Args:
-            names: of all environments.
-        """
+    def add_environment(self) -> None:
+        """``--load``, ``--env``, ``--preset``, ``--robot`` and ``--object``: what an environment is made of."""
         self.add_load()
-        self.add_argument("--env", default=default, help=f"environment: {', '.join(names)} (default: %(default)s)")
+        self.add_argument("--env", default="nero_lift", help="environment; list-envs names them all (default: %(default)s)")
         self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
         self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
-        text = "thing to lift, push or place in place of the task's object: a mesh (.obj, .stl, .glb), a folder, or a name"
+        text = "object to lift, push or place in place of the task's own: a mesh (.obj, .stl, .glb), a folder, or a name"
         self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; --env.object.scale: its scale)")
 
     def add_load(self) -> None:
@@ -179,6 +182,12 @@ def _blamed(name: str) -> Iterator[None]:
         where = "" if isinstance(error, UserError | FileNotFoundError) else f" ({frame.filename}:{frame.lineno})"
         kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
         raise UserError(f"cannot load {name}: {kind}{' '.join(str(error).split())}{where}") from error
+
+
+def listed(title: str, meanings: Mapping[str, str]) -> str:
+    """Names with what each means, a line each, for a help text."""
+    width = max(map(len, meanings))
+    return "\n".join([f"{title}:", *(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())])
 
 
 def fields_help(cfgs: Mapping[str, Any]) -> str:

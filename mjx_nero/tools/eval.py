@@ -5,16 +5,19 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mjx_nero import console, control, files
 from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
-from mjx_nero.learn.play import evaluation
+from mjx_nero.learn.play.cfg import EXPERT, EvalCfg
 from mjx_nero.sim import render
 from mjx_nero.tools import cli
+
+if TYPE_CHECKING:
+    from mjx_nero.learn.play.evaluation import Played
 
 RECORDED = 1000  # episodes at most, among which those that fail are looked for
 
@@ -23,11 +26,11 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     args, dotted = _parser().parse(argv, ("env", "control"), _cfgs)
     if args.view:
-        from mjx_nero.tools import view
+        from mjx_nero.tools.view import opening
 
         agent = args.controller or (args.agent if args.agent != "policy" else None)
         policies = [args.policy] if args.policy else []
-        return view.serve(
+        return opening.serve(
             env_name=args.env,
             preset=args.preset,
             robot=args.robot,
@@ -41,9 +44,11 @@ def main(argv: Sequence[str]) -> None:
     for path in filter(None, (args.video, args.json)):
         files.check_writable(path)
     video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
-    cfg = evaluation.EvalCfg(
+    from mjx_nero.learn.play import evaluation  # with Brax and MJX, which help does without
+
+    cfg = EvalCfg(
         args.env,
-        **cli.fields(args, evaluation.EvalCfg),
+        **cli.fields(args, EvalCfg),
         record=RECORDED if args.failures else video.episodes if args.video else 0,
         env_fields=dotted["env"],
         control_fields=dotted["control"],
@@ -65,18 +70,16 @@ def main(argv: Sequence[str]) -> None:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Configs whose fields ``--help`` lists."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
-    name = next(iter(env.controllers), "") if args.controller == evaluation.EXPERT else args.controller
+    name = next(iter(env.controllers), "") if args.controller == EXPERT else args.controller
     return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser(
-        prog=cli.called_as("eval"), description="Plays episodes with a policy or a controller and reports success."
-    )
-    parser.add_environment(registry.list_envs())
+    parser = cli.Parser("eval", "Plays episodes with a policy or a controller and reports success.")
+    parser.add_environment()
     parser.add_seed(1)
     parser.add_impl()
-    parser.add_fields(evaluation.EvalCfg)
+    parser.add_fields(EvalCfg)
     parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three episodes")
     parser.add_argument("--failures", action="store_true", help="show failed episodes in the video")
     parser.add_video()
@@ -92,7 +95,7 @@ def report(result: dict[str, Any]) -> None:
         print(f"warning: {result['warning']}", file=sys.stderr)
 
 
-def draw(played: evaluation.Played, path: pathlib.Path, cfg: render.VideoCfg) -> None:
+def draw(played: "Played", path: pathlib.Path, cfg: render.VideoCfg) -> None:
     """Writes the video; says so where that cannot be."""
     screen, episodes = console.screen(), played.episodes
     try:

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 
 from mjx_nero import config, files
 from mjx_nero.envs import registry
-from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import need, onnx
-from mjx_nero.learn import policy
+from mjx_nero.interop import need
+from mjx_nero.learn import bundled
 from mjx_nero.tools import cli
 from mjx_nero.types import UserError
 
@@ -21,18 +20,21 @@ def main(argv: Sequence[str]) -> None:
         UserError: no such policy, a wrong argument, or the file cannot be written.
     """
     parser = cli.Parser(
-        prog=cli.called_as("export"),
-        description="Writes a policy as ONNX: normalisation and network as a graph, joints, terms, limits and rates as metadata.",
+        "export", "Writes a policy as ONNX: normalisation and network as a graph, joints, terms, limits and rates as metadata."
     )
     parser.add_load()
-    parser.add_argument("policy", help=f"policy file, or name of a bundled policy ({', '.join(_shipped())})")
+    parser.add_argument("policy", help=f"policy file, or name of a bundled policy ({', '.join(bundled.names())})")
     parser.add_argument("--out", type=cli.path(".onnx"), required=True, metavar="FILE", help="ONNX file to write")
     parser.add_argument("--robot", help="folder of the imported robot that the policy was trained with")
     args, dotted = parser.parse(argv, prefixes=("env",))
+    from mjx_nero.envs.env import ManipulationEnv  # with Brax and MJX, which help does without
+    from mjx_nero.interop import onnx
+    from mjx_nero.learn import policy
+
     onnx_package = need("onnx", "onnx")
     files.check_writable(args.out)
     cli.setup_jax()
-    path = _shipped().get(args.policy) or pathlib.Path(args.policy)
+    path = bundled.names().get(args.policy) or pathlib.Path(args.policy)
     meta = policy.load(path).meta
     env = ManipulationEnv(config.override(registry.env_cfg(meta["env"], meta["preset"], args.robot), dotted["env"]))
     trained = policy.load_for(env, meta["env"], path)
@@ -48,10 +50,3 @@ def main(argv: Sequence[str]) -> None:
         f"ONNX Runtime and JAX differ by at most {difference:.1e} over {onnx.tries(meta):,} observations; "
         f"{1000 * p99:.3f} ms of one core for one (99th percentile)"
     )
-
-
-def _shipped() -> dict[str, pathlib.Path]:
-    """Bundled policies by environment, or by environment and preset joined with an underscore."""
-    names = registry.list_envs()
-    paths = [policy.shipped(name, preset) for name in names for preset in registry.list_presets(name)]
-    return {path.stem: path for path in paths if path.is_file()}

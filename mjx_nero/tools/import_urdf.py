@@ -69,9 +69,9 @@ def main(argv: Sequence[str]) -> None:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(
-        prog=cli.called_as("import-urdf"),
-        description="Makes a model folder of a URDF: model.xml, meshes/, robot.yaml (edit it) and report.json.",
-        epilog=_EPILOG,
+        "import-urdf",
+        "Makes a model folder of a URDF: model.xml, meshes/, robot.yaml (edit it) and report.json.",
+        ends=_EPILOG,
     )
     parser.add_argument("file", type=cli.path(), help="URDF or xacro file")
     parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to make")

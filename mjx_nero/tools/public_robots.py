@@ -38,10 +38,7 @@ class Public:
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    parser = cli.Parser(
-        prog=cli.called_as("public-robots"),
-        description="Imports the robots of a list, each with its self-test, and makes the table of it.",
-    )
+    parser = cli.Parser("public-robots", "Imports the robots of a list, each with its self-test, and makes the table of it.")
     parser.add_argument("list", type=cli.path(".yaml"), help="repositories with their commits, and robots")
     parser.add_argument("--folder", type=cli.path(), required=True, help="folder of the repositories, each as OWNER+NAME")
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")

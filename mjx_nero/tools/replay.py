@@ -125,17 +125,14 @@ def main(argv: Sequence[str]) -> None:
     Raises:
         UserError: a file is missing or malformed, or the port is taken.
     """
-    parser = cli.Parser(
-        prog=cli.called_as("replay"),
-        description="Shows a logged run of an arm in a browser, beside what the simulation makes of the same targets, and says "
-        "how far they differ.",
-    )
+    says = "Shows a logged run of an arm in a browser, beside the simulation's prediction, and says how far they differ."
+    parser = cli.Parser("replay", says)
     add = parser.add_argument
-    add("log", type=cli.path(".csv"), help="of deploy --log, or of record")
+    add("log", type=cli.path(".csv"), help="log that deploy --log or record wrote")
     add("--robot", required=True, help="name, or folder of an imported robot")
     add("--identified", type=cli.path(".yaml", ".yml"), help="file of identify, whose drives the simulation takes")
     add("--dt", type=cli.positive_float, default=0.005, help="physics step, s (default: %(default)s)")
-    add("--no-view", action="store_true", help="say how far they differ, and no more")
+    add("--no-view", action="store_true", help="print how far they differ, and open no page")
     parser.add_address()
     args, _ = parser.parse(argv)
     robot = registry.robot(args.robot)

@@ -12,12 +12,8 @@ from mjx_nero import console, files
 from mjx_nero.envs import registry
 from mjx_nero.envs.task import for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import policy
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.sim.physics import warp_available
+from mjx_nero.learn import bundled
 from mjx_nero.tools import cli
-from mjx_nero.tools.benchmark import learning, machine
 
 Row = dict[str, Any]
 WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
@@ -42,11 +38,10 @@ alone on the GPU.
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
     parser = cli.Parser(
-        prog=cli.called_as("results"),
-        description="Measures how every environment learns and what the bundled policies achieve, and writes the tables.",
-        epilog=f"what can be measured:\n{lines}",
+        "results",
+        "Measures how every environment learns and what the bundled policies achieve, and writes the tables.",
+        ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_load()
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")
@@ -67,6 +62,8 @@ def main(argv: Sequence[str]) -> None:
     files.check_writable(args.json)
     held = read(args.json)
     cli.setup_jax()
+    from mjx_nero.tools.benchmark import machine
+
     measured_with = {"version": machine.versions()["mjx-nero"], "machine": machine.name(machine.machine())}
     for what in whats:
         for env in envs:
@@ -115,6 +112,9 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
 
 def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """All seeds of an environment, by the settings that ``train.py --env`` has."""
+    from mjx_nero.learn.runs import cfg as run_cfg  # with Brax and MJX, which help does without
+    from mjx_nero.tools.benchmark import learning
+
     run, _ = run_cfg.fit_machine(run_cfg.resolve(env, args.preset, None, {}, {}))
     run = dataclasses.replace(run, eval_every=run.num_timesteps // EVALUATIONS)
     *_, total = learning.measure_learning(run, args.seeds, run.env.budget.success)
@@ -123,8 +123,11 @@ def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """The preset's bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
-    path = policy.shipped(env, args.preset)
-    if not path.exists() or args.preset != "default" and path == policy.shipped(env):
+    from mjx_nero.learn.play import evaluation
+    from mjx_nero.sim.physics import warp_available
+
+    path = bundled.shipped(env, args.preset)
+    if not path.exists() or args.preset != "default" and path == bundled.shipped(env):
         return
     backends = {"native": "mujoco"} | ({"warp": "mjx"} if warp_available() else {})
     for name, backend in backends.items():

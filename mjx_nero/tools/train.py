@@ -39,10 +39,8 @@ def _learner(args: argparse.Namespace, cfg: EnvCfg) -> str:
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser(
-        prog=cli.called_as("train"), description="Trains a policy on thousands of environments in one compiled step."
-    )
-    parser.add_environment(registry.list_envs())
+    parser = cli.Parser("train", "Trains a policy on thousands of environments in one compiled step.")
+    parser.add_environment()
     parser.add_argument("--learner", help=f"one of {', '.join(learner.names())} (default: the task's own)")
     parser.add_argument("--num-envs", type=cli.positive, help="number of environments (default: 8192 on a GPU, 256 on a CPU)")
     parser.add_argument(

@@ -13,7 +13,7 @@ from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.tools import benchmark
+from mjx_nero.tools.benchmark import inverse_kinematics
 
 N = 500  # every test of the batched solver has this batch: it is compiled once a robot
 
@@ -203,7 +203,7 @@ def test_closed_form_of_the_cobotta_with_the_gripper_straight_down():
     quat = jnp.array(np.stack([0 * psi, -np.sin(psi / 2), np.cos(psi / 2), 0 * psi], axis=1), jnp.float32)
 
     solver = ik.InverseKinematics(COBOTTA_PRO_900, "flange", ik.IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-5))
-    at, turn = jax.vmap(solver.chain.poses)(jnp.array(exact, jnp.float32))
+    at, turn = jax.jit(jax.vmap(solver.chain.poses))(jnp.array(exact, jnp.float32))
     np.testing.assert_allclose(at[:, 0], pos, rtol=0, atol=2e-6)
     np.testing.assert_allclose(np.abs(np.sum(turn[:, 0] * quat, axis=1)), 1.0, rtol=0, atol=1e-6)
     start = jnp.array(exact + rng.uniform(-0.1, 0.1, exact.shape), jnp.float32)
@@ -219,7 +219,7 @@ def test_unknown_frame():
 
 @pytest.mark.slow
 def test_benchmark():
-    (ours, *_) = benchmark.measure_ik(NERO, [N], 1)
+    (ours, *_) = inverse_kinematics.measure_ik(NERO, [N], 1)
     assert (ours["solver"], ours["batch"], ours["poses"]) == ("mjx_nero", N, N)
     assert ours["success"] >= 0.99 and ours["error_mm"] < 1.0 and ours["error_mrad"] < 10.0
     assert ours["solves_per_s"] == pytest.approx(N / ours["ms_per_batch"] * 1e3, rel=0.01)
@@ -227,11 +227,11 @@ def test_benchmark():
 
 def test_benchmark_with_mink(arm):
     pytest.importorskip("mink")
-    (row,) = benchmark.measure_mink(arm.robot, *(np.asarray(x) for x in arm.poses(arm.random(10, 20))))
+    (row,) = inverse_kinematics.measure_mink(arm.robot, *(np.asarray(x) for x in arm.poses(arm.random(10, 20))))
     assert row["solver"] == "mink" and row["poses"] == 20 and row["success"] > 0.5 and row["error_mm"] < 1.0
 
 
 def test_benchmark_without_mink(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mink", None)
-    assert benchmark.measure_mink(NERO, np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])) == []
+    assert inverse_kinematics.measure_mink(NERO, np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])) == []
     assert capsys.readouterr().out.count("\n") == 1

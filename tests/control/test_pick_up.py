@@ -100,7 +100,7 @@ def test_fingers_whose_drives_lag_get_time_to_press():
 
 def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
     zero, q = jnp.zeros((), jnp.int32), jnp.zeros(6)
-    memory = pick_up.PickUpMemory(zero, zero, q, q, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3), zero)
+    memory = pick_up.PickUpMemory(zero, zero, q, q, zero, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3))
 
     def ends(phase, count=0, error=0.0, arrived=True, qd=0.0) -> bool:
         now = dataclasses.replace(memory, phase=jnp.array(phase), count=jnp.array(count), qd=jnp.full(6, qd))

@@ -17,7 +17,7 @@ def test_the_ray_tracer_draws_what_mujoco_draws(monkeypatch):
     cfg = registry.env_cfg("nero_lift", "rgb").uncorrupted()
     env = ManipulationEnv(dataclasses.replace(cfg, observations={"state": cfg.observations["state"]}), impl="native")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 9))
-    shown = np.asarray(state.pipeline_state.qpos), jax.device_get(jax.vmap(env.scenery)(state))
+    shown = np.asarray(state.pipeline_state.qpos), jax.device_get(jax.jit(jax.vmap(env.scenery))(state))
     drawn = {}
     for renderer in ("mujoco", "warp"):
         cameras = pictures.Cameras(env, ["front", "wrist"], (48, 48), renderer)

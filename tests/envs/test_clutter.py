@@ -110,7 +110,7 @@ def test_what_counts_as_held_is_above_the_largest_of_its_kind(env, starts):
     for name, height in zip(NAMES, heights, strict=True):
         lies = poses(env, starts, name)[:, 2].max()
         assert lies < height - 0.004 and height < 1.15 * CFG.scene.objects[name].rest_height + 0.0051
-    paid = jax.vmap(lambda view: rewards.object_is_held(view, **CFG.rewards["holding_object"].params))
+    paid = jax.jit(jax.vmap(lambda view: rewards.object_is_held(view, **CFG.rewards["holding_object"].params)))
     view = jax.jit(jax.vmap(env.view))(starts)
     at = view.replace(ee_pos_w=view.objects["target"].pos_w)
     assert float(paid(at).sum()) == 0

@@ -164,9 +164,9 @@ def test_an_open_gripper_closes_for_actions_below_its_hysteresis(env, start, act
 
 def test_clip_bounds_actions_before_use(start):
     clipped = make("nero_lift", impl="native", action_clip=0.04, actions=joint_actions())
-    ctrl = clipped.targets(start, jnp.array([5.0, -5.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    ctrl = jax.jit(clipped.targets)(start, jnp.array([5.0, -5.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(ctrl[:3], [0.02, -0.02, 0.01], atol=1e-7)
-    after = clipped.finish(start, jnp.full(8, 5.0), start.pipeline_state, jnp.zeros(()))
+    after = jax.jit(clipped.finish)(start, jnp.full(8, 5.0), start.pipeline_state, jnp.zeros(()))
     assert (after.info["carry"].action == jnp.float32(0.04)).all()
 
 

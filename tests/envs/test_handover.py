@@ -90,7 +90,7 @@ def test_a_term_names_a_robot_that_is_there():
 
 
 def test_a_view_of_one_robot_is_as_if_it_were_alone(env, state):
-    view = env.view(state)
+    view = jax.jit(env.view)(state)
     first, second = view.of(), view.of("taker")
     np.testing.assert_array_equal(jnp.concatenate([first.joint_pos, second.joint_pos]), view.joint_pos)
     np.testing.assert_array_equal(jnp.concatenate([first.ctrl, second.ctrl]), view.ctrl)
@@ -140,7 +140,7 @@ def placed(env, state):
     hands = env.cfg.success.condition.params["hands"]
 
     def place(giver, taker, height=0.2):
-        view = env.view(state)
+        view = jax.jit(env.view)(state)
         bar = view.objects["bar"].replace(
             pos_w=jnp.array([0.4, 0.0, height]), quat_w=jnp.array([1.0, 0, 0, 0]), linvel_w=jnp.zeros(3)
         )

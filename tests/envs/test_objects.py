@@ -49,11 +49,11 @@ def test_every_object_is_seen_and_rewarded_by_its_name(two):
     model, qpos = two.physics_model, state.pipeline_state.qpos
     assert [model.joint(n).qposadr[0] for n in ("cube", "blue")] == [RED.start, BLUE.start] and model.nq == 23
     np.testing.assert_allclose(qpos[BLUE], [0.2, 0.3, 0.015, 1, 0, 0, 0], atol=1e-7)  # no event moves it
-    view = two.view(state)
+    view = jax.jit(two.view)(state)
     for name, at in (("cube", RED), ("blue", BLUE)):
         np.testing.assert_array_equal(view.objects[name].pos_w, qpos[at][:3])
         np.testing.assert_array_equal(view.objects[name].quat_w, qpos[at][3:])
-    after = two.finish(state, jnp.zeros(8), state.pipeline_state, jnp.zeros(()))
+    after = jax.jit(two.finish)(state, jnp.zeros(8), state.pipeline_state, jnp.zeros(()))
     for name, at in (("near_red", RED), ("near_blue", BLUE)):
         far = math.dist(view.ee_pos_w.tolist(), qpos[at][:3].tolist())
         assert float(after.metrics[f"reward/{name}"]) == pytest.approx(0.02 * (1 - math.tanh(far / 0.1)), rel=2e-3)
@@ -71,7 +71,7 @@ def collide(physics, sim, at, steps):
 
 
 def test_cubes_collide(two):
-    start, step = two.sample(jax.random.PRNGKey(0))[0], jax.jit(two.physics.step)
+    start, step = jax.jit(two.sample)(jax.random.PRNGKey(0))[0], jax.jit(two.physics.step)
     red, blue, red_speed, blue_speed = collide(step, start, 0.55, 15).T
     np.testing.assert_allclose(0.03 * red_speed + 0.06 * blue_speed, 0.03, rtol=1e-3)  # momentum
     assert blue_speed[-1] > 0.3 and red_speed[-1] < 0.4 and (blue - red > 0.02).all()
@@ -81,7 +81,7 @@ def test_cubes_collide(two):
 
 @pytest.mark.slow
 def test_cubes_collide_alike_on_mjx(two):
-    start = two.sample(jax.random.PRNGKey(0))[0]
+    start = jax.jit(two.sample)(jax.random.PRNGKey(0))[0]
     step = jax.jit(JaxPhysics(two.physics_model, two.cfg.sim).step)
     np.testing.assert_allclose(collide(step, start, 0.55, 8), collide(jax.jit(two.physics.step), start, 0.55, 8), atol=5e-3)
 

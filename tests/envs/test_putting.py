@@ -92,7 +92,7 @@ def test_hands_that_cannot_are_told_in_one_line():
 
 def test_the_block_stands_at_the_goal_and_the_peg_beside_it(env):
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 300))
-    view = jax.vmap(env.view)(state)
+    view = jax.jit(jax.vmap(env.view))(state)
     hole, peg = np.array(view.fixtures["socket"].site_pos_w["hole"]), np.array(view.objects["peg"].pos_w)
     off = hole[:, :2] - np.array(view.goal_pos_w)[:, :2]
     assert 0.0009 < np.abs(off).max() <= 0.001 + 1e-6 and np.abs(hole[:, 2]).max() < 1e-6
@@ -104,7 +104,7 @@ def test_success_is_a_peg_on_the_ground_of_the_hole(env, functions, height, succ
     reset, finish = functions
     state = reset(jax.random.PRNGKey(3))
     at, sim = int(env.physics_model.joint("peg").qposadr[0]), state.pipeline_state
-    hole = env.view(state).fixtures["socket"].site_pos_w["hole"]
+    hole = jax.jit(env.view)(state).fixtures["socket"].site_pos_w["hole"]
     sim = sim.replace(qpos=sim.qpos.at[at : at + 3].set(hole.at[2].set(height)))
     carry = state.info["carry"]
     state = state.replace(info={**state.info, "carry": carry.replace(step=carry.step + env.episode_length - 25)})
@@ -129,6 +129,6 @@ def test_a_learner_may_begin_where_the_script_was_and_the_block_stays_at_the_goa
     bank = jax.tree.map(jnp.asarray, starts.rows(found, 8, wrappers.PHASES, 0))
     chances = jnp.zeros(wrappers.PHASES + 1).at[wrappers.PHASES].set(1.0)
     state = jax.jit(lambda key: env.reset(key, starts=(bank, chances)))(jax.random.PRNGKey(0))
-    view = env.view(state)
+    view = jax.jit(env.view)(state)
     off = view.fixtures["socket"].site_pos_w["hole"] - view.goal_pos_w
     assert np.abs(off[:2]).max() <= 0.001 + 1e-6

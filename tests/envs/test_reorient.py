@@ -35,8 +35,8 @@ def test_arms_of_five_joints_are_told_in_one_line():
 
 def test_another_side_is_up_at_first_and_the_cube_lies_on_the_table(env):
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 300))
-    view = jax.vmap(env.view)(state)
-    up = np.asarray(jax.vmap(lambda v: sides.normal(v, "box"))(view))[:, 2]
+    view = jax.jit(jax.vmap(env.view))(state)
+    up = np.asarray(jax.jit(jax.vmap(lambda v: sides.normal(v, "box")))(view))[:, 2]
     assert up.max() < 1e-5 and 0.1 < (up < -0.9).mean() < 0.3
     np.testing.assert_allclose(view.objects["box"].pos_w[:, 2], env.cfg.scene.objects["box"].rest_height, atol=1e-6)
 

@@ -12,7 +12,7 @@ SEEDS = 3
 @pytest.mark.slow
 def test_seeds_of_the_same_second(tmp_path):
     """``for s in 0 1 2; do python train.py --seed $s & done``: as many good runs, each in a folder of its own."""
-    argv = [kill_many.sys.executable, "-c", kill_many.KINEMATIC + kill_many.MAIN, "--env", "nero_lift", "--impl", "native"]
+    argv = [kill_many.sys.executable, "-c", kill_many.KINEMATIC + kill_many.MAIN, "--env", "nero_reach", "--impl", "native"]
     argv += ["--num-timesteps", "640", *kill_many.SIZES]
     env = kill_many.surroundings() | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}  # shared, and empty
     runs = [

@@ -14,10 +14,18 @@ LONGEST = 500  # characters of a message
 SECONDS, MEMORY = 30.0, 2e9
 
 
+def _without_cache() -> dict[str, str]:
+    """The environment without JAX's cache of programs: a judge of what is written would see it written to."""
+    return {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+
+
 @pytest.fixture(scope="session")
 def server():
     """The process that forks a child for every command (``server.py``)."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])}
+    env = {
+        **_without_cache(),
+        "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]),
+    }
     env |= {"PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "JAX_PLATFORMS": "cpu"}
     server = subprocess.Popen(
         [sys.executable, HERE / "server.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env
@@ -85,7 +93,8 @@ def campaign(tmp_path):
         minutes = float(os.environ.get("MJX_NERO_FUZZ_MINUTES", "10")) / 2
         seed = datetime.date.today().strftime("%Y%m%d000")
         command = [sys.executable, HERE / "fuzz.py", f"--minutes={minutes}", f"--seed={seed}", "--finds=finds.txt"]
-        done = subprocess.run([*command, *(f"--reader={name}" for name in readers)], cwd=tmp_path, text=True, capture_output=True)
+        command += [f"--reader={name}" for name in readers]
+        done = subprocess.run(command, cwd=tmp_path, text=True, capture_output=True, env=_without_cache())
         print(done.stdout, done.stderr)
         finds = tmp_path / "finds.txt"
         assert done.returncode == 0, finds.read_text() if finds.exists() else done.stderr

@@ -14,13 +14,14 @@ import fuzz
 import numpy as np
 import server
 
+from mjx_nero.envs import registry
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.learn.runs import checkpoints, logs, resume, training, trust
 from mjx_nero.learn.runs import folder as run_folder
 from mjx_nero.tools import seeds, train_run
 from mjx_nero.tools.view import agents
-from mjx_nero.tools.view import command as view_command
+from mjx_nero.tools.view import opening as view_opening
 
 NAMES = (".lock", "config.json", "summary.json", "seeds.json", "metrics.jsonl", "policy.safetensors", "best.safetensors")
 NAMES += ("curve.png", "video.mp4", "checkpoints", "tensorboard", "wandb", "wandb/id", "wandb/run-1", "wandb/latest-run")
@@ -141,8 +142,8 @@ def started(home: pathlib.Path) -> None:
 
 def followed(home: pathlib.Path) -> None:
     """What ``view --run`` reads of a folder, up to the networks."""
-    named = view_command._described(home)
-    view_command.registry.env_cfg(named.get("env_name", "nero_lift"), named.get("preset", "default"))
+    named = view_opening._described(home)
+    registry.env_cfg(named.get("env_name", "nero_lift"), named.get("preset", "default"))
     newest = agents.newest(home)
     if newest is not None:
         resume.header.check(checkpoint.load_meta(newest), newest)

@@ -48,7 +48,7 @@ from mjx_nero.tools import (  # noqa: E402
     train_run,
 )
 from mjx_nero.tools.robustness import command as robustness  # noqa: E402
-from mjx_nero.tools.view import command as view_command  # noqa: E402
+from mjx_nero.tools.view import opening as view_opening  # noqa: E402
 from mjx_nero.urdf import drives, import_urdf, meshes, xacro  # noqa: E402
 from mjx_nero.urdf import files as urdf_files  # noqa: E402
 from mjx_nero.urdf.report import Notes  # noqa: E402
@@ -244,7 +244,7 @@ def read_run(folder: pathlib.Path, content: bytes, name: str) -> None:
         (folder / other).write_bytes(content if other == name else own)
     with contextlib.redirect_stdout(open(os.devnull, "w")):
         if name == "config.json":
-            view_command._described(folder)
+            view_opening._described(folder)
             resume.same_run(folder, run_cfg.resolve("nero_reach", "default", None, {}, {}), (), {})
         elif name == "summary.json":
             train_run.report({**training._summary(folder), "folder": "x"}, films=False)

@@ -70,10 +70,10 @@ def messages(seed: int, count: int) -> Iterator[tuple[str, str]]:
     """Messages to a view, a hundred a connection; a page of somebody else's stays all the time."""
     import pages
 
-    from mjx_nero.tools import view
+    from mjx_nero.tools.view import opening
 
     said, draw = _log(), random.Random(f"messages {seed}")
-    shown = view.open_view(env_name="nero_reach", agent="zero", port=18600)
+    shown = opening.open_view(env_name="nero_reach", agent="zero", port=18600)
     odd = pages.odd_messages(shown, draw)
     try:
         with pages.talk(shown) as other:

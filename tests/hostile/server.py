@@ -136,7 +136,7 @@ def main() -> None:
     import mjx_nero.control.rmpflow
     import mjx_nero.tools.eval
     import mjx_nero.tools.import_urdf
-    import mjx_nero.tools.inspection.command
+    import mjx_nero.tools.inspect
     import mjx_nero.tools.train  # noqa: F401
 
     print("ready", flush=True)

@@ -53,7 +53,7 @@ def test_who_joins_and_with_what(monkeypatch, env, how):
 
 def start(folder, *flags, **env):
     env = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", **env}
-    argv = [sys.executable, "-c", KINEMATIC + MAIN, "--env", "nero_lift", "--impl", "jax", *SIZES, *flags]
+    argv = [sys.executable, "-c", KINEMATIC + MAIN, "--env", "nero_reach", "--impl", "jax", *SIZES, *flags]
     return subprocess.Popen(argv, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

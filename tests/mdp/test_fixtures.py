@@ -111,7 +111,7 @@ def test_resets_move_the_fixture_and_its_joint():
         moved = fixtures.stand_uniform(k_stand, start, fixture="cabinet", x=(-0.1, 0.0), y=(0.2, 0.3), yaw=(-0.5, 0.5))
         return fixtures.joint_uniform(k_joint, moved, fixture="cabinet", joint="door", position=(0.1, 0.2)).fixtures["cabinet"]
 
-    found = jax.vmap(drawn)(jax.random.split(jax.random.PRNGKey(0), 500))
+    found = jax.jit(jax.vmap(drawn))(jax.random.split(jax.random.PRNGKey(0), 500))
     assert found.pos_w[:, 0].min() >= 0.4 and found.pos_w[:, 0].max() <= 0.5
     assert found.pos_w[:, 1].min() >= 0.3 - 1e-6 and found.pos_w[:, 1].max() <= 0.4 + 1e-6
     np.testing.assert_allclose(found.pos_w[:, 2], 0.2)
@@ -122,7 +122,9 @@ def test_resets_move_the_fixture_and_its_joint():
 
 
 def test_commands_to_either_side():
-    found = jax.vmap(lambda key: commands.either_side(key, size=(0.5, 1.0)))(jax.random.split(jax.random.PRNGKey(0), 400))
+    found = jax.jit(jax.vmap(lambda key: commands.either_side(key, size=(0.5, 1.0))))(
+        jax.random.split(jax.random.PRNGKey(0), 400)
+    )
     assert not found[:, 1:].any()
     sides = np.array(found[:, 0])
     assert 0.5 <= np.abs(sides).min() < 0.52 and 0.98 < np.abs(sides).max() <= 1.0 and 150 < (sides > 0).sum() < 250

@@ -32,7 +32,7 @@ def drawn(term, **params):
     """A thousand draws: {field: (rows, values [1000, rows, ...])}."""
     rows = {field: row for field, (row, _) in term(jax.random.PRNGKey(0), MODEL, **params).items()}
     keys = jax.random.split(jax.random.PRNGKey(1), 1000)
-    values = jax.vmap(lambda key: {f: v for f, (_, v) in term(key, MODEL, **params).items()})(keys)
+    values = jax.jit(jax.vmap(lambda key: {f: v for f, (_, v) in term(key, MODEL, **params).items()}))(keys)
     return {field: (rows[field], np.asarray(values[field])) for field in rows}
 
 

@@ -20,7 +20,7 @@ def drawn(kind: str, goal=GOAL, **changes):
     """Centres and edges [n, 2, 3] of both boxes, in the frame of the way."""
     at = view(ee_pos_w=START, goal_pos_w=goal, root_pos_w=[1.0, 2.0, 0.0])
     params = {**PARAMS, "kinds": (kind,), **changes}
-    boxes = jax.vmap(lambda key: obstacles.across(key, at, **params))(jax.random.split(jax.random.PRNGKey(0), N))
+    boxes = jax.jit(jax.vmap(lambda key: obstacles.across(key, at, **params)))(jax.random.split(jax.random.PRNGKey(0), N))
     pos = np.stack([boxes[name].pos_w for name in ("one", "two")], axis=1)
     size = np.stack([boxes[name].size for name in ("one", "two")], axis=1)
     # Turned about z to face the way: its angle is that of 3-4-5.
@@ -107,7 +107,7 @@ def test_nothing_stands_where_there_is_no_room():
 
 def test_each_kind_is_as_likely():
     at = view(ee_pos_w=START, goal_pos_w=GOAL, root_pos_w=[1.0, 2.0, 0.0])
-    boxes = jax.vmap(lambda key: obstacles.across(key, at, **PARAMS))(jax.random.split(jax.random.PRNGKey(1), 2000))
+    boxes = jax.jit(jax.vmap(lambda key: obstacles.across(key, at, **PARAMS)))(jax.random.split(jax.random.PRNGKey(1), 2000))
     two = boxes["two"].pos_w[:, 2] > 0  # posts and shelves
     assert float(jnp.mean(two)) == pytest.approx(0.5, abs=0.05)
 

@@ -28,7 +28,7 @@ def start() -> Start:
 @pytest.fixture(scope="module")
 def scattered():
     """A thousand starts with two to four of the five."""
-    scatter = jax.vmap(lambda key: events.scatter(key, start(), objects=NAMES, count=(2, 4), **WAY))
+    scatter = jax.jit(jax.vmap(lambda key: events.scatter(key, start(), objects=NAMES, count=(2, 4), **WAY)))
     return jax.jit(scatter)(jax.random.split(jax.random.PRNGKey(0), 1000))
 
 
@@ -92,7 +92,7 @@ def test_objects_leave_the_table_unless_they_are_parked(x, left):
 
 def test_colours_are_bright_and_none_is_green():
     model = randomization.Model({"geom_rgba": jnp.zeros((3, 4))}, {"geom": {"a": 0, "b": 2}})
-    draw = jax.vmap(lambda key: randomization.color(key, model, geoms=("b", "a"))["geom_rgba"][1])
+    draw = jax.jit(jax.vmap(lambda key: randomization.color(key, model, geoms=("b", "a"))["geom_rgba"][1]))
     rows = randomization.color(jax.random.PRNGKey(0), model, geoms=("b", "a"))["geom_rgba"][0]
     np.testing.assert_array_equal(rows, [2, 0])
     rgba = np.asarray(draw(jax.random.split(jax.random.PRNGKey(0), 500))).reshape(-1, 4)

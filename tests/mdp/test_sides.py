@@ -109,7 +109,7 @@ def test_what_is_paid_on_the_way():
 
 def test_every_command_is_a_side_and_another_side_is_up_at_first():
     keys = jax.random.split(jax.random.PRNGKey(0), 600)
-    commands = jax.vmap(sides.any_side)(keys)
+    commands = jax.jit(jax.vmap(sides.any_side))(keys)
     assert len(np.unique(np.asarray(commands), axis=0)) == 6
     start = Start(joint_pos=jnp.zeros(1), object_pos_w={}, object_quat_w={"box": about(0, 0)})
 
@@ -118,8 +118,8 @@ def test_every_command_is_a_side_and_another_side_is_up_at_first():
         begun = dataclasses.replace(start, goal_pos_w=command + jnp.array(base))
         return sides.other_side_up(key, begun, base=base, yaw=(-0.3, 0.3), object="box").object_quat_w["box"]
 
-    turned = jax.vmap(laid)(keys, commands)
-    up = np.asarray(jax.vmap(quats.rotate)(turned, commands))[:, 2]
+    turned = jax.jit(jax.vmap(laid))(keys, commands)
+    up = np.asarray(jax.jit(jax.vmap(quats.rotate))(turned, commands))[:, 2]
     assert set(np.round(up, 3)) == {0.0, -1.0} and 0.1 < (up < -0.5).mean() < 0.3  # four sides of five lie level
-    level = np.abs(np.asarray(jax.vmap(quats.rotation_matrix)(turned))[:, 2]).max(axis=1)
+    level = np.abs(np.asarray(jax.jit(jax.vmap(quats.rotation_matrix))(turned))[:, 2]).max(axis=1)
     np.testing.assert_allclose(level, 1.0, atol=1e-5)  # it lies flat

@@ -300,7 +300,7 @@ def test_distances_of_success():
 
 def test_pose_is_a_place_in_its_box_and_one_orientation():
     params = {"x": (0.4, 0.5), "y": (-0.1, 0.1), "z": (0.3, 0.3), "quat": (0.0, 0.0, 1.0, 0.0)}
-    pos, quat = jax.vmap(lambda k: commands.pose(k, **params))(jax.random.split(KEY, 500))
+    pos, quat = jax.jit(jax.vmap(lambda k: commands.pose(k, **params)))(jax.random.split(KEY, 500))
     assert (quat == jnp.array([0.0, 0.0, 1.0, 0.0])).all()
     np.testing.assert_allclose(pos.min(0), [0.4, -0.1, 0.3], atol=0.005)
     np.testing.assert_allclose(pos.max(0), [0.5, 0.1, 0.3], atol=0.005)
@@ -493,7 +493,7 @@ def delays(steps, hold, number=400, length=60):
 
         return jax.lax.scan(step, line.init(key, jnp.zeros(())), jnp.arange(10.0, 10.0 + length))[1]
 
-    return np.asarray(jax.vmap(run)(jax.random.split(KEY, number)))[:, 10:]
+    return np.asarray(jax.jit(jax.vmap(run))(jax.random.split(KEY, number)))[:, 10:]
 
 
 def test_a_delay_is_drawn_once_an_episode():
@@ -519,7 +519,7 @@ def test_a_history_has_the_newest_at_the_end():
 
 def test_uniform_pose_fills_its_ranges():
     ranges = {"x": (0.1, 0.3), "y": (-0.2, 0.0), "z": (0.5, 0.5), "roll": (0.0, 0.0), "pitch": (0.0, 0.0), "yaw": (-1.0, 2.0)}
-    pos, quat = jax.vmap(lambda key: commands.uniform_pose(key, **ranges))(jax.random.split(KEY, 2000))
+    pos, quat = jax.jit(jax.vmap(lambda key: commands.uniform_pose(key, **ranges)))(jax.random.split(KEY, 2000))
     assert ((pos >= jnp.array([0.1, -0.2, 0.5])) & (pos <= jnp.array([0.3, 0.0, 0.5]))).all()
     yaw = 2 * np.arctan2(quat[:, 3], quat[:, 0])
     assert yaw.min() == pytest.approx(-1, abs=0.01) and yaw.max() == pytest.approx(2, abs=0.01)
@@ -530,7 +530,7 @@ def test_uniform_pose_fills_its_ranges():
 def starts(event, joints, cube, number=2000, **params):
     """The joints and cubes of many draws of an event."""
     start = Start(joint_pos=joints, object_pos_w={"cube": cube, "other": cube}, object_quat_w={})
-    after = jax.vmap(lambda k: event(k, start, **params))(jax.random.split(KEY, number))
+    after = jax.jit(jax.vmap(lambda k: event(k, start, **params)))(jax.random.split(KEY, number))
     return after.joint_pos, after.object_pos_w["cube"], after.object_pos_w["other"]
 
 
@@ -545,7 +545,7 @@ def test_joints_are_scaled_one_by_one():
 
 def test_uniform_position_fills_its_box():
     box = {"x": (0.3, 0.35), "y": (-0.2, 0.2), "z": (0.2, 0.2)}
-    points = jax.vmap(lambda k: commands.uniform_position(k, **box))(jax.random.split(KEY, 2000))
+    points = jax.jit(jax.vmap(lambda k: commands.uniform_position(k, **box)))(jax.random.split(KEY, 2000))
     low, high = np.float32([0.3, -0.2, 0.2]), np.float32([0.35, 0.2, 0.2])
     assert (points >= low).all() and (points <= high).all()
     np.testing.assert_allclose(points.min(0), low, atol=0.002)
@@ -645,7 +645,7 @@ def test_noise_keeps_its_bounds_and_is_independent():
     np.testing.assert_array_equal(off["state"], exact)
     np.testing.assert_array_equal(off["privileged_state"], exact[:2])
 
-    draws = jax.vmap(lambda k: terms.observe(NOISY, view(), view(), k, RECALL))(jax.random.split(KEY, 4000))
+    draws = jax.jit(jax.vmap(lambda k: terms.observe(NOISY, view(), view(), k, RECALL)))(jax.random.split(KEY, 4000))
     noise = np.asarray(draws["state"]) - exact
     assert (noise[:, 2:5] == 0).all()  # no noise asked for
     bounds = np.array([0.01, 0.01, 0.1, 0.1])

@@ -294,7 +294,7 @@ def test_an_object_is_turned_about_the_vertical():
     turned = events.object_yaw_uniform(KEY, lying, yaw=(math.pi / 2, math.pi / 2), object="b").object_quat_w
     np.testing.assert_allclose(turned["b"], [0.5, 0.5, 0.5, 0.5], atol=1e-6)  # x, then z: x -> y -> z -> x
     np.testing.assert_array_equal(turned["a"], STRAIGHT)
-    draw = jax.vmap(lambda key: events.object_yaw_uniform(key, start(), yaw=(-0.2, 0.4), object="a").object_quat_w["a"])
+    draw = jax.jit(jax.vmap(lambda key: events.object_yaw_uniform(key, start(), yaw=(-0.2, 0.4), object="a").object_quat_w["a"]))
     angle = 2 * np.arcsin(np.asarray(draw(jax.random.split(KEY, 500))[:, 3]))
     assert angle.min() == pytest.approx(-0.2, abs=0.01) and angle.max() == pytest.approx(0.4, abs=0.01)
 

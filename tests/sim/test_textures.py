@@ -118,7 +118,7 @@ def test_looks_choose_among_what_there_is(built):
     }
     look = Look(model, terms)
     assert look.names == ("geom_matid", "geom_rgba")
-    drawn = jax.vmap(look)(jax.random.split(jax.random.PRNGKey(0), 2000))
+    drawn = jax.jit(jax.vmap(look))(jax.random.split(jax.random.PRNGKey(0), 2000))
     table, robot = model.geom("table_top").id, np.flatnonzero(model.geom_matid >= 0)
     shown = np.array(drawn["geom_matid"][:, table])
     photos = [names.index(f"photograph_{i}") for i in range(2)]

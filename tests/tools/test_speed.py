@@ -6,21 +6,24 @@ dear.
 """
 
 import dataclasses
+import os
 import statistics
 import time
+import types
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 import pytest
+from mujoco import rollout
 
 import mjx_nero
 from mjx_nero.envs import wrappers
 from mjx_nero.learn.ppo import learner as ppo
 from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.sim.physics import fusion
-from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.tools.benchmark import throughput
-from mjx_nero.tools.benchmark.program import Program
 
 NUM_ENVS, ROUNDS = 128, 5
 
@@ -43,25 +46,41 @@ def optimised():
     jax.config.update("jax_disable_most_optimizations", before)
 
 
+def bare(env, steps: int):
+    """MuJoCo's own threaded rollout of the same scene under random targets: ``steps`` control steps a call, no JAX."""
+    model, n, substeps = env.physics_model, env.num_envs, env.cfg.sim.decimation
+    threads = len(os.sched_getaffinity(0))
+    data, roll = [mujoco.MjData(model) for _ in range(threads)], rollout.Rollout(nthread=threads).rollout
+    sims, draw = jax.jit(jax.vmap(env.sample))(jax.random.split(jax.random.PRNGKey(0), n))[0], np.random.default_rng(0)
+    state = np.concatenate([np.zeros((n, 1)), sims.qpos, sims.qvel], axis=1)
+
+    def run():
+        nonlocal state
+        for _ in range(steps):
+            targets = np.asarray(sims.ctrl, float) + 0.5 * draw.normal(size=sims.ctrl.shape)
+            ctrl = np.repeat(targets[:, None], substeps, axis=1)
+            state = roll(model, data, state, ctrl, nstep=substeps)[0][:, -1]
+
+    return types.SimpleNamespace(run=run, work=n * steps)
+
+
 @pytest.fixture(scope="module")
-def costs(env, optimised) -> dict[str, list[float]]:
+def costs(optimised) -> dict[str, list[float]]:
     """CPU seconds an env step, one entry a round."""
     if jax.default_backend() != "cpu":
         pytest.skip("on an accelerator the CPU's seconds tell little")
-    mjx_step = jax.jit(jax.vmap(JaxPhysics(env.physics_model, env.cfg.sim).step))
     native = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
     still = mjx_nero.make("nero_lift", impl="native", num_envs=NUM_ENVS)
     still.__dict__["physics"] = Still()
     cfg = dataclasses.replace(run_cfg.learner_cfg(native.cfg, "default"), num_envs=NUM_ENVS)
-    sim = jax.jit(jax.vmap(env.sample))(jax.random.split(jax.random.PRNGKey(0), 8))[0]
     programs = {
         "physics": throughput.physics(native, 25),
         "step": throughput.step(native, 25),
         "terms": throughput.step(still, 100),
         "ppo": throughput.training(ppo.Learner(wrappers.for_training(native), cfg), 1),
-        "mjx": Program(lambda sim, key: (mjx_step(sim, sim.ctrl)[0], {}), sim, 8),
+        "bare": bare(native, 25),
     }
-    programs["mjx"].run()  # compiles
+    programs["bare"].run()  # makes MuJoCo's own arrays
     found: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(ROUNDS):
         for name, program in programs.items():
@@ -76,7 +95,7 @@ OLD = jax.__version_info__ < (0, 11)
 BOUNDS = [
     pytest.param("terms", "physics", 0.12 if OLD else 0.07, id="the MDP beside the physics (0.08; 0.045)"),
     pytest.param("ppo", "step", 4.0, id="training beside random actions (2.5; 2.8)"),
-    pytest.param("physics", "mjx", 0.07, id="MuJoCo's C library beside MJX-JAX (0.04)"),
+    pytest.param("physics", "bare", 1.8, id="the physics beside MuJoCo's own rollout (1.2)"),
 ]
 
 

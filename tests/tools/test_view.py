@@ -13,8 +13,7 @@ from flax import struct
 import mjx_nero
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.play.recorder import Recorder
-from mjx_nero.tools import view
-from mjx_nero.tools.view import agents
+from mjx_nero.tools.view import agents, opening
 from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.scene import Scene
 from mjx_nero.tools.view.session import Session, free_joints
@@ -165,7 +164,7 @@ def test_checkpoints_of_a_training_play_too(tmp_path, reach):
 @pytest.mark.slow
 def test_a_training_writes_what_the_view_follows(call, tmp_path):
     assert call("train", "--env", "nero_reach", "--num-envs", 32, "--num-timesteps", 3072, "--no-video", "--out", "run")[0] == 0
-    followed = view.open_view(run=tmp_path / "run", port=18100)
+    followed = opening.open_view(run=tmp_path / "run", port=18100)
     try:
         followed.follow()
         assert followed.panel.agent.value.startswith("run ") and followed.session.env.cfg.robot.name == "nero"
@@ -212,7 +211,7 @@ def test_in_a_browser(browser):
 
     # One long episode: a slow browser takes more than one of the usual length until it pauses.
     overrides = {"scene.view_distance": 1.4, "episode_length_s": 120.0, **STRONG}
-    page = view.open_view(env_name="nero_reach", agent="ik", port=18080, overrides=overrides)
+    page = opening.open_view(env_name="nero_reach", agent="ik", port=18080, overrides=overrides)
     try:
         browser.get(page.url)
         canvas = wait(lambda: browser.find_elements(By.TAG_NAME, "canvas"))[0]

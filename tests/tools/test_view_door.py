@@ -13,8 +13,7 @@ import time
 import msgspec
 import pytest
 
-from mjx_nero.tools import view
-from mjx_nero.tools.view import request
+from mjx_nero.tools.view import opening, request
 
 pytest.importorskip("viser")
 
@@ -272,7 +271,7 @@ def test_a_page_of_another_origin_neither_steers_nor_shares(browser, evil, host,
 
     opened = []
     monkeypatch.setattr(_viser, "ViserTunnel", lambda *args, **kwargs: opened.append(args))
-    shown = view.open_view(env_name="nero_lift", agent="zero", port=18500, host=host)
+    shown = opening.open_view(env_name="nero_lift", agent="zero", port=18500, host=host)
     try:
         port = shown._door.port
         browser.get(f"http://127.0.0.1:{port}/?token={token_of(shown._door)}")
@@ -293,10 +292,12 @@ def test_a_page_of_another_origin_neither_steers_nor_shares(browser, evil, host,
             seen = browser.execute_script("return seen")
             assert {what for name, what in seen.items() if name.startswith("ws")} == {"refused"}, seen
             assert seen["fetch cors"] == "refused" and seen["fetch no-cors"] in ("refused", 0), seen
-            time.sleep(3)  # a framed page would be a client by now
-            assert len(shown.server.get_clients()) == 1
+        time.sleep(3)  # a framed page would be a client by now
+        assert len(shown.server.get_clients()) == 1
+        for handle in set(browser.window_handles) - {own}:
+            browser.switch_to.window(handle)
             browser.close()
-            browser.switch_to.window(own)
+        browser.switch_to.window(own)
         browser.switch_to.new_window("tab")
         browser.get(f"http://evil.example:{port}/?token={token_of(shown._door)}")  # a name that is made to lead here
         assert "Open the address that the program printed" in browser.find_element(By.TAG_NAME, "body").text

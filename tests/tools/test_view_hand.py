@@ -14,8 +14,7 @@ import mjx_nero
 from mjx_nero.data import episode as names
 from mjx_nero.data import open_dataset
 from mjx_nero.errors import UserError
-from mjx_nero.tools import view
-from mjx_nero.tools.view import agents, hand_panel, tape
+from mjx_nero.tools.view import agents, hand_panel, opening, tape
 from mjx_nero.tools.view.hand import NAME, Hand, Recording
 from mjx_nero.tools.view.session import Session
 
@@ -137,7 +136,7 @@ def test_what_the_hand_did_is_played_again_in_physics(shown, tmp_path, call):
 
 def test_corrections_are_recorded_while_the_user_steers(tmp_path):
     """Taking over begins an episode, giving back saves it; what the policy does by itself is not in it."""
-    page = view.open_view(env_name="nero_lift", agent="zero", port=18500, demos=tmp_path / "d")
+    page = opening.open_view(env_name="nero_lift", agent="zero", port=18500, demos=tmp_path / "d")
     try:
         hands = page.hands
         assert {"Record (R)", "Discard (D)", "Replay (P)", "Save (S)", "Give back"} <= set(controls(page))

@@ -9,8 +9,7 @@ import time
 import msgspec
 import pytest
 
-from mjx_nero.tools import view
-from mjx_nero.tools.view import log
+from mjx_nero.tools.view import log, opening
 from mjx_nero.tools.view.orders import Orders
 
 pytest.importorskip("viser")
@@ -26,7 +25,7 @@ from mjx_nero.tools.view import messages
 
 @pytest.fixture(scope="module")
 def lift():
-    shown = view.open_view(env_name="nero_lift", agent="zero", port=18400)
+    shown = opening.open_view(env_name="nero_lift", agent="zero", port=18400)
     yield shown
     shown.close()
 

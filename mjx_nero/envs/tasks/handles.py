@@ -14,17 +14,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, velocity_actions
 from mjx_nero.mdp import commands, fixtures, observations, randomization, rewards, terminations
 from mjx_nero.mdp.fixtures import Handle
-from mjx_nero.mdp.terms import (
-    ONCE,
-    CommandTerm,
-    DoneTerm,
-    MetricTerm,
-    ObservationGroup,
-    ObservationTerm,
-    RewardTerm,
-    Term,
-    privileged,
-)
+from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import fixtures as models
 from mjx_nero.sim import scene as scenes
@@ -139,7 +129,7 @@ class Task:
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         }
 
-    def observations(self) -> dict[str, ObservationGroup]:
+    def observations(self) -> Groups:
         """The arm, the handle and the joint; the critic sees speeds besides."""
         held = {"handle": self.held}
         state = {
@@ -149,10 +139,7 @@ class Task:
             "joint": ObservationTerm(fixtures.joint, params=held, noise=0.002),
             "actions": ObservationTerm(observations.last_action),
         }
-        return {
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(state, {"joint_velocity": ObservationTerm(fixtures.joint_velocity, params=held)}),
-        }
+        return groups(state, {"joint_velocity": ObservationTerm(fixtures.joint_velocity, params=held)})
 
     def opening(self) -> EnvCfg:
         """Builds a task that is done once the joint is as far as its target, or farther."""

@@ -25,7 +25,7 @@ from mjx_nero.envs.task import (
 from mjx_nero.envs.tasks import seeing
 from mjx_nero.envs.tasks import sim2real as sim2reals
 from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -136,19 +136,14 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
         "target_object_position": ObservationTerm(observations.command),
         "actions": ObservationTerm(observations.last_action),
     }
+    seen = {
+        "object_velocity": ObservationTerm(observations.object_velocity),
+        "object_orientation": ObservationTerm(observations.object_orientation),
+    }
     return dataclasses.replace(
         recipe,
         actions=velocity_actions(hysteresis=0.5),
-        observations={
-            "state": ObservationGroup(state),
-            "privileged_state": privileged(
-                state,
-                {
-                    "object_velocity": ObservationTerm(observations.object_velocity),
-                    "object_orientation": ObservationTerm(observations.object_orientation),
-                },
-            ),
-        },
+        observations=groups(state, seen),
         rewards=carrying(held),
         curriculum=CurriculumCfg(),
         controllers=setup.controllers(robot),

@@ -7,7 +7,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
 from mjx_nero.envs.tasks.building import Tower
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, groups
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -54,7 +54,7 @@ def default(robot: RobotCfg) -> EnvCfg:
             ),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, **named}),
         },
-        observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
+        observations=groups(state, seen),
         budget=Budget(steps=70_000_000),
     )
 

@@ -10,7 +10,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, nearer
 from mjx_nero.envs.tasks.building import Tower
 from mjx_nero.mdp import commands, events, fixtures, holes, observations, rewards, sensors, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import fixtures as models
 from mjx_nero.sim.robot import RobotCfg
@@ -103,7 +103,7 @@ class Putting(Tower):
             "object_velocity": ObservationTerm(observations.object_velocity, params=one),
             "to_place": ObservationTerm(holes.to_place, params=place),
         }
-        return {"state": ObservationGroup(state), "privileged_state": privileged(state, seen)}
+        return groups(state, seen)
 
     def cfg(self, controllers: dict[str, dict[str, Any]], **own: Any) -> EnvCfg:
         """Makes the task.

@@ -9,7 +9,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
 from mjx_nero.envs.tasks.building import LIFTED, Tower
 from mjx_nero.mdp import commands, events, observations, towers
-from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, privileged
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
@@ -62,7 +62,7 @@ def _stack(robot: RobotCfg, count: int, episode_length_s: float) -> EnvCfg:
                 params={"objects": tuple(objects), "x": there.cube[0], "y": there.cube[1], "apart": apart},
             ),
         },
-        observations={"state": ObservationGroup(state), "privileged_state": privileged(state, seen)},
+        observations=groups(state, seen),
         rewards={**tower.rewards(), "leaving": leaving},
         budget=Budget(steps=70_000_000),
     )

@@ -1,33 +1,27 @@
 """Plays and measures a policy, a controller, the zero agent or the random agent."""
 
 import dataclasses
-import pathlib
 import time
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_nero import config, control
-from mjx_nero.config import flag
-from mjx_nero.config.bounds import Bounds, OneOf, Seed
 from mjx_nero.envs import registry, things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import policy
+from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import rollout
+from mjx_nero.learn.play.cfg import EXPERT, EvalCfg
 from mjx_nero.mdp import metrics
 from mjx_nero.sim.physics import warp_available
 
-AGENTS = ("policy", "zero", "random")
-EXPERT = "expert"  # the task's first controller
-BACKENDS = ("auto", "mjx", "mujoco")
 
-
-def agent(cfg: "EvalCfg", env: ManipulationEnv) -> tuple[rollout.Act, Any]:
+def agent(cfg: EvalCfg, env: ManipulationEnv) -> tuple[rollout.Act, Any]:
     """Returns an agent's act function and parameters.
 
     ``policy`` is deterministic, ``random`` uniform in +-1, and ``zero`` stays at home.
@@ -62,45 +56,6 @@ def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[s
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalCfg:
-    """Settings of an evaluation.
-
-    Attributes:
-        robot: robot in place of the environment's own, by name or folder.
-        agent: policy, zero or random (default: the policy, or else the task's controller).
-        policy: policy file (default: the bundled one of the environment).
-        any_robot: play a policy that was trained for another model of the robot.
-        controller: play one of the task's controllers, or expert for the first of them, instead of an agent.
-        episodes: number of episodes, played side by side.
-        backend: mjx, or mujoco for the C library on the CPU; auto: see impl.
-        impl: physics, one of ``physics.impls()``.
-        record: number of episodes whose steps are kept, for example for a video.
-        env_fields, control_fields: fields of the environment's and the controller's config by dotted name.
-    """
-
-    env_name: str
-    preset: str = flag("default")
-    robot: str | None = flag(None)
-    agent: Annotated[str, OneOf(*AGENTS)] | None = flag(None)
-    policy: pathlib.Path | None = flag(None)
-    any_robot: bool = flag(False)
-    controller: str | None = flag(None)
-    episodes: Annotated[int, Bounds(1, 1_000_000)] = flag(64)
-    seed: Seed = flag(1)
-    backend: Annotated[str, OneOf(*BACKENDS)] = flag("auto")
-    impl: str = flag("auto")
-    record: int = 0
-    env_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    control_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    def __post_init__(self):
-        if self.controller and (self.agent or self.policy):
-            raise UserError("only one can play: give --controller, --agent or --policy")
-        if self.control_fields and (self.agent or self.policy):
-            raise UserError("--control.* needs --controller")
-
-
-@dataclasses.dataclass(frozen=True)
 class Played:
     """The episodes, the environment that they were played in, and their figures (plain JSON)."""
 
@@ -114,7 +69,7 @@ def _controller_name(cfg: EvalCfg, env_cfg: EnvCfg) -> str | None:
     usual = next(iter(env_cfg.controllers), None)
     if cfg.controller:
         return (usual or EXPERT) if cfg.controller == EXPERT else cfg.controller
-    return None if cfg.agent or cfg.policy or policy.shipped(cfg.env_name, cfg.preset).exists() else usual
+    return None if cfg.agent or cfg.policy or bundled.shipped(cfg.env_name, cfg.preset).exists() else usual
 
 
 def play(cfg: EvalCfg) -> Played:

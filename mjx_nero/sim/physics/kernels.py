@@ -49,8 +49,13 @@ def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
     """
     import warp as wp
 
-    modes = {"graph_mode": wp.JaxCallableGraphMode.NONE, "module_preload_mode": wp.JaxModulePreloadMode.NONE}
-    return wp.jax_callable(function, num_outputs=outputs, vmap_method=None, **modes)
+    return wp.jax_callable(
+        function,
+        num_outputs=outputs,
+        vmap_method=None,
+        graph_mode=wp.JaxCallableGraphMode.NONE,
+        module_preload_mode=wp.JaxModulePreloadMode.NONE,
+    )
 
 
 def source(name: str) -> str:

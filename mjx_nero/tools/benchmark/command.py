@@ -1,31 +1,23 @@
 """The command line of the benchmark: what to measure, and what becomes of the rows."""
 
 import argparse
-import dataclasses
-import functools
-import gc
 import pathlib
 import re
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from mjx_nero import config, console, files
 from mjx_nero.envs import registry
-from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import device_memory
 from mjx_nero.learn import learner as learners
-from mjx_nero.learn.play import evaluation
 from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import compiled
-from mjx_nero.sim.physics import impls, resolve_impl
+from mjx_nero.sim.physics import impls
 from mjx_nero.tools import cli
-from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, machine, plot, start, throughput
-from mjx_nero.tools.benchmark.program import Row
+from mjx_nero.tools.benchmark import machine, plot
+from mjx_nero.tools.benchmark.machine import Row
 
 WHATS = {
     "physics": "random actions into the bare physics",
@@ -38,7 +30,6 @@ WHATS = {
     "start": "what comes before the first training step, in a process of its own",
     "ik": "inverse kinematics",
 }
-_SIZES = "1024,4096,16384"
 _ENDS = ("_min", "_max")
 _ON_DEVICES = ("ppo", "learning")  # what --num-devices spreads
 _COUNTS = ("nan_count", "overflow_count")
@@ -56,38 +47,26 @@ _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the ta
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
-    """One entry of the list of measurements. ``size`` orders those that differ in nothing else; 0: has none."""
-
-    what: str
-    impl: str
-    size: int
-    rows: Callable[[], Iterable[Row]]
-
-    def failed(self, note: str) -> Row:
-        row: Row = {"what": self.what, "impl": self.impl}
-        return row | ({"num_envs": self.size} if self.size else {}) | {"note": note}
-
-
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
     args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    from mjx_nero.tools.benchmark import jobs  # with Brax and MJX, which help does without
+
     args.learner = args.learner or registry.env_cfg(args.env, args.preset, args.robot).learner
     parser.only(dotted, learners.names(), args.learner)
     whats = cli.choices(args.what, "what", tuple(WHATS))
     _check_files(args.json, args.plot, whats)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
-    jobs = _jobs(args, cfg, dotted.get(args.learner, {}), whats, argv)
+    todo = jobs.jobs(args, cfg, dotted.get(args.learner, {}), whats, argv)
     head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
     here = machine.machine()
     report = {"machine": here, "versions": machine.versions(), "command": command(argv), "complete": False}
     title = f"{', '.join(head.values())} on {machine.name(here)}"
     rows: list[Row] = []
     try:
-        for row in _measured(jobs):
+        for row in jobs.measured(todo):
             spread = {"num_devices": args.num_devices} if row["what"] in _ON_DEVICES else {}
             rows.append({**head, **row, **spread})
             print(_line(row), file=sys.stderr)
@@ -109,15 +88,16 @@ def command(argv: Sequence[str]) -> str:
 
 
 def _parser() -> cli.Parser:
-    lines = "\n".join(f"  {name:<9} {what}" for name, what in WHATS.items())
     parser = cli.Parser(
-        prog=cli.called_as("benchmark"),
-        description="Measures what this machine does in a second, and how long it takes to learn.",
-        epilog=f"what can be measured:\n{lines}",
+        "benchmark",
+        "Measures what this machine does in a second, and how long it takes to learn.",
+        ends=cli.listed("what can be measured", WHATS),
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_argument(
-        "--num-envs", type=_sizes, help=f"list of numbers (default: {_SIZES}; learning: the number that train.py would take)"
+        "--num-envs",
+        type=_sizes,
+        help="list of numbers (default: 1024,4096,16384; learning: the number that train.py would take)",
     )
     parser.add_argument("--learner", help="learner for ppo and learning (default: the task's own)")
     parser.add_argument(
@@ -150,90 +130,16 @@ def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
 
 def begin() -> None:
     """The process of ``--what start``; the first argument is when it was started, the others are the benchmark's."""
+    from mjx_nero.sim.physics import resolve_impl
+    from mjx_nero.tools.benchmark import jobs, start
+
     imported, spawned, argv = time.time(), float(sys.argv[1]), sys.argv[2:]
     args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _cfgs)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     impl, sizes = resolve_impl(args.impl), args.num_envs or [0]
     args.learner = args.learner or cfg.learner
-    start.begin(spawned, imported, _run(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
-
-
-def _jobs(
-    args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str], argv: Sequence[str]
-) -> list[_Job]:
-    """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here."""
-    make_run = functools.partial(_run, args, hyperparameters)
-    jobs = []
-    for impl in dict.fromkeys(resolve_impl(impl) for impl in cli.choices(args.impl, "impl", impls())):
-        for what in whats:
-            if what == "learning":
-                for n in args.num_envs or [0]:
-                    run = make_run(cfg, impl, n)
-                    rows = functools.partial(learning.measure_learning, run, args.seeds, args.target)
-                    compiled.make_learner(run)
-                    jobs.append(_Job(what, impl, run.num_envs, rows))
-            elif what == "start":
-                run = make_run(cfg, impl, (args.num_envs or [0])[0])
-                compiled.make_learner(run)
-                jobs.append(_Job(what, impl, run.num_envs, functools.partial(start.measure_start, [*argv, "--impl", impl], run)))
-            elif what not in ("ik", "render"):
-                task = for_controllers(cfg) if what == "control" else cfg
-                sizes = args.num_envs or _sizes(_SIZES)
-                jobs += [_throughput(what, ManipulationEnv(task, impl, n), args, make_run) for n in sizes]
-    if "render" in whats:
-        env = ManipulationEnv(cfg)
-        jobs.append(_Job("render", "", 0, lambda: [drawing.measure_render(env, min(20, args.steps), args.repeats)]))
-    if "ik" in whats:
-        jobs.append(_Job("ik", "", 0, lambda: inverse_kinematics.measure_ik(cfg.robot, args.batch, args.repeats)))
-    return jobs
-
-
-def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace, make_run: Callable[..., run_cfg.RunCfg]) -> _Job:
-    make: Callable[[], throughput.Program]
-    about: Row = {}
-    if what == "ppo":
-        run = make_run(env.cfg, env.impl, env.num_envs)
-        learner = compiled.make_learner(run)
-        iterations = max(1, args.steps * env.num_envs // learner.steps_per_iteration)
-        make = functools.partial(throughput.training, learner, iterations)
-        about = {"learner": args.learner} if args.learner != "ppo" else {}
-    elif what == "control":
-        name = next(iter(env.cfg.controllers), "")
-        make = functools.partial(throughput.controlled, env, evaluation.controller(name, env, args.env))
-        about = {"controller": name}
-    else:
-        measured = {"physics": throughput.physics, "step": throughput.step, "reset": throughput.reset}[what]
-        make = functools.partial(measured, env, args.steps)
-    return _Job(what, env.impl, env.num_envs, lambda: [throughput.measure(what, env, make, args.repeats) | about])
-
-
-def _run(args: argparse.Namespace, asked: Mapping[str, str], cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
-    sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
-    fields = {**asked, **{name: value for name, value in sizes.items() if value}}
-    learner = config.override(run_cfg.learner_cfg(cfg, args.preset, args.learner), fields)
-    how = {"impl": impl, "eval_every": args.eval_every, "num_devices": args.num_devices, "learner": args.learner}
-    return run_cfg.fit_machine(run_cfg.RunCfg(args.env, args.preset, cfg, learner, **how))[0]
-
-
-def _measured(jobs: Iterable[_Job]) -> Iterator[Row]:
-    """The rows of all jobs. Where memory ends, a row says so, and larger sizes of the same are passed over."""
-    full: dict[tuple[str, str], int] = {}
-    for job in jobs:
-        limit = full.get((job.what, job.impl))
-        if limit is not None and job.size >= limit:
-            yield job.failed(f"not run: out of memory at {limit:,}")
-            continue
-        try:
-            yield from job.rows()
-            continue
-        except (MemoryError, RuntimeError) as error:
-            if not (isinstance(error, MemoryError) or device_memory.says_so(error)):
-                raise
-            message = (str(error) or type(error).__name__).splitlines()[0]
-        full[job.what, job.impl] = job.size
-        gc.collect()  # the traceback held the arrays
-        yield job.failed(f"out of memory: {message}")
+    start.begin(spawned, imported, jobs.run_of(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
 
 
 def _check_files(rows: pathlib.Path | None, picture: pathlib.Path | None, whats: list[str]) -> None:

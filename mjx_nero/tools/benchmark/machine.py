@@ -8,12 +8,14 @@ import re
 import shutil
 import subprocess
 from importlib import metadata
+from typing import Any
 
 import jax
 
 import mjx_nero
 from mjx_nero.learn.runs import folder as run_folder
-from mjx_nero.tools.benchmark.program import Row
+
+Row = dict[str, Any]  # one measurement, as JSON has it
 
 
 def machine() -> Row:

@@ -3,7 +3,7 @@
 import pathlib
 from typing import Any
 
-from mjx_nero.tools.benchmark.program import Row
+from mjx_nero.tools.benchmark.machine import Row
 
 PLOTTED = ("physics", "step", "ppo", "control", "reset")
 _MEMORY: tuple[tuple[str, Any], ...] = (("memory_mb", "-"), ("warp_mb", ":"))  # key of a row, style of its line

@@ -9,8 +9,7 @@ import jax
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import device_memory
-
-Row = dict[str, Any]  # one measurement, as JSON has it
+from mjx_nero.tools.benchmark.machine import Row
 
 
 class Program:

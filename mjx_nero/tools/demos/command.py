@@ -22,10 +22,10 @@ def main(argv: Sequence[str]) -> None:
         UserError: unknown names, a folder of something else, a package is missing, a full disk, or nobody succeeds.
     """
     parser = cli.Parser(
-        prog=cli.called_as("demos"),
-        description="Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
+        "demos",
+        "Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_seed(0)
     parser.add_argument("--out", type=cli.path(), metavar="DIR", help="folder to write to, or to go on with")
     parser.add_fields(DemosCfg)

@@ -19,8 +19,9 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import teachers
-from mjx_nero.learn import policy
+from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import demonstrations, evaluation, rollout
+from mjx_nero.learn.play.cfg import EXPERT
 from mjx_nero.learn.play.demonstrations import Player
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim import team
@@ -54,7 +55,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     env_cfg = things.applied(config.override(env_cfg, cfg.env_fields))
     acts = cfg.agent == "policy"
     size = min(cfg.side_by_side, cfg.episodes)
-    name = next(iter(env_cfg.controllers), evaluation.EXPERT) if cfg.agent == evaluation.EXPERT else cfg.agent
+    name = next(iter(env_cfg.controllers), EXPERT) if cfg.agent == EXPERT else cfg.agent
     drives = not acts and cfg.through == "drives"
     told = not cfg.policy and teachers.GROUP in env_cfg.observations  # who acts is told what others have to see
     if not acts or told:  # what no term reads is not drawn
@@ -80,7 +81,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "fingerprint": fingerprint(env.cfg.robot),
         "env_fields": {key: str(value) for key, value in cfg.env_fields.items()},
         "agent": "policy" if acts else name,
-        "policy": _digest(cfg.policy or policy.shipped(cfg.env_name, cfg.preset)) if acts else None,
+        "policy": _digest(cfg.policy or bundled.shipped(cfg.env_name, cfg.preset)) if acts else None,
         "through": "task" if acts else cfg.through,
         "seed": cfg.seed,
         "all": cfg.all,

@@ -34,7 +34,7 @@ def add_arm(parser: cli.Parser) -> None:
     """Flags of the arm and its bus."""
     add = parser.add_argument
     add("--port", help="serial port, INTERFACE:CHANNEL, HOST, or TYPE:field=value,...: see docs/guides/deploy.md")
-    add("--gripper", metavar="HOST", help="compute box of the Cobotta's RG6 (default: its gripper is told nothing)")
+    add("--gripper", metavar="HOST", help="compute box of the Cobotta's RG6 (default: the gripper gets no commands)")
     add("--calibration", type=cli.path(".json"), help="SO-ARM: LeRobot's file; lerobot: which joint is which motor")
     add("--emulate", action="store_true", help="in place of the arm, a program that speaks its protocol, with MuJoCo behind it")
     text = "file of identify or deploy --check: its offsets are subtracted, and its delay is that of --delay"
@@ -44,13 +44,25 @@ def add_arm(parser: cli.Parser) -> None:
 def add_limits(parser: cli.Parser) -> None:
     """Flags of the safety layer: they move limits, and switch nothing off."""
     add = parser.add_argument
-    add("--speed", type=cli.share, default=1.0, metavar="SHARE", help="of the joints' speeds, at most (default: %(default)s)")
+    add(
+        "--speed",
+        type=cli.share,
+        default=1.0,
+        metavar="SHARE",
+        help="share of the joints' speeds, at most (default: %(default)s)",
+    )
     add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table's top, m (default: %(default)s)")
     text = "box that no link may leave, m (default: about home and the task's regions, and 0.3 m on all sides)"
     add("--workspace", metavar="X0,X1,Y0,Y1,Z0,Z1", help=text)
     add("--apart", type=cli.non_negative, default=0.0, help="least distance between links, m (default: %(default)s)")
     hottest = cli.number(Annotated[float, Bounds(20.0, 90.0)])
-    add("--hottest", type=hottest, default=60.0, metavar="CELSIUS", help="of a drive, at most 90 (default: %(default)s)")
+    add(
+        "--hottest",
+        type=hottest,
+        default=60.0,
+        metavar="CELSIUS",
+        help="hold when a drive is hotter (default: %(default)s)",
+    )
 
 
 def check(parser: cli.Parser, args: argparse.Namespace) -> None:

@@ -43,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(
-        prog=cli.called_as("deploy"),
-        description="Runs an exported policy on an arm, behind a safety layer. Every fault ends in holding, never in cutting "
+        "deploy",
+        "Runs an exported policy on an arm, behind a safety layer. Every fault ends in holding, never in cutting "
         "torque. Stop it with Ctrl-C, or with space, q or escape.",
     )
     add = parser.add_argument

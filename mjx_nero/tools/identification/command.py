@@ -23,8 +23,8 @@ _DT = 0.005
 def record_main(argv: Sequence[str]) -> None:
     """The command line of ``record``."""
     parser = cli.Parser(
-        prog=cli.called_as("record"),
-        description="Moves an arm by sine sweeps within its limits, and writes what its drives were told and did. Without --arm "
+        "record",
+        "Moves an arm by sine sweeps within its limits, and writes what its drives were told and did. Without --arm "
         "the arm is simulated, at once; with it, the movement goes through the safety layer of deploy, in real time.",
     )
     _add_robot(parser)
@@ -75,10 +75,7 @@ def _record_arm(parser: cli.Parser, args: argparse.Namespace) -> None:
 
 def identify_main(argv: Sequence[str]) -> None:
     """The command line of ``identify``."""
-    parser = cli.Parser(
-        prog=cli.called_as("identify"),
-        description="Fits gains, armature, friction, delay and encoder offsets of an arm's drives to a log.",
-    )
+    parser = cli.Parser("identify", "Fits gains, armature, friction, delay and encoder offsets of an arm's drives to a log.")
     parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/guides/identification.md)")
     _add_robot(parser)
     parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML for make(identified=...) and --env.identified")

@@ -1,9 +1,7 @@
-"""A robot in its scene, an environment, all environments: as values and as a picture."""
+"""A robot in its scene, or an environment: as values and as a picture."""
 
 import dataclasses
-import math
 import pathlib
-import pkgutil
 from collections.abc import Iterator
 
 import jax
@@ -14,11 +12,9 @@ import numpy as np
 from mjx_nero import config
 from mjx_nero.config import docs
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs import registry, tasks
+from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.learn import policy
-from mjx_nero.learn.ppo import networks
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim import grasp, linkage, render, scene, team
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
@@ -116,19 +112,6 @@ class Report:
         return sum(pair.contacts for pair in self.pairs)
 
 
-@dataclasses.dataclass(frozen=True)
-class Environment:
-    """A line of ``list-envs``; an environment for any robot has no robot and no sizes of its own."""
-
-    name: str
-    task: str
-    robot: str | None
-    presets: tuple[str, ...]
-    action_size: int | None
-    observation_sizes: dict[str, int]
-    policy: bool
-
-
 def find(name: str, preset: str | None = None, robot: str | None = None) -> tuple[RobotCfg, EnvCfg | None]:
     """A robot, and the environment if ``name`` is one.
 
@@ -187,24 +170,6 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
         contacts_per_env=sim.contacts_per_env,
         constraints_per_env=sim.constraints_per_env,
     )
-
-
-def environments() -> tuple[Environment, ...]:
-    """All environments; nothing is compiled."""
-    names = [module.name for module in pkgutil.iter_modules(tasks.__path__)]
-    out = []
-    for env_name in registry.list_envs():
-        task = next((t for t in names if env_name.endswith(t)), env_name)
-        presets = registry.list_presets(env_name)
-        if registry.robot_of(env_name) is None:
-            out.append(Environment(env_name, task, None, presets, None, {}, policy=False))
-            continue
-        env = ManipulationEnv(registry.env_cfg(env_name), impl="jax")
-        shapes = {group: networks.shapes(env.observation_size[group]) for group in env.cfg.observations}
-        sizes = {group: sum(map(math.prod, those)) for group, those in shapes.items()}
-        shipped = policy.shipped(env_name).is_file()
-        out.append(Environment(env_name, task, env.cfg.robot.name, presets, env.action_size, sizes, shipped))
-    return tuple(out)
 
 
 def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height: int = 720) -> np.ndarray:

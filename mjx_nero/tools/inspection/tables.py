@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.console import Table
-from mjx_nero.tools.inspection.report import Environment, Report, Task
+from mjx_nero.tools.inspection.report import Report, Task
 from mjx_nero.tools.motion import Move
 
 
@@ -58,18 +58,6 @@ def move_table(moved: Sequence[Move]) -> Table:
         ends, error = (_fixed(m.start, 3), _fixed(m.target, 3)), _fixed(abs(m.end - m.target), 4)
         view.add(m.joint, *ends, error, there, f"{m.fastest:.2f}", f"{100 * m.saturation:.0f}")
     view.caption = "there: within 1% of the joint's range; rad, rad/s; slides: m, m/s"
-    return view
-
-
-def environment_table(rows: Sequence[Environment]) -> Table:
-    """A line an environment."""
-    columns = ("name", "task", "robot", "presets", "actions", "observations", "policy")
-    view = Table("environments", columns, left=columns)
-    for row in rows:
-        sizes = ", ".join(f"{group} {size}" for group, size in row.observation_sizes.items())
-        action = "" if row.action_size is None else str(row.action_size)
-        ships = "ships" if row.policy else ""
-        view.add(row.name, row.task, row.robot or "any (--robot)", ", ".join(row.presets), action, sizes, ships)
     return view
 
 

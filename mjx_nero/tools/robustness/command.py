@@ -22,10 +22,9 @@ _LARGEST = 1 << 20  # [bytes] of figures
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
-        prog=cli.called_as("robustness"),
-        description="Plays a policy over the range of each parameter of the world, one at a time and all at once.",
+        "robustness", "Plays a policy over the range of each parameter of the world, one at a time and all at once."
     )
-    parser.add_environment(registry.list_envs())
+    parser.add_environment()
     parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled one)")
     parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting (default: %(default)s)")
     parser.add_seed(90210)

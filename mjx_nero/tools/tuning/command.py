@@ -15,8 +15,7 @@ from mjx_nero.tools.tuning.report import save_gains, save_plot, table
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
-        prog=cli.called_as("tune-gains"),
-        description="Proposes stiffness and damping for a robot's drives, and shows the step responses before and after.",
+        "tune-gains", "Proposes stiffness and damping for a robot's drives, and shows the step responses before and after."
     )
     parser.add_load()
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")

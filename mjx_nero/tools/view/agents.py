@@ -10,7 +10,7 @@ from brax.envs.base import State
 
 from mjx_nero import control, files
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import policy
+from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.learn.runs.checkpoints import POLICY, saved
 from mjx_nero.tools.view import hand
@@ -22,7 +22,7 @@ Make = Callable[[], rollout.Agent]
 def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
     """Lists all agents, each with a function that makes it: policies from files, the bundled one, controllers and sliders."""
     found: dict[str, Make] = {}
-    shipped = policy.shipped(env_name, preset)
+    shipped = bundled.shipped(env_name, preset)
     for path in [*policies, *([shipped] if shipped.is_file() else [])]:
         name = f"policy {path.stem}" if path == shipped else f"policy {path}"
         found[name] = lambda path=path: of_policy(policy.load_for(env, env_name, path))  # type: ignore[misc]

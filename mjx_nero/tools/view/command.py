@@ -1,30 +1,11 @@
-"""The command line of ``view``, and what it starts."""
+"""The command line of ``view``."""
 
-import functools
 import pathlib
-import threading
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
-import jax.numpy as jnp
-
-from mjx_nero import config, files
-from mjx_nero.config import values
-from mjx_nero.data import open_dataset
 from mjx_nero.envs import registry
-from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import need
-from mjx_nero.learn import policy
-from mjx_nero.learn.runs.folder import CONFIG
-from mjx_nero.sim import team
+from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
-from mjx_nero.tools.view import agents
-from mjx_nero.types import UserError
-
-if TYPE_CHECKING:
-    from mjx_nero.tools.view import leader as leaders
-
-WATCH_S = 2.0  # how often a followed run is looked at
 
 
 def main(argv: Sequence[str]) -> None:
@@ -33,31 +14,40 @@ def main(argv: Sequence[str]) -> None:
     Raises:
         UserError: unknown names, a policy that does not fit, the extra ``view`` is missing, or the port is taken.
     """
-    parser = cli.Parser(prog=cli.called_as("view"), description="Shows environments in a browser: watch them, and take part.")
-    parser.add_environment(registry.list_envs())
+    parser = cli.Parser("view", "Shows environments in a browser: watch them, and take part.")
+    parser.add_environment()
     parser.add_argument("--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint; repeatable")
     parser.add_argument("--agent", help="first agent: a controller, zero, random, or 'joint sliders' (default: a policy)")
     parser.add_argument(
-        "--run", type=pathlib.Path, metavar="FOLDER", help="run folder to follow: its environment, with its newest checkpoint"
+        "--run",
+        type=pathlib.Path,
+        metavar="FOLDER",
+        help="run folder to follow: its newest checkpoint plays",
     )
     parser.add_argument(
-        "--demos", type=cli.path(), metavar="DIR", help="record demonstrations of your own: a data set, new or one to go on with"
+        "--demos",
+        type=cli.path(),
+        metavar="DIR",
+        help="data set to record your own demonstrations into, new or old",
     )
     parser.add_argument(
-        "--episode", type=cli.number(int), metavar="K", help="with --demos: replay that episode, from 0; its environment, too"
+        "--episode",
+        type=cli.number(int),
+        metavar="K",
+        help="with --demos: replay episode K, counted from 0, in its environment",
     )
     parser.add_argument("--leader", metavar="PORT", help="serial port of LeRobot's SO-101 leader arm, which the robot follows")
-    parser.add_argument("--calibration", type=cli.path(".json"), help="with --leader: its calibration file, LeRobot's")
+    parser.add_argument("--calibration", type=cli.path(".json"), help="with --leader: LeRobot's calibration file of that arm")
     parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="environments side by side (default: %(default)s)")
     parser.add_seed(1)
     parser.add_address()
-    from mjx_nero.tools.view import leader
-
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     if args.episode is not None and not args.demos:
         raise UserError("--episode is of a data set: pass --demos DIR, too")
     given = parser.given(argv)  # else what the run says
-    serve(
+    from mjx_nero.tools.view import leader, opening  # with Brax and MJX, which help does without
+
+    opening.serve(
         env_name=args.env if "env" in given else None,
         preset=args.preset if "preset" in given else None,
         policies=args.policy,
@@ -65,179 +55,3 @@ def main(argv: Sequence[str]) -> None:
         leader=leader.at(args.leader, args.calibration) if args.leader else None,
         **{name: getattr(args, name) for name in "robot agent run num_envs seed host port demos episode".split()},
     )
-
-
-def serve(**kwargs: Any) -> None:
-    """Serves the page until Ctrl-C.
-
-    Args:
-        kwargs: of ``open_view``.
-    """
-    need("viser", "view")
-    cli.setup_jax()
-    view = open_view(**kwargs)
-    print(f"{view.url}  (Ctrl-C ends it)", flush=True)
-    try:
-        view.wait()
-    finally:
-        view.close()
-
-
-class View:
-    """A page that is being served.
-
-    Attributes:
-        url: to open, with its token.
-        server: viser's.
-        session: what it shows.
-        panel: its controls.
-        hands: those of the user's hand.
-    """
-
-    def __init__(self, page, door, orders, session, panel, hands, run: pathlib.Path | None, env_name: str):
-        self._page, self._door, self._orders = page, door, orders
-        self.session, self.panel, self.hands = session, panel, hands
-        self.leader: leaders.Leader | None = None  # that is read
-        self.url, self.server = door.url, page.server
-        self._run, self._env_name = run, env_name
-        self._seen: pathlib.Path | None = None
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def start(self, shown) -> None:
-        """Lets the session run."""
-        self._thread = threading.Thread(target=self.session.run, args=(shown,), daemon=True)
-        self._thread.start()
-
-    def wait(self) -> None:
-        """Waits until the simulation fails, and follows the run meanwhile."""
-        while self.session.failure is None and not self._ended.wait(WATCH_S):
-            self.follow()
-        if self.session.failure is not None:
-            raise self.session.failure
-
-    def follow(self) -> None:
-        """Plays the newest checkpoint of the run, if there is one that did not play yet."""
-        newest = agents.newest(self._run) if self._run else None
-        if newest is None or newest == self._seen:
-            return
-        self._seen, env = newest, self.session.env
-        trained = functools.partial(policy.load_for, env, self._env_name, newest, any_robot=True)
-        self.panel.add(f"run {newest.stem}", lambda: agents.of_policy(trained()))
-        self.session.reset()
-
-    def close(self) -> None:
-        """Ends simulation and servers."""
-        self._ended.set()
-        if self.leader:
-            self.leader.close()
-        self.session.stop()
-        if self._thread:
-            self._thread.join(timeout=5)
-        self._door.close()
-        self._orders.close()
-        self._page.close()
-
-
-def open_view(
-    env_name: str | None = None,
-    preset: str | None = None,
-    robot: str | None = None,
-    policies: Sequence[pathlib.Path] = (),
-    agent: str | None = None,
-    run: pathlib.Path | None = None,
-    num_envs: int = 1,
-    seed: int = 1,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    overrides: Mapping[str, Any] | None = None,
-    demos: pathlib.Path | None = None,
-    episode: int | None = None,
-    leader: "leaders.Readable | None" = None,
-) -> View:
-    """Serves the page, and lets the environments run.
-
-    Args:
-        agent: a name of ``agents.known``; None: a policy, a controller, or if there is none the joint sliders.
-        run: folder of a training to follow.
-        host: address to listen at.
-        port: the first free one from here on.
-        demos: data set to record to, of the first environment.
-        episode: of that data set, to replay at first.
-        leader: an arm that the user moves by hand, connected.
-
-    Raises:
-        UserError: as the command.
-    """
-    need("viser", "view")
-    from mjx_nero.tools.view import hand, session, tape
-    from mjx_nero.tools.view import leader as leaders
-
-    described = _described(run) if run else _played(demos) if demos and episode is not None else {}
-    env_name = env_name or described.get("env_name", "nero_lift")
-    preset = preset or described.get("preset", "default")
-    cfg = registry.env_cfg(env_name, preset, robot)
-    env = ManipulationEnv(config.override(cfg.uncorrupted(), overrides or {}), impl="native", num_envs=num_envs)
-    makers = agents.known(env, env_name, list(policies), preset)
-    if leader and leaders.same_joints(env):
-        makers[leaders.NAME] = lambda: leaders.agent(env)
-    chosen = _chosen(agent, list(makers), env_name)
-    home = jnp.array(team.home(env.team)) if chosen == agents.SLIDERS else None
-    sim = session.Session(env, num_envs, makers[chosen](), home, seed)
-    if demos and episode is not None:
-        sim.replay(tape.of_dataset(demos, episode, sim.frame))
-    recording = hand.Recording(sim, demos, env_name, preset, fields=overrides) if demos else None
-    return _served(sim, makers, chosen, recording, leader, (host, port), run, env_name)
-
-
-def _served(sim, makers, chosen: str, recording, leader, where: tuple[str, int], run: pathlib.Path | None, env_name: str) -> View:
-    """Puts a session's page together and starts both.
-
-    Raises:
-        UserError: as ``open_view``.
-    """
-    from mjx_nero.tools.view import door, hand, hand_panel, orders, panel, scene
-    from mjx_nero.tools.view import leader as leaders
-
-    page, guard = door.open_page(*where)
-    work = orders.Orders()
-    controls = panel.Panel(page.server, sim, makers, chosen, work)
-    steered = hand.Hand(sim, lambda: hands.take_over())
-    read, follow = None, None
-    if leader:
-        read, follow = leaders.attached(leader, sim, controls, steered, lambda name: hands.take_over(name))
-    hands = hand_panel.HandPanel(page.server, controls, steered, recording, work, follow)
-    page.gamepad = hands.gamepad
-    picture = scene.Scene(page.server, sim, sim.env.mj_model, work, steered)
-    view = View(page, guard, work, sim, controls, hands, run, env_name)
-    view.leader = read
-
-    def shown(frame) -> None:
-        picture.show(frame)
-        controls.show(frame)
-
-    view.start(shown)
-    return view
-
-
-def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
-    """Returns the first agent; a policy may be named without that word."""
-    found = next((name for name in (agent or names[0], f"policy {agent}") if name in names), None)
-    if found is None:
-        raise UserError(f"nobody called {agent!r} can act in {env_name}: choose one of {', '.join(names)}")
-    return found
-
-
-def _played(demos: pathlib.Path) -> dict[str, Any]:
-    """The environment and the preset of a data set."""
-    about = open_dataset(demos).schema.about
-    return {"env_name": about["env"], "preset": about["preset"]}
-
-
-def _described(run: pathlib.Path) -> dict[str, Any]:
-    path = files.inside(run, CONFIG)
-    if not path.exists():
-        raise UserError(f"{run} is not the folder of a training: give what train.py wrote to (--out)")
-    found = files.read_json(path)
-    names = {key: found[key] for key in ("env_name", "preset") if key in found} if isinstance(found, dict) else None
-    return values.read(Mapping[str, str], names, f"{path}:")

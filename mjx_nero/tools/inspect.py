@@ -1,4 +1,4 @@
-"""The commands ``inspect`` and ``list-envs``."""
+"""The command ``inspect``; the package ``inspection`` is its library."""
 
 import dataclasses
 import json
@@ -9,22 +9,19 @@ from typing import Any
 from mjx_nero import config, console, files
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.sim.scene import SimCfg
-from mjx_nero.tools import cli, self_test
-from mjx_nero.tools.inspection.report import environments, find, inspect, picture
-from mjx_nero.tools.inspection.tables import environment_table, move_table, tables
-from mjx_nero.tools.motion import moves
+from mjx_nero.tools import cli
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line of ``inspect``."""
-    parser = cli.Parser(prog=cli.called_as("inspect"), description="Shows what a robot or an environment is made of.")
+    parser = cli.Parser("inspect", "Shows what a robot or an environment is made of.")
     parser.add_load()
     parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
     parser.add_argument("--preset", help="preset of the environment (default: the first)")
     parser.add_argument("--robot", help="robot of the environment, or to inspect alone: a name, or an imported one's folder")
-    parser.add_argument("--object", metavar="FILE", help="show a thing of a mesh instead: a file, a folder, or a name")
+    parser.add_argument("--object", metavar="FILE", help="show an object made of meshes instead: a file, a folder, or a name")
     parser.add_argument(
-        "--scale", type=cli.positive_float, default=1.0, help="of the lengths in that file (default: %(default)s)"
+        "--scale", type=cli.positive_float, default=1.0, help="factor of the lengths in that file (default: %(default)s)"
     )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
@@ -42,6 +39,9 @@ def main(argv: Sequence[str]) -> None:
         parser.error("fields of the environment are for its cameras: pass --cameras FILE, too")
     if args.name is None and args.robot is None:
         parser.error("name a robot, an environment or the folder of an imported robot")
+    from mjx_nero.tools import self_test  # with Brax and MJX, which help does without
+    from mjx_nero.tools.inspection import find, inspect, move_table, moves, picture, tables
+
     what = (args.name, args.preset, args.robot) if args.name else (args.robot, args.preset, None)
     robot, cfg = find(*what)
     report, screen = inspect(*what), console.screen()
@@ -103,11 +103,3 @@ def _see(cfg: EnvCfg, path: pathlib.Path) -> None:
     with files.whole(path) as part:
         imageio.imwrite(part, cameras.sheet(seen))
     console.wrote(screen, "cameras", path)
-
-
-def list_envs_main(argv: Sequence[str]) -> None:
-    """The command line of ``list-envs``."""
-    parser = cli.Parser(prog=cli.called_as("list-envs"), description="Lists the environments.")
-    parser.add_load()
-    parser.parse(argv)
-    console.screen().print(environment_table(environments()))

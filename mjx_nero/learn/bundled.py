@@ -1,0 +1,19 @@
+"""The package's own policies."""
+
+import pathlib
+
+from mjx_nero.envs import registry
+from mjx_nero.sim.robot import ASSETS
+
+
+def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
+    """Path of the package's own policy for an environment: the preset's, or else the default's."""
+    own = ASSETS / "policies" / f"{env_name}_{preset}.safetensors"
+    return own if own.is_file() else ASSETS / "policies" / f"{env_name}.safetensors"
+
+
+def names() -> dict[str, pathlib.Path]:
+    """Maps the names of all bundled policies to their files: the environment, or environment and preset with an underscore."""
+    envs = registry.list_envs()
+    paths = [shipped(env, preset) for env in envs for preset in registry.list_presets(env)]
+    return {path.stem: path for path in paths if path.is_file()}

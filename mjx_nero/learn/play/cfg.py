@@ -1,0 +1,53 @@
+"""Settings of an evaluation. Imports neither Brax nor MJX, so that ``--help`` comes at once."""
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from mjx_nero.config import flag
+from mjx_nero.config.bounds import Bounds, OneOf, Seed
+from mjx_nero.errors import UserError
+
+AGENTS = ("policy", "zero", "random")
+EXPERT = "expert"  # the task's first controller
+BACKENDS = ("auto", "mjx", "mujoco")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalCfg:
+    """Settings of an evaluation.
+
+    Attributes:
+        robot: robot in place of the environment's own, by name or folder.
+        agent: policy, zero or random (default: the bundled policy, or the task's controller if there is none).
+        policy: policy file (default: the bundled one of the environment).
+        any_robot: play a policy that was trained for another model of the robot.
+        controller: play one of the task's controllers, or expert for the first of them, instead of an agent.
+        episodes: number of episodes, played side by side.
+        backend: mjx, or mujoco for the C library on the CPU; auto: as impl says.
+        impl: physics, one of ``physics.impls()``.
+        record: number of episodes whose steps are kept, for example for a video.
+        env_fields, control_fields: fields of the environment's and the controller's config by dotted name.
+    """
+
+    env_name: str
+    preset: str = flag("default")
+    robot: str | None = flag(None)
+    agent: Annotated[str, OneOf(*AGENTS)] | None = flag(None)
+    policy: pathlib.Path | None = flag(None)
+    any_robot: bool = flag(False)
+    controller: str | None = flag(None)
+    episodes: Annotated[int, Bounds(1, 1_000_000)] = flag(64)
+    seed: Seed = flag(1)
+    backend: Annotated[str, OneOf(*BACKENDS)] = flag("auto")
+    impl: str = flag("auto")
+    record: int = 0
+    env_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    control_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.controller and (self.agent or self.policy):
+            raise UserError("only one can play: give --controller, --agent or --policy")
+        if self.control_fields and (self.agent or self.policy):
+            raise UserError("--control.* needs --controller")
