@@ -39,8 +39,9 @@ SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the 
 YAW = 0.25  # [rad] greatest turn of the bar at the start, from straight away from the first arm
 WIDER = 2.0  # opening of the hands, in widths of the bar
 CLOSING = 0.4  # [s] least closing time of the script's fingers
-# [m, m/s] tolerances at the goal. At half an arm's length a learner's noise alone, 0.1 of full speed, moves the bar at 5 cm/s.
-THERE, STILL = 0.03, 0.25
+THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
+# Least deviation of a learner's actions: at half an arm's length, one of 0.1 moves the bar faster than what is still.
+CALMEST = 0.05
 AWAY = 0.05  # [m] a hand so far from the bar's axis has left it
 CLASH = 0.09  # [m] grasp points so near to one another: the hands, 7 cm wide each way, would run into one another
 JOINTS = 6  # of an arm that can point its hand down anywhere around it
@@ -324,7 +325,7 @@ def default(robot: RobotCfg, taker: RobotCfg | None = None) -> EnvCfg:
         events=_start(two),
         rewards=_rewards(two),
         curriculum=CurriculumCfg(expert_starts=0.5),
-        training=SHOWN,
+        training={**SHOWN, "min_std": CALMEST},
         budget=Budget(steps=300_000_000, success=0.85),
         terminations={
             **stays_on_table(scene, **one),
