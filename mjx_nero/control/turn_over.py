@@ -20,7 +20,8 @@ from mjx_nero.types import View
 
 ABOVE, DOWN, CLOSE, UP, TURN, SET, OPEN, BACK, REST = range(9)
 _LOST = 0.05  # [m] further than this from the grasp point, the cube has been lost
-_CLEAR = 0.01  # [m] of a cube's edge above the table while it is turned
+_CLEAR = 0.03  # [m] of a cube's edge above the table while it is turned: a quick hand is lower than its set-point
+_RISES = 0.15  # [m/rad] on its way to the next grasp the hand is so high over the end of its way, for what is left to go
 _UNDER = 0.01  # [m] the cube is at most so far below the height to which it is lifted, when the hand begins to turn
 _LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] a phase has so much time
 
@@ -110,8 +111,8 @@ class TurnOver:
         closed = (phase >= CLOSE) & (phase <= SET)
         fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest, phase == TURN)
-        q = jnp.where(phase == TURN, self._above(q), q)
-        qd = jnp.where(phase == TURN, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
+        q = jnp.where(leaps, self._above(memory, q, wanted_q, wanted), q)
+        qd = jnp.where(leaps, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
         ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
@@ -134,10 +135,18 @@ class TurnOver:
         )
         return memory, jnp.concatenate([q + self._lead * qd, fingers])
 
-    def _above(self, q: Float[Array, " nj"]) -> Float[Array, " nj"]:
-        """Lifts the hand where a cube in it would strike the table with an edge: straight ways of joints may dip."""
+    def _above(
+        self, memory: TurnOverMemory, q: Float[Array, " nj"], end: Float[Array, " nj"], wanted: Float[Array, "3"]
+    ) -> Float[Array, " nj"]:
+        """Lifts the hand where a cube in it would strike the table with an edge, or where it would strike the cube itself.
+
+        Straight ways of joints may dip.
+        """
         pos, quat = (x[0] for x in self._ik.chain.poses(q))
-        lacks = jnp.maximum(0.0, np.sqrt(2) * self.cfg.rest + _CLEAR - self._turns.held(pos, quat)[2])
+        turns = np.sqrt(2) * self.cfg.rest + _CLEAR - self._turns.held(pos, quat)[2]
+        rises = jnp.minimum(memory.count * self.cfg.speed * self.dt, _RISES * jnp.linalg.norm(end - q))
+        comes = wanted[2] + jnp.minimum(rises, self.cfg.lift) - pos[2]
+        lacks = jnp.maximum(0.0, jnp.where(memory.phase == TURN, turns, comes))
         return self._ik.local(pos + lacks * jnp.array([0.0, 0.0, 1.0]), quat, q).q
 
     def _wanted(self, memory: TurnOverMemory, cube: Float[Array, "3"]) -> Float[Array, "3"]:
