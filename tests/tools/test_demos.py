@@ -12,6 +12,7 @@ from mjx_nero.data import episode as names
 from mjx_nero.data import open_dataset, units
 from mjx_nero.envs import registry
 from mjx_nero.tools import cli, demos
+from mjx_nero.tools.demos import making
 
 SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays", "--env.episode_length_s", 0.2]
 
@@ -160,11 +161,13 @@ def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
 
 @pytest.mark.slow
 def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(call, tmp_path):
-    """The bundled policy acts, told where the cube is; both cameras see it as the preset has it looks."""
-    argv = [*SHORT, "--preset", "rgb", "--episodes", 3, "--cameras", "front,wrist", "--out", "d"]
+    """The bundled policy acts, told where the cube is; both cameras see it as the preset has it looks. Of a step there is what
+    LeRobot's policies learn from, and no more."""
+    argv = [*SHORT, "--preset", "rgb", "--episodes", 3, "--cameras", "front,wrist", "--holds", "lerobot", "--out", "d"]
     code, _, err = call("mjx_nero", "demos", *argv)
     assert code == 0, err
     found = open_dataset(tmp_path / "d")
+    assert set(found.schema.features) == {*making.HOLDS["lerobot"], *(names.PICTURES + name for name in ("front", "wrist"))}
     told = found.schema.features[names.ENVIRONMENT].names  # who sees is told the goal alone, and learns no more from LeRobot
     assert told == tuple(f"goal.{axis}" for axis in ("x", "y", "z", "qw", "qx", "qy", "qz"))
     assert found.column(names.ENVIRONMENT)[:, :3].std(axis=0).max() > 0.01

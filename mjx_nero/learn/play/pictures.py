@@ -6,7 +6,6 @@ MuJoCo's own renderer draws one after another. On a GPU the ray tracer draws hun
 import concurrent.futures
 import copy
 import dataclasses
-import threading
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
+from mjx_nero.learn.play.batches import Batches
 from mjx_nero.sim.cameras.cfg import MARK
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
@@ -22,6 +22,7 @@ from mjx_nero.types import Scenery
 SIZE = 128, 128  # [pixels] of a camera for people
 SHADOWS = 0  # no shadow map, which takes three quarters of the time on a CPU
 TOGETHER = 256  # steps of an episode that are drawn in one go, at most
+EPISODES, PIXELS = 8, 1 << 26  # so many of which a GPU draws in one go, at most
 _UNSEEN = 5  # a group of geoms that is not drawn
 
 
@@ -102,19 +103,17 @@ class _Drawn:
 
 
 class _Traced:
-    """MuJoCo Warp's ray tracer; each step is a world of one batch."""
+    """MuJoCo Warp's ray tracer; each step is a world of one batch, and episodes that wait are drawn together."""
 
     def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
         camera = dataclasses.replace(env.cfg.scene.cameras[name], size=size, kinds=("rgb",))
-        seen, self._lock = env.draw_by({name: camera}, "warp"), threading.Lock()
-        self._draw = jax.jit(jax.vmap(lambda qpos, scenery: seen(qpos, scenery)[name].rgb))
+        seen = env.draw_by({name: camera}, "warp")
+        draw = jax.jit(jax.vmap(lambda shown: seen(*shown)[name].rgb))
+        episodes = max(1, min(EPISODES, PIXELS // (TOGETHER * size[0] * size[1])))
+        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}))
 
     def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
-        n = len(qpos)
-        filled = np.minimum(np.arange(TOGETHER if n > 1 else 1), n - 1)  # two sizes, two programs
-        with self._lock:  # the ray tracer's buffers are for one batch
-            drawn = jax.block_until_ready(self._draw(qpos[filled], scenery[filled]))
-        return np.asarray(drawn)[:n]
+        return self._draw((qpos, scenery))
 
     def close(self) -> None:
         """Does nothing: the buffers are the ray tracer's."""

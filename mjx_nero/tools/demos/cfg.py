@@ -30,7 +30,8 @@ class DemosCfg:
         noise: standard deviation of what is added to the arm's actions, smooth in time, in the unit of the action (rad for
             experts); the clean action stands beside what was done.
         actions: joints (targets of all drives), or hand (steps of the hand, and targets of the gripper).
-        holds: all of a step, or arm: only what a real arm knows, too, so that both go together.
+        holds: all of a step; arm: only what a real arm knows, too, so that both go together; or lerobot: only what LeRobot's
+            policies learn from, which they then read faster.
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
         cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
         picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
@@ -53,7 +54,7 @@ class DemosCfg:
     ends: Annotated[str, OneOf("task", "success")] = flag("task")
     noise: NonNegative = flag(0.0)
     actions: Annotated[str, OneOf(*ACTIONS)] = flag("joints")
-    holds: Annotated[str, OneOf("all", "arm")] = flag("all")
+    holds: Annotated[str, OneOf("all", "arm", "lerobot")] = flag("all")
     units: Annotated[str, OneOf("auto", "si", "lerobot")] = flag("auto")
     cameras: str = flag("")
     picture: str = flag("")

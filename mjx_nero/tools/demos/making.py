@@ -31,6 +31,7 @@ from mjx_nero.tools.demos.cfg import DemosCfg
 
 HOPELESS = 1000  # episodes in a row without a success
 ARM = (names.STATE, names.ACTION, names.EXECUTED, names.DONE)  # what a real arm knows
+HOLDS = {"arm": ARM, "lerobot": (names.STATE, names.ENVIRONMENT, names.ACTION)}  # what LeRobot's policies learn from
 SENTENCES = {  # by the end of an environment's name, longer ones first
     "reach_obstacles": "Bring the hand to the goal without touching an obstacle.",
     "lift_obstacles": "Pick up the cube and carry it past the obstacles to the goal.",
@@ -96,7 +97,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "version": mjx_nero.__version__,
     }
     usual = features(env, shown, cfg.actions, seen=bool(cameras))
-    held = {name: each for name, each in usual.items() if cfg.holds == "all" or name in ARM}
+    held = {name: each for name, each in usual.items() if name in HOLDS.get(cfg.holds, usual)}
     if cameras:
         held |= {names.PICTURES + name: names.picture(*size[::-1]) for name, size in cameras.sizes.items()}
     schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), held, about)
