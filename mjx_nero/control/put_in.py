@@ -229,7 +229,7 @@ class PutIn:
         if not self.cfg.turns:
             return jnp.zeros(())
         most = jnp.pi / self.cfg.turns
-        lacks = math.yaw(view.goal_quat_w) - math.yaw(quat)
+        lacks = math.yaw(math.quat_mul(view.goal_quat_w, math.quat_conj(quat)))
         return jnp.mod(lacks + most, 2 * most) - most
 
     def _fingers(self, pick: PickUpMemory, view: View, opens: Bool[Array, ""]) -> Float[Array, " ng"]:

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-import mujoco
 import numpy as np
 
 from mjx_nero.config import bounds
@@ -13,11 +12,12 @@ from mjx_nero.envs.tasks.building import AWAY
 from mjx_nero.envs.tasks.lift_any import LIFTED, NEAR, expert
 from mjx_nero.mdp import towers
 from mjx_nero.mdp.terms import Term
-from mjx_nero.sim.objects import shapes
+from mjx_nero.sim.objects import rests, shapes
 from mjx_nero.sim.scene import ObjectCfg
 
 LONGER = 3.0  # [s] that the script takes longer than with a box: it lowers what it holds slowly
 OVER, DONE = 0.03, 0.004  # [m] heights over its place: from where a thing comes straight down, and where the hand opens
+STEP = 0.005  # [s] physics steps: with ones of 10 ms, flat things that lie on many corners tremble too fast to be at rest
 MEETS = 0.01  # [m] below half of it the hand yields to what the thing stands on
 T = TypeVar("T", bound=Term)
 
@@ -30,22 +30,26 @@ def places(condition: Term) -> bool:
     return tower[0] == towers.GOAL and len(tower) == 2
 
 
-def unturned(quat: np.ndarray) -> tuple[float, float, float, float]:
-    """The orientation without its turn about the vertical, which comes last (wxyz)."""
-    w, x, y, z = quat
-    half = -np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
-    out = np.zeros(4)
-    mujoco.mju_mulQuat(out, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), np.asarray(quat, float))
-    w, x, y, z = (round(float(v), 6) for v in out / np.linalg.norm(out))
-    return w, x, y, z
+def tilt(up: np.ndarray) -> tuple[float, float]:
+    """Roll and pitch of a thing that is not turned about the vertical, by where up is in its own frame [rad]."""
+    x, y, z = up
+    level = np.hypot(y, z)
+    roll = np.arctan2(y, z) if level > 1e-3 else 0.0  # on its nose any roll is a turn about the vertical
+    return round(float(roll), 6), round(float(np.arctan2(-x, level)), 6)
+
+
+def tilted(roll: float, pitch: float) -> tuple[float, float, float, float]:
+    """The orientation of such a thing (wxyz)."""
+    w, x = np.cos(roll / 2), np.sin(roll / 2)
+    c, s = np.cos(pitch / 2), np.sin(pitch / 2)
+    return float(c * w), float(c * x), float(s * w), float(-s * x)
 
 
 def applied(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
     """Returns the task with the thing at the goal as it lies at the start, but for its heading."""
-    (solid,), (w, x, y, z) = item.solids, item.quat
-    roll, pitch = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    (solid,), (roll, pitch) = item.solids, tilt(rests.up(np.array(item.quat)))
     height = round(item.rest_height - cfg.robot.base_pos[2], 4)
-    still = {"z": (height,) * 2, "roll": (round(float(roll), 6),) * 2, "pitch": (round(float(pitch), 6),) * 2}
+    still = {"z": (height,) * 2, "roll": (roll, roll), "pitch": (pitch, pitch)}
     was = cfg.success.condition.params["place"]
     reach = float(np.linalg.norm(shapes.box(solid)[1]) / 2)
     place = dataclasses.replace(
@@ -60,6 +64,7 @@ def applied(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
     )
     return dataclasses.replace(
         cfg,
+        sim=cfg.sim.finer(STEP),
         episode_length_s=cfg.episode_length_s + LONGER,
         command=dataclasses.replace(cfg.command, params={**cfg.command.params, **still}),
         rewards=_all_there(cfg.rewards, place),

@@ -76,7 +76,7 @@ def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
         return item.quat
     if what == PUSHES:
         raise UserError(f"{item.file} does not stand as its file has it, and what is pushed has to: turn it in the file")
-    return placing.unturned(solid.rest_quat[int(np.argmax(solid.rest_share))])
+    return placing.tilted(*placing.tilt(rests.up(solid.rest_quat[int(np.argmax(solid.rest_share))])))
 
 
 def _lifted(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:

@@ -1,5 +1,8 @@
 """The choice of the next turn of a cube: by what its rotation does to the side that has to be up. The task tests the motion."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 
 from mjx_nero import math
 from mjx_nero.control.ik import InverseKinematics
+from mjx_nero.control.turn_over import ABOVE, TurnOver
 from mjx_nero.control.turns import Table, Turns
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.mdp import sides
@@ -72,3 +76,17 @@ def test_where_the_arm_cannot_lean_it_first_makes_the_side_look_elsewhere(then):
     looks, _ = then(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0]), table(fails, go))
     assert abs(looks[2]) < 1e-5
     assert any(np.allclose(looks[:2], way, atol=1e-5) for way in ((-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)))  # to the robot, or aside
+
+
+def _on_its_way(count) -> Any:
+    return SimpleNamespace(phase=jnp.array(ABOVE), count=count)
+
+
+def test_a_hand_on_its_way_to_the_cube_passes_over_it():
+    """It rises at first, is as high as a lifted cube, and comes down at the end."""
+    script, home = TurnOver(NERO, 0.02), jnp.asarray(NERO.arm.home)
+    place = jax.jit(lambda q: script._ik.chain.poses(q)[0][0])
+    above = jax.jit(lambda count, end: script._above(_on_its_way(count), home, end, place(home)))
+    for count, left, rises in ((0, 1.0, 0.0), (4, 1.0, 0.02), (50, 1.0, 0.06), (50, 0.2, 0.03), (50, 0.0, 0.0)):
+        q = above(jnp.array(count), home.at[0].add(left))
+        assert float(place(q)[2] - place(home)[2]) == pytest.approx(rises, abs=2e-3)

@@ -235,7 +235,7 @@ def test_object_in_the_place_of_the_cube():
             env_cfg(env_name, **{"object.file": thing})
 
 
-@pytest.mark.parametrize(("file", "stands"), [("mug", True), ("bottle", True), ("screwdriver", False)])
+@pytest.mark.parametrize(("file", "stands"), [("mug", True), ("bottle", True), ("screwdriver", False), ("dumbbell", False)])
 def test_object_in_the_place_of_the_box(file, stands):
     """It starts and ends as its file has it, or as it mostly rests; start and goal differ by place and heading alone."""
     cfg = env_cfg("nero_place", **{"object.file": file})
