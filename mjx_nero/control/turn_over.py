@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero.config.bounds import Positive
+from mjx_nero.config.bounds import NonNegative, Positive
 from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
@@ -20,8 +20,6 @@ from mjx_nero.types import View
 
 ABOVE, DOWN, CLOSE, UP, TURN, SET, OPEN, BACK, REST = range(9)
 _LOST = 0.05  # [m] further than this from the grasp point, the cube has been lost
-_CLEAR = 0.03  # [m] of a cube's edge above the table while it is turned: a quick hand is lower than its set-point
-_RISES = 0.15  # [m/rad] on its way to the next grasp the hand is so high over the end of its way, for what is left to go
 _UNDER = 0.01  # [m] the cube is at most so far below the height to which it is lifted, when the hand begins to turn
 _LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] a phase has so much time
 
@@ -40,6 +38,9 @@ class TurnOverCfg:
         lift: height to which the cube is lifted to be turned.
         speed: of the grasp point [m/s].
         closing: how long the fingers take [s], beside the lag of their drives.
+        clear: of a cube's edge above the table while it is turned. A quick hand is lower than its set-point.
+        rises: on its way to a grasp the hand is at least so high over the end of it, for what is left to go [m/rad], so that it
+            passes over the cube; 0: it goes as straight as its joints do.
         ik: of the arm's motion.
     """
 
@@ -52,6 +53,8 @@ class TurnOverCfg:
     lift: Positive = 0.06
     speed: Positive = 0.25
     closing: Positive = 0.4
+    clear: Positive = 0.01
+    rises: NonNegative = 0.0
     ik: IkCfg = IkCfg(orientation_weight=0.1, iterations=40, restarts=3)
 
 
@@ -111,8 +114,9 @@ class TurnOver:
         closed = (phase >= CLOSE) & (phase <= SET)
         fastest = jnp.where(closed, self._gentle, setpoint.FASTEST)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest, phase == TURN)
-        q = jnp.where(leaps, self._above(memory, q, wanted_q, wanted), q)
-        qd = jnp.where(leaps, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
+        lifts = leaps if self.cfg.rises else phase == TURN
+        q = jnp.where(lifts, self._above(memory, q, wanted_q, wanted), q)
+        qd = jnp.where(lifts, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
         ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
 
@@ -143,8 +147,8 @@ class TurnOver:
         Straight ways of joints may dip.
         """
         pos, quat = (x[0] for x in self._ik.chain.poses(q))
-        turns = np.sqrt(2) * self.cfg.rest + _CLEAR - self._turns.held(pos, quat)[2]
-        rises = jnp.minimum(memory.count * self.cfg.speed * self.dt, _RISES * jnp.linalg.norm(end - q))
+        turns = np.sqrt(2) * self.cfg.rest + self.cfg.clear - self._turns.held(pos, quat)[2]
+        rises = jnp.minimum(memory.count * self.cfg.speed * self.dt, self.cfg.rises * jnp.linalg.norm(end - q))
         comes = wanted[2] + jnp.minimum(rises, self.cfg.lift) - pos[2]
         lacks = jnp.maximum(0.0, jnp.where(memory.phase == TURN, turns, comes))
         return self._ik.local(pos + lacks * jnp.array([0.0, 0.0, 1.0]), quat, q).q

@@ -10,7 +10,7 @@ import pytest
 
 from mjx_nero import math
 from mjx_nero.control.ik import InverseKinematics
-from mjx_nero.control.turn_over import ABOVE, TurnOver
+from mjx_nero.control.turn_over import ABOVE, TurnOver, TurnOverCfg
 from mjx_nero.control.turns import Table, Turns
 from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.mdp import sides
@@ -84,7 +84,7 @@ def _on_its_way(count) -> Any:
 
 def test_a_hand_on_its_way_to_the_cube_passes_over_it():
     """It rises at first, is as high as a lifted cube, and comes down at the end."""
-    script, home = TurnOver(NERO, 0.02), jnp.asarray(NERO.arm.home)
+    script, home = TurnOver(NERO, 0.02, TurnOverCfg(rises=0.15)), jnp.asarray(NERO.arm.home)
     place = jax.jit(lambda q: script._ik.chain.poses(q)[0][0])
     above = jax.jit(lambda count, end: script._above(_on_its_way(count), home, end, place(home)))
     for count, left, rises in ((0, 1.0, 0.0), (4, 1.0, 0.02), (50, 1.0, 0.06), (50, 0.2, 0.03), (50, 0.0, 0.0)):

@@ -35,6 +35,8 @@ AWAY = 0.02  # [m] clearance of the pads beside a box that the hand has left
 YAW = (-0.3, 0.3)  # [rad] heading of the box at the start
 CLOSING = 0.4  # [s] least closing time of the script's fingers
 JOINTS = 6  # of an arm whose hand may lean in any direction
+# The script's way with six joints. With seven, inverse kinematics that lifts a hand turns the other joints about as well.
+ROUND = {"clear": 0.03, "rises": 0.15}
 WIDER = 2.0  # opening of the hand, in edges of the box
 
 
@@ -80,6 +82,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "lift": round(1.2 * edge, 4),
         "before": round(lying.clearance + LIFTED, 4),
         "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+        **(ROUND if len(robot.arm.joints) == JOINTS else {}),
         **regions.ik(robot, "ik."),
     }
     return EnvCfg(
