@@ -66,7 +66,7 @@ def _part(cfg: EnvCfg) -> tuple[str, str]:
 
 
 def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
-    """How a thing stands: as its file has it, or, if it is not pushed, as it rests most often; about the vertical as its file.
+    """Returns the orientation of a thing: as its file has it if it stands so, or else as it rests most often, but not turned.
 
     Raises:
         UserError: it does not stand, and is pushed.
