@@ -49,7 +49,7 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
         encoder.flags |= av.codec.context.Flags.global_header.value  # parameters stand once, in the file's head
         packets = []
         for i, frame in enumerate(frames()):
-            drawn = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            drawn = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(frame), format="rgb24")  # without a copy
             drawn.pts, drawn.time_base = i, step
             packets += encoder.encode(drawn)
         return packets + encoder.encode()

@@ -1,6 +1,8 @@
-"""Both drawers of episodes' pictures, at steps that do not fill a batch."""
+"""Both drawers of episodes' pictures, at steps that do not fill a batch, and several of one kind."""
 
 import dataclasses
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -27,3 +29,31 @@ def test_the_ray_tracer_draws_what_mujoco_draws(monkeypatch):
         off = np.abs(frames - drawn["mujoco"][name]).mean(axis=(1, 2, 3))
         assert frames.shape == (9, 48, 48, 3) and frames.std() > 30
         assert off.max() < 10 and off.max() < 0.2 * np.abs(frames - np.roll(drawn["mujoco"][name], 1, axis=0)).mean()
+
+
+def test_each_caller_at_a_time_has_a_drawer_of_its_own(monkeypatch):
+    """Three callers meet in three drawers, though only the first was there before. A fourth drawer is one too many."""
+    monkeypatch.setattr(pictures, "MOST", 3)
+    monkeypatch.setattr(pictures.os, "cpu_count", lambda: 8)
+    meet, made, closed = threading.Barrier(3), [], []
+
+    class Drawer:
+        def __init__(self):
+            made.append(self)
+            self.busy = threading.Lock()
+
+        def __call__(self, qpos, scenery):
+            assert self.busy.acquire(blocking=False)
+            meet.wait(30)
+            self.busy.release()
+            return [qpos]
+
+        def close(self):
+            closed.append(self)
+
+    several = pictures._Several(Drawer)
+    assert len(made) == 1
+    with ThreadPoolExecutor(6) as pool:
+        assert list(pool.map(lambda i: several(i, None), range(6))) == [[i] for i in range(6)]
+    several.close()
+    assert len(made) == 3 and closed == made

@@ -19,11 +19,11 @@ SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays",
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Six episodes of ten steps, with noise, in pieces of four."""
+    """Six episodes of ten steps, with noise and velocities, in pieces of four."""
     where = tmp_path_factory.mktemp("demos") / "d"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "setup_jax", lambda: None)
-        demos.main([*map(str, SHORT), "--episodes", "6", "--side-by-side", "4", "--noise", "0.5", "--out", str(where)])
+        demos.main([*map(str, SHORT), "--episodes", "6", "--side-by-side", "4", "--noise", "0.5", "--velocities", "--out", str(where)])
     return where
 
 
@@ -31,16 +31,20 @@ def test_what_a_step_holds(made):
     found = open_dataset(made)
     assert found.lengths.tolist() == [10] * 6 and found.numbers.tolist() == list(range(6)) and not found.success.any()
     joints = [f"joint{i}.pos" for i in range(1, 8)] + ["gripper_joint1.pos", "gripper_joint2.pos"]
-    for name in (names.STATE, names.ACTION, names.EXECUTED):
+    for name in (names.ACTION, names.EXECUTED):
         assert list(found.schema.features[name].names) == joints
-    assert found.schema.features[names.STATE].units == ("rad",) * 7 + ("m",) * 2
+    state = found.schema.features[names.STATE]
+    assert list(state.names) == joints + [joint.replace(".pos", ".vel") for joint in joints]
+    assert state.units == ("rad",) * 7 + ("m",) * 2 + ("rad/s",) * 7 + ("m/s",) * 2
     assert found.schema.fps == pytest.approx(50) and found.schema.task == "Pick up the cube and hold it at the goal."
     assert found.schema.about["noise"] == 0.5 and found.schema.about["env_fields"] == {"episode_length_s": "0.2"}
-    np.testing.assert_array_equal(found.column(names.STATE), found.column(names.QPOS)[:, :9])
+    pos, vel = np.split(found.column(names.STATE), 2, axis=1)
+    np.testing.assert_array_equal(pos, found.column(names.QPOS)[:, :9])
     seen = found.schema.features[names.SEEN]
     assert seen.names[0] == "joint_pos.0" and seen.size == found.column(names.SEEN).shape[1]
     home = np.array(registry.robot("nero").home, np.float32)
-    np.testing.assert_allclose(found.column(names.SEEN)[:, :9], found.column(names.STATE) - home, atol=1e-6)  # no noise on it
+    np.testing.assert_allclose(found.column(names.SEEN)[:, :9], pos - home, atol=1e-6)  # no noise on it
+    np.testing.assert_allclose(found.column(names.SEEN)[:, 9:18], vel, atol=1e-6)
     place = [found.schema.features[names.ENVIRONMENT].names.index(f"cube.{axis}") for axis in "xyz"]
     np.testing.assert_array_equal(found.column(names.ENVIRONMENT)[:, place], found.column(names.QPOS)[:, 9:12])
     ends = found.column(names.DONE).reshape(6, 10)

@@ -47,6 +47,7 @@ class Player:
         noise: standard deviation of the noise on the arm's actions, in the agent's units.
         cameras: cameras whose pictures episodes keep.
         early: an episode ends as soon as success has held for as long as the task asks, and the next one begins in its place.
+        velocities: the state has the joints' velocities, too.
 
     Raises:
         UserError: so many episodes of such a length do not fit into memory.
@@ -63,8 +64,9 @@ class Player:
         noise: float = 0.0,
         cameras: Cameras | None = None,
         early: bool = False,
+        velocities: bool = False,
     ):
-        self._cameras, self._early = cameras, early
+        self._cameras, self._early, self._velocities = cameras, early, velocities
         self.env, self.agent, self.units, self.size, self.kept, self.noise = env, agent, units, size, kept, noise
         self._arm = len(env.cfg.robot.arm.joints)
         robot = env.cfg.robot
@@ -173,7 +175,7 @@ class Player:
         label, told = (self._deltas(view, x) if self._hand else self.units.shown(x) for x in (label, told))
         flags = after.done > 0, after.metrics["success"] > 0
         found = {
-            names.STATE: self.units.shown(view.joint_pos),
+            names.STATE: joint_state(view, self.units, self._velocities),
             names.ENVIRONMENT: environment_state(env, view, seen=bool(self._cameras)),
             names.ACTION: label,
             names.EXECUTED: told,
@@ -199,6 +201,12 @@ def _cut(kept: tuple, slot: int, steps: int) -> tuple:
     """The steps of a slot out of what is kept of a segment, leaves [n, steps, ...]."""
     features, *drawn = kept
     return {name: x[slot, :steps] for name, x in features.items()}, *jax.tree.map(lambda x: x[slot, :steps], drawn)
+
+
+def joint_state(view: View, units: Units, velocities: bool) -> Float[Array, " n"]:
+    """Positions of the joints in a data set's units, and, if asked for, their velocities in units a second."""
+    shown = units.shown(view.joint_pos)
+    return jnp.concatenate([shown, view.joint_vel * units.factor]) if velocities else shown
 
 
 def told(env: ManipulationEnv, seen: bool) -> tuple[str, ...]:

@@ -1,12 +1,17 @@
 """Pictures of played episodes, drawn afterwards from the physics' positions.
 
-MuJoCo's own renderer draws one after another. On a GPU the ray tracer draws hundreds at a time, by the scene's own cameras.
+MuJoCo's own renderer draws one after another, on several cores. On a GPU the ray tracer draws thousands at a time, by the
+scene's own cameras.
 """
 
 import concurrent.futures
 import copy
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import functools
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol
 
 import jax
@@ -22,6 +27,7 @@ from mjx_nero.types import Scenery
 SIZE = 128, 128  # [pixels] of a camera for people
 SHADOWS = 0  # no shadow map, which takes three quarters of the time on a CPU
 TOGETHER = 256  # steps of an episode that are drawn in one go, at most
+MOST = 8  # contexts of OpenGL
 EPISODES, PIXELS = 8, 1 << 26  # so many of which a GPU draws in one go, at most
 _UNSEEN = 5  # a group of geoms that is not drawn
 
@@ -53,8 +59,9 @@ class Cameras:
         self.renderer = renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
         self._drawers: dict[str, _Drawer] = {}
         for name in names:
-            kind: type[_Drawn] | type[_Traced] = _Traced if self.renderer == "warp" and name in own else _Drawn
-            self._drawers[name] = kind(env, name, self.sizes[name])
+            traced = self.renderer == "warp" and name in own
+            made = functools.partial(_Traced if traced else _Drawn, env, name, self.sizes[name])
+            self._drawers[name] = made() if traced else _Several(made)
 
     def close(self) -> None:
         """Frees the renderers."""
@@ -100,6 +107,33 @@ class _Drawn:
     def close(self) -> None:
         self._thread.submit(self._renderer.__exit__).result()
         self._thread.shutdown()
+
+
+class _Several:
+    """As many drawers as there are callers at a time, but no more than cores; each is made when all others are busy."""
+
+    def __init__(self, make: Callable[[], _Drawer]):
+        self._make, self._made, self._lock = make, [make()], threading.Lock()
+        self._free: queue.SimpleQueue[_Drawer] = queue.SimpleQueue()
+        self._free.put(self._made[0])
+
+    def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
+        drawer = self._take()
+        try:
+            return drawer(qpos, scenery)
+        finally:
+            self._free.put(drawer)
+
+    def _take(self) -> _Drawer:
+        with self._lock:
+            if self._free.empty() and len(self._made) < min(MOST, os.cpu_count() or 1):
+                self._made.append(self._make())
+                return self._made[-1]
+        return self._free.get()
+
+    def close(self) -> None:
+        for drawer in self._made:
+            drawer.close()
 
 
 class _Traced:

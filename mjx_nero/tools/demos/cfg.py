@@ -32,6 +32,7 @@ class DemosCfg:
         actions: joints (targets of all drives), or hand (steps of the hand, and targets of the gripper).
         holds: all of a step; arm: only what a real arm knows, too, so that both go together; or lerobot: only what LeRobot's
             policies learn from, which they then read faster.
+        velocities: the state has the joints' velocities beside their positions (as ``<joint>.vel``).
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
         cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
         picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
@@ -55,6 +56,7 @@ class DemosCfg:
     noise: NonNegative = flag(0.0)
     actions: Annotated[str, OneOf(*ACTIONS)] = flag("joints")
     holds: Annotated[str, OneOf("all", "arm", "lerobot")] = flag("all")
+    velocities: bool = flag(False)
     units: Annotated[str, OneOf("auto", "si", "lerobot")] = flag("auto")
     cameras: str = flag("")
     picture: str = flag("")

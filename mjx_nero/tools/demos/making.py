@@ -96,13 +96,14 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         "impl": env.impl,
         "version": mjx_nero.__version__,
     }
-    usual = features(env, shown, cfg.actions, seen=bool(cameras))
+    usual = features(env, shown, cfg.actions, bool(cameras), cfg.velocities)
     held = {name: each for name, each in usual.items() if name in HOLDS.get(cfg.holds, usual)}
     if cameras:
         held |= {names.PICTURES + name: names.picture(*size[::-1]) for name, size in cameras.sizes.items()}
     schema = Schema(1 / env.dt, robot_type(env.cfg.robot.name, shown), cfg.task or sentence(cfg.env_name), held, about)
     early = cfg.ends == "success"
-    return schema, Player(env, agent, shown, size, tuple(held), cfg.actions == "hand", cfg.noise, cameras, early)
+    deltas = cfg.actions == "hand"
+    return schema, Player(env, agent, shown, size, tuple(held), deltas, cfg.noise, cameras, early, cfg.velocities)
 
 
 def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
@@ -147,10 +148,14 @@ def units_of(env: ManipulationEnv, kind: str) -> units.Units:
     return units.lerobot(robot.name, slides, low, high, opens)
 
 
-def features(env: ManipulationEnv, shown: units.Units, actions: str, seen: bool = False) -> dict[str, Feature]:
-    """Lists the features of a step, without pictures; ``seen``: it has some."""
+def features(
+    env: ManipulationEnv, shown: units.Units, actions: str, seen: bool = False, velocities: bool = False
+) -> dict[str, Feature]:
+    """Lists the features of a step, without pictures; ``seen``: it has some; ``velocities``: the state has the joints'."""
     joints = env.cfg.robot.joints
     targets = Feature(tuple(f"{joint}.pos" for joint in joints), shown.names)
+    speeds = Feature(tuple(f"{joint}.vel" for joint in joints), tuple(f"{unit}/s" for unit in shown.names))
+    moving = Feature(targets.names + speeds.names, targets.units + speeds.units)
     arm = len(env.cfg.robot.arm.joints)
     hand = tuple(f"hand.{what}" for what in ("x", "y", "z", "turn_x", "turn_y", "turn_z"))
     steps = Feature(hand + targets.names[arm:], ("m",) * 3 + ("rad",) * 3 + shown.names[arm:])
@@ -158,7 +163,7 @@ def features(env: ManipulationEnv, shown: units.Units, actions: str, seen: bool 
     pose = [f"{thing}.{axis}" for thing in things for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")]
     qpos = env.physics_model.nq
     return {
-        names.STATE: targets,
+        names.STATE: moving if velocities else targets,
         names.ENVIRONMENT: Feature(tuple(pose), (("m",) * 3 + ("",) * 4) * len(things)),
         names.ACTION: steps if actions == "hand" else targets,
         names.EXECUTED: targets,

@@ -23,6 +23,7 @@ class MjxNeroEnv(EnvConfig):
         robot: another than the environment's own, by name or folder.
         units: of joints, as in the data set: auto, si or lerobot.
         through: who made the data set acted through: task (a policy) or drives (an expert), as ``demos --inspect`` says.
+        velocities: the state has the joints' velocities, too, as ``demos --velocities``.
         cameras: whose pictures the policy sees, with commas between them, as ``demos --cameras``.
         renderer: of the pictures, as ``demos --renderer``.
         width, height: of a picture [pixels].
@@ -34,6 +35,7 @@ class MjxNeroEnv(EnvConfig):
     robot: str | None = None
     units: str = "auto"
     through: str = "task"
+    velocities: bool = False
     cameras: str = ""
     renderer: str = "auto"
     width: int = 64
@@ -50,7 +52,7 @@ class MjxNeroEnv(EnvConfig):
         self.fps = round(1 / (cfg.sim.dt * cfg.sim.decimation))
         self.features = {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(joints,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(joints,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(joints * (1 + self.velocities),)),
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(7 * poses,)),
         }
         for name in filter(None, self.cameras.split(",")):
@@ -77,6 +79,7 @@ class MjxNeroEnv(EnvConfig):
             "robot": self.robot,
             "units": self.units,
             "through": self.through,
+            "velocities": self.velocities,
             "cameras": self.cameras,
             "renderer": self.renderer,
             "size": size,

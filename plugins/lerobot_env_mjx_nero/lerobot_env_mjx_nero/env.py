@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn.play.demonstrations import environment_state, told
+from mjx_nero.learn.play.demonstrations import environment_state, joint_state, told
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.sim.render import Renderer
 from mjx_nero.tools import cli
@@ -24,6 +24,7 @@ class Programs:
     Args:
         task, preset, robot: of ``registry.env_cfg``.
         units: of ``making.units_of``.
+        velocities: the state has the joints', too.
         through: of the data set, as ``demos --inspect`` says it: task (a policy's) or drives (an expert's).
         cameras: names with commas between them.
         renderer: of ``demos --renderer``.
@@ -40,6 +41,7 @@ class Programs:
         cameras: str,
         renderer: str,
         size: tuple[int, int],
+        velocities: bool,
     ):
         cli.setup_jax()  # compiled once for all processes that LeRobot starts
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
@@ -51,7 +53,7 @@ class Programs:
 
         def seen(state):
             view = env.view(state)
-            return self.units.shown(view.joint_pos), environment_state(env, view, seen=bool(names))
+            return joint_state(view, self.units, velocities), environment_state(env, view, seen=bool(names))
 
         def reset(seed):
             state = env.reset(jax.random.PRNGKey(seed))
@@ -104,9 +106,10 @@ class Env(gymnasium.Env):
         cameras: str = "",
         renderer: str = "auto",
         size: tuple[int, int] = (64, 64),
+        velocities: bool = False,
         render_mode: str = "rgb_array",
     ):
-        self._programs = made(task, preset, robot, units, through, cameras, renderer, tuple(size))
+        self._programs = made(task, preset, robot, units, through, cameras, renderer, tuple(size), velocities)
         env = self._programs.env
         self.render_mode, self.task, self.task_description = render_mode, task, making.sentence(task)
         self.metadata = {**self.metadata, "render_fps": round(1 / env.dt)}
@@ -114,7 +117,7 @@ class Env(gymnasium.Env):
         low, high = self._programs.units.shown(np.stack(env.actions.bounds()))
         self.action_space = gymnasium.spaces.Box(np.minimum(low, high), np.maximum(low, high), dtype=np.float32)
         poses = told(env, seen=bool(self._programs.cameras))
-        boxes = {"agent_pos": len(env.cfg.robot.joints), "environment_state": 7 * len(poses)}
+        boxes = {"agent_pos": len(env.cfg.robot.joints) * (1 + velocities), "environment_state": 7 * len(poses)}
         spaces: dict[str, Any] = {name: gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32) for name, n in boxes.items()}
         if drawn := self._programs.cameras:
             pictures = {n: gymnasium.spaces.Box(0, 255, (h, w, 3), np.uint8) for n, (w, h) in drawn.sizes.items()}
