@@ -1,4 +1,4 @@
-"""What the command ``view`` starts: the session, its page and the door before it."""
+"""The view that the command ``view`` opens: the session, its page and the door before it."""
 
 import functools
 import pathlib
