@@ -1,4 +1,4 @@
-"""What terms remember: one truth, delays and histories. All have ``init`` and ``step``, as every term with memory does."""
+"""Memories of terms: one truth, delays and histories. All have ``init`` and ``step``, as every term with memory does."""
 
 import dataclasses
 from typing import Any
