@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 
 HERE = pathlib.Path(__file__).resolve().parent
 if __name__ == "__main__":
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)  # before JAX reads it: what it would write there is outside of the folders
     sys.path[:0] = [str(HERE.parents[1]), str(HERE), str(HERE.parent), str(HERE.parent / "tools")]
 
 import bad_meshes  # noqa: E402
@@ -179,5 +180,4 @@ def main() -> int:
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt):
         os.environ["JAX_PLATFORMS"] = "cpu"
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)  # else it would be written to
         functools.partial(sys.exit, main())()
