@@ -110,7 +110,7 @@ class _Drawn:
 
 
 class _Several:
-    """As many drawers as there are callers at a time, but no more than cores; each is made when all others are busy."""
+    """Drawers for callers at the same time: each is made when all others are busy, and there are no more of them than cores."""
 
     def __init__(self, make: Callable[[], _Drawer]):
         self._make, self._made, self._lock = make, [make()], threading.Lock()
