@@ -23,7 +23,9 @@ def made(tmp_path_factory):
     where = tmp_path_factory.mktemp("demos") / "d"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "setup_jax", lambda: None)
-        demos.main([*map(str, SHORT), "--episodes", "6", "--side-by-side", "4", "--noise", "0.5", "--velocities", "--out", str(where)])
+        demos.main(
+            [*map(str, SHORT), "--episodes", "6", "--side-by-side", "4", "--noise", "0.5", "--velocities", "--out", str(where)]
+        )
     return where
 
 
