@@ -22,8 +22,11 @@ def test_the_ray_tracer_draws_what_mujoco_draws(monkeypatch):
     shown = np.asarray(state.pipeline_state.qpos), jax.device_get(jax.jit(jax.vmap(env.scenery))(state))
     drawn = {}
     for renderer in ("mujoco", "warp"):
-        cameras = pictures.Cameras(env, ["front", "wrist"], (48, 48), renderer)
-        drawn[renderer] = {name: np.stack(list(cameras.frames(name, *shown))).astype(int) for name in cameras.names}
+        cameras = pictures.Cameras(env, ["front", "wrist", "front+wrist"], (48, 48), renderer)
+        drawn[renderer] = {name: np.stack(list(cameras.frames(name, *shown))).astype(int) for name in cameras.names[:2]}
+        both = np.stack(list(cameras.frames("front+wrist", *shown)))
+        np.testing.assert_array_equal(both, np.concatenate([*drawn[renderer].values()], axis=2))
+        assert cameras.sizes["front+wrist"] == (96, 48)
         cameras.close()
     for name, frames in drawn["warp"].items():
         off = np.abs(frames - drawn["mujoco"][name]).mean(axis=(1, 2, 3))

@@ -36,7 +36,7 @@ class Cameras:
     """Cameras of an environment: those of its scene, which do not see the goal's marker, and those for people, which do.
 
     Args:
-        names: of the cameras.
+        names: of the cameras; ``front+wrist`` is one picture of both, side by side.
         size: width and height [pixels], even, as encoders want them; None: a camera's own.
         renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp where JAX has a GPU.
 
@@ -52,15 +52,17 @@ class Cameras:
         model, own = env.mj_model, env.cfg.scene.cameras
         people = [name for i in range(model.ncam) if not (name := model.camera(i).name).startswith(MARK)]
         there = list(dict.fromkeys((*own, *people)))
-        if unknown := [name for name in names if name not in there]:
+        single = list(dict.fromkeys(part for name in names for part in name.split("+")))
+        if unknown := [name for name in single if name not in there]:
             raise UserError(f"{', '.join(unknown)}: no camera of this environment: choose from {', '.join(there)}")
         self.names = tuple(names)
-        self.sizes = {name: size or (own[name].size if name in own else SIZE) for name in names}
+        sizes = {name: size or (own[name].size if name in own else SIZE) for name in single}
+        self.sizes = {name: _beside(name, [sizes[part] for part in name.split("+")]) for name in names}
         self.renderer = renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
         self._drawers: dict[str, _Drawer] = {}
-        for name in names:
+        for name in single:
             traced = self.renderer == "warp" and name in own
-            made = functools.partial(_Traced if traced else _Drawn, env, name, self.sizes[name])
+            made = functools.partial(_Traced if traced else _Drawn, env, name, sizes[name])
             self._drawers[name] = made() if traced else _Several(made)
 
     def close(self) -> None:
@@ -77,7 +79,20 @@ class Cameras:
         """
         for first in range(0, len(qpos), TOGETHER):
             now = slice(first, first + TOGETHER)
-            yield from self._drawers[name](qpos[now], scenery[now])
+            parts = [self._drawers[part](qpos[now], scenery[now]) for part in name.split("+")]
+            yield from parts[0] if len(parts) == 1 else (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+
+
+def _beside(name: str, sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Width and height of pictures side by side.
+
+    Raises:
+        UserError: they differ in height.
+    """
+    widths, heights = zip(*sizes, strict=True)
+    if len(set(heights)) > 1:
+        raise UserError(f"{name}: pictures side by side need one height, and these have {heights}: pass --picture")
+    return sum(widths), heights[0]
 
 
 class _Drawer(Protocol):

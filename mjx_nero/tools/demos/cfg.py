@@ -34,7 +34,8 @@ class DemosCfg:
             policies learn from, which they then read faster.
         velocities: the state has the joints' velocities beside their positions (as ``<joint>.vel``).
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
-        cameras: of the scene, with commas between them: their pictures are drawn and written as videos.
+        cameras: of the scene, with commas between them: their pictures are drawn and written as videos; front+wrist is one
+            picture of both, side by side, which LeRobot reads sooner than two.
         picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
         renderer: mujoco (OpenGL, a picture at a time) or warp (the ray tracer, for the scene's own cameras); auto: warp on a GPU.
         form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).

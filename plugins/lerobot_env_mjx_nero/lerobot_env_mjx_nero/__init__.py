@@ -56,7 +56,8 @@ class MjxNeroEnv(EnvConfig):
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(7 * poses,)),
         }
         for name in filter(None, self.cameras.split(",")):
-            self.features[f"pixels/{name}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(self.height, self.width, 3))
+            width = self.width * len(name.split("+"))  # pictures side by side
+            self.features[f"pixels/{name}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(self.height, width, 3))
             self.features_map[f"pixels/{name}"] = f"{OBS_IMAGES}.{name}"
 
     @property
