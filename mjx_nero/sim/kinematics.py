@@ -140,7 +140,8 @@ class Chain:
                 pos = pos + math.rotate(quat, along * off)
             else:
                 quat = math.quat_mul(quat, math.axis_angle(along, off))
-            nodes.append((pos, quat))
+            # Without a barrier XLA computes a link's pose anew for every number that depends on it: ten times the work.
+            nodes.append(jax.lax.optimization_barrier((pos, quat)))
         return nodes
 
     def _frames(self, nodes: list[Pose]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:

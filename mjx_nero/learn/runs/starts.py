@@ -32,7 +32,7 @@ EPISODES = 64
 # Greatest standard deviation of the noise on the expert's actions, if they are velocities or not: noisy positions shake the arm.
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
-# A controller of 64 arms is thousands of tiny operations. Sharing them among a large machine's threads takes ten times as long.
+# A controller of 64 arms is thousands of operations that are too small to share among threads.
 _ONE_THREAD: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
 COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
 _HOLD = "success.hold"
