@@ -25,14 +25,16 @@ class Batches:
     the next batch meanwhile.
 
     Args:
-        function: arrays [rows, ...] in any tree -> an array [rows, ...] of JAX. One call of it runs at a time.
+        function: arrays [rows, ...] in any tree -> an array [rows, ...] of JAX. One call runs at a time, whatever functions there
+            are: a first call may capture a graph, which nothing else on the device may disturb.
         sizes: rows that it may be called with, ascending; each is a program of its own. No caller has more rows than the last.
     """
+
+    _lock = threading.Lock()
 
     def __init__(self, function: Callable[[Any], jax.Array], sizes: Sequence[int]):
         self._function, self._sizes = function, tuple(sizes)
         self._waiting: collections.deque[_Asked] = collections.deque()
-        self._lock = threading.Lock()
 
     def __call__(self, given: Any) -> np.ndarray:
         """The results of ``given``, arrays [rows, ...] in a tree. Any thread may call it."""
