@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import SHOWN, EnvCfg, Envs, Presets
+from mjx_nero.envs.task import EnvCfg, Envs, Presets
 from mjx_nero.envs.tasks import (
     clutter,
     follow_target,
@@ -83,11 +83,6 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.FollowTargetSetup:
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.LiftSetup], EnvCfg]) -> EnvCfg:
     setup = lift_setup(robot)
     return factory(_ready(robot), setup)
-
-
-def _shown_lift(robot: RobotCfg, setup: lift.LiftSetup) -> EnvCfg:
-    """An arm that no table knows may wait long until noise closes its fingers on a cube, so its expert shows how."""
-    return dataclasses.replace(lift.default(robot, setup), training=SHOWN)
 
 
 def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
@@ -178,7 +173,7 @@ def envs(prefix: str, robot: RobotCfg, *setups: Any, **others: RobotCfg) -> Envs
 
 ENVS: Envs = {
     "reach": (None, reach.presets()),
-    "lift": (None, _presets(_lift, default=_shown_lift, isaac=lift.isaac, sim2real=lift.sim2real, **lift.SEEN)),
+    "lift": (None, _presets(_lift, default=lift.default, isaac=lift.isaac, sim2real=lift.sim2real, **lift.SEEN)),
     "follow_target": (None, _presets(_follow_target, default=follow_target.default, static=follow_target.static)),
     "pick_place": (None, {"default": _pick_place}),
     "reach_obstacles": (None, reach_obstacles.presets()),

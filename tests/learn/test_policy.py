@@ -11,7 +11,7 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.envs.task import joint_actions
-from mjx_nero.learn import checkpoint, policy
+from mjx_nero.learn import bundled, checkpoint, policy
 from mjx_nero.learn.ppo import networks
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.mdp.actions import BinaryGripper
@@ -172,7 +172,7 @@ def test_policy_of_another_robot_of_the_same_name(trained, path):
 
 
 def test_a_preset_may_ship_a_policy_of_its_own(monkeypatch, tmp_path):
-    monkeypatch.setattr(policy, "ASSETS", tmp_path)
+    monkeypatch.setattr(bundled, "ASSETS", tmp_path)
     (tmp_path / "policies").mkdir()
     (tmp_path / "policies" / "nero_lift_sim2real.safetensors").touch()
     stems = {preset: policy.shipped("nero_lift", preset).stem for preset in ("default", "isaac", "sim2real")}
@@ -227,7 +227,7 @@ def test_files_that_describe_no_policy(trained, tmp_path, changes, message):
 
 
 def test_no_policy_ships(env, monkeypatch):
-    monkeypatch.setattr(policy, "ASSETS", pathlib.Path("/nowhere"))
+    monkeypatch.setattr(bundled, "ASSETS", pathlib.Path("/nowhere"))
     with pytest.raises(UserError, match=r"^there is no bundled policy for nero_lift: train one \(python train.py --env"):
         policy.load_for(env, "nero_lift", None)
     with pytest.raises(UserError, match=r"train one \(python train.py --env reach --robot \./my_arm\)"):

@@ -248,6 +248,12 @@ def test_a_task_without_an_expert_says_so():
     assert told == ["no expert shows how: the task has no script that grasps"]
 
 
+def test_a_run_that_begins_with_a_policy_imitates_nobody():
+    told, env = [], wrappers.for_training(ManipulationEnv(env_cfg("nero_lift"), impl="native"))
+    learner = types.SimpleNamespace(**vars(asked(env)), imitates=True)
+    assert starts.maker(learner, told.append, new=False)(0) == {} and not told
+
+
 def test_all_that_differs_is_left_out_where_the_expert_plays():
     cfg = starts.playground(env_cfg("nero_lift", "sim2real"))
     assert not cfg.randomization and not cfg.sensors and cfg.robot.gravity_compensation

@@ -11,7 +11,6 @@ from typing import Any
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import (
-    CALM,
     SHOWN,
     CurriculumCfg,
     EnvCfg,
@@ -147,7 +146,7 @@ def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
         rewards=carrying(held),
         curriculum=CurriculumCfg(),
         controllers=setup.controllers(robot),
-        training=CALM,
+        training=SHOWN,
     )
 
 

@@ -67,12 +67,15 @@ def none(seed: int) -> dict[str, Any]:
     return {}
 
 
-def maker(learner: Learner, say: Callable[[str], None]) -> Make:
+def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Make:
     """Returns a function that makes from a seed what an expert leaves a learner.
 
     It returns nothing, and says why in a line, if there can be none.
+
+    Args:
+        new: the run begins with a new policy. One that begins with a policy of a file imitates nobody: that policy knows more.
     """
-    env, imitates = learner.env, getattr(learner, "imitates", False)
+    env, imitates = learner.env, new and getattr(learner, "imitates", False)
     begins = isinstance(env, wrappers.ExpertStarts)
     player = functools.cache(lambda: _player(env.unwrapped, learner.num_envs))
 
