@@ -397,7 +397,7 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, velocities, a bar held still, what an expert shows, and the recipes' presets, whose runners differ."""
+    """But for how long it takes, velocities, a bar held still, what an expert shows, and presets of recipes."""
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
