@@ -49,8 +49,8 @@ def _prepare() -> None:
     """Sets what JAX and MuJoCo read from the environment when they start."""
     # Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one
     # batched step takes seconds instead of milliseconds), and its concurrent scheduler can deadlock where physics and networks
-    # share a loop. Later versions have neither, and the newest abort on the first flag, so both are set for the old ones alone,
-    # before the first JAX computation.
+    # share a loop. Later versions fuse MJX well and have no such scheduler, and the newest abort on the first flag, so both are
+    # set for the old ones alone, before the first JAX computation. Our own chains have barriers (``sim.kinematics``).
     with contextlib.suppress(metadata.PackageNotFoundError):
         if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
             for flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):

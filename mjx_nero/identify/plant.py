@@ -8,7 +8,6 @@ then pulls the joint to it, and the encoder reads the joint's position plus an o
 
 import copy
 import dataclasses
-import os
 
 import mujoco
 import numpy as np
@@ -17,6 +16,7 @@ from mujoco import rollout
 
 from mjx_nero.errors import UserError
 from mjx_nero.sim import scene
+from mjx_nero.sim.physics.native import cores
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
@@ -89,7 +89,7 @@ class Plant:
             np.where(friction > 0, friction, FRICTION * np.array(robot.arm.effort)),
             np.zeros(self.n),
         )
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = cores()
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
 

@@ -37,7 +37,7 @@ def test_the_ray_tracer_draws_what_mujoco_draws(monkeypatch):
 def test_each_caller_at_a_time_has_a_drawer_of_its_own(monkeypatch):
     """Three callers meet in three drawers, though only the first was there before. A fourth drawer is one too many."""
     monkeypatch.setattr(pictures, "MOST", 3)
-    monkeypatch.setattr(pictures.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(pictures, "cores", lambda: 8)
     meet, made, closed = threading.Barrier(3), [], []
 
     class Drawer:

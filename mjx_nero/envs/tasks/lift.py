@@ -169,7 +169,7 @@ def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
-    return dataclasses.replace(sim2reals.randomized(default(robot, setup)), training=SHOWN)
+    return sim2reals.randomized(default(robot, setup))
 
 
 def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:

@@ -8,7 +8,6 @@ import concurrent.futures
 import copy
 import dataclasses
 import functools
-import os
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +20,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn.play.batches import Batches
 from mjx_nero.sim.cameras.cfg import MARK
+from mjx_nero.sim.physics.native import cores
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
@@ -141,7 +141,7 @@ class _Several:
 
     def _take(self) -> _Drawer:
         with self._lock:
-            if self._free.empty() and len(self._made) < min(MOST, os.cpu_count() or 1):
+            if self._free.empty() and len(self._made) < min(MOST, cores()):
                 self._made.append(self._make())
                 return self._made[-1]
         return self._free.get()

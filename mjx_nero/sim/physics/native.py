@@ -34,6 +34,11 @@ _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDi
 _KEPT = 8
 
 
+def cores() -> int:
+    """Number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class NativePhysics:
     """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept for a while.
 
@@ -51,7 +56,7 @@ class NativePhysics:
         self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu * (1 + cfg.ramp)])
         self._readers, self._gauges = touch.readers(model), forces.gauges(model)
         self._ends = np.cumsum([self._sizes[2] + len(self._readers), *(gauge.size for gauge in self._gauges.values())])
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = cores()
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
 

@@ -14,6 +14,7 @@ import jax
 
 import mjx_nero
 from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.sim.physics.native import cores
 
 Row = dict[str, Any]  # one measurement, as JSON has it
 
@@ -21,13 +22,12 @@ Row = dict[str, Any]  # one measurement, as JSON has it
 def machine() -> Row:
     """Devices, processor, memory, system: nothing that names the machine or who uses it."""
     devices = jax.local_devices()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "device": devices[0].device_kind,
         "devices": len(devices),
         "platform": devices[0].platform,
         "cpu": _cpu(),
-        "cores": cores,  # that this process may use
+        "cores": cores(),
         "memory_gb": _memory_gb(),
         "os": _os(),
     }
