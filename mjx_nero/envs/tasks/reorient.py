@@ -36,7 +36,7 @@ YAW = (-0.3, 0.3)  # [rad] heading of the box at the start
 CLOSING = 0.4  # [s] least closing time of the script's fingers
 JOINTS = 6  # of an arm whose hand may lean in any direction
 # The script's way with six joints. With seven, inverse kinematics that lifts a hand turns the other joints about as well.
-ROUND = {"clear": 0.03, "rises": 0.15}
+ROUND = {"clear": 0.02, "rises": 0.15}
 WIDER = 2.0  # opening of the hand, in edges of the box
 
 
