@@ -5,13 +5,13 @@ Each episode is encoded by itself, so that all cores can work, and begins with a
 
 import concurrent.futures
 import fractions
-import os
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from mjx_nero import cores
 from mjx_nero.errors import UserError
 
 CODEC, PIXELS = "libx264", "yuv420p"
@@ -54,7 +54,7 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
             packets += encoder.encode(drawn)
         return packets + encoder.encode()
 
-    with av.open(str(path), "w") as file, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with av.open(str(path), "w") as file, concurrent.futures.ThreadPoolExecutor(cores()) as pool:
         stream: Any = file.add_stream(CODEC, rate=round(fps), options=_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = *shape[:2], PIXELS
         begin = 0
