@@ -4,6 +4,7 @@ Each episode is encoded by itself, so that all cores can work, and begins with a
 """
 
 import concurrent.futures
+import contextlib
 import fractions
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -54,7 +55,9 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
             packets += encoder.encode(drawn)
         return packets + encoder.encode()
 
-    with av.open(str(path), "w") as file, concurrent.futures.ThreadPoolExecutor(cores()) as pool:
+    pool = concurrent.futures.ThreadPoolExecutor(cores())
+    with av.open(str(path), "w") as file, contextlib.ExitStack() as ends:
+        ends.callback(pool.shutdown, cancel_futures=True)  # after an error or Ctrl-C no further episode is begun
         stream: Any = file.add_stream(CODEC, rate=round(fps), options=_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = *shape[:2], PIXELS
         begin = 0

@@ -24,7 +24,7 @@ from mjx_nero.data import Episode
 from mjx_nero.data import episode as names
 from mjx_nero.data.units import Units
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory
+from mjx_nero.learn import device_memory, waiting
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
@@ -91,7 +91,7 @@ class Player:
         parts: list[list] = [[] for _ in numbers]
         won, done = np.zeros(self.size, bool), dict[int, Episode]()
         while True:
-            slots, played = self._play(slots, jnp.asarray(numbers), key)
+            slots, played = waiting.result_of(self._play, slots, jnp.asarray(numbers), key)
             kept, alive, wins = jax.device_get(played)
             kept = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
             counts, ended = alive.sum(axis=0).astype(int), np.asarray(slots[-1]) == 0
