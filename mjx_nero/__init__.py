@@ -45,6 +45,11 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+def cores() -> int:
+    """Number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _prepare() -> None:
     """Sets what JAX and MuJoCo read from the environment when they start."""
     # Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one
@@ -57,7 +62,7 @@ def _prepare() -> None:
                 if flag not in os.environ.get("XLA_FLAGS", ""):
                     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{flag}=false".strip()
     # With a single processor XLA has a single thread, and a program that calls the C library back waits for itself, now and then.
-    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+    if cores() == 1:
         os.environ.setdefault("NPROC", "2")
     # MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
     if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():

@@ -25,7 +25,7 @@ def of(values: np.ndarray) -> Stats:
     at = {name: (int(share * (n - 1)), share * (n - 1) % 1) for name, share in QUANTILES.items()}
     mean = rows.mean(axis=-1, dtype=np.float64)
     out = {"mean": mean, "std": rows.std(axis=-1, dtype=np.float64)}
-    rows.partition(sorted({0, n - 1, *(min(low + i, n - 1) for low, _ in at.values() for i in (0, 1))}), axis=-1)
+    rows.sort(axis=-1)  # a processor's vectors sort sooner than a partition at twelve places
     out |= {"min": rows[..., 0].astype(np.float64), "max": rows[..., -1].astype(np.float64)}
     for name, (low, between) in at.items():
         ends = (rows[..., i].astype(np.float64) for i in (low, min(low + 1, n - 1)))

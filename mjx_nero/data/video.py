@@ -4,14 +4,15 @@ Each episode is encoded by itself, so that all cores can work, and begins with a
 """
 
 import concurrent.futures
+import contextlib
 import fractions
-import os
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from mjx_nero import cores
 from mjx_nero.errors import UserError
 
 CODEC, PIXELS = "libx264", "yuv420p"
@@ -54,7 +55,9 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
             packets += encoder.encode(drawn)
         return packets + encoder.encode()
 
-    with av.open(str(path), "w") as file, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    pool = concurrent.futures.ThreadPoolExecutor(cores())
+    with av.open(str(path), "w") as file, contextlib.ExitStack() as ends:
+        ends.callback(pool.shutdown, cancel_futures=True)  # after an error or Ctrl-C no further episode is begun
         stream: Any = file.add_stream(CODEC, rate=round(fps), options=_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = *shape[:2], PIXELS
         begin = 0

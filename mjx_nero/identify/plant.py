@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
+from mjx_nero import cores
 from mjx_nero.errors import UserError
 from mjx_nero.sim import scene
-from mjx_nero.sim.physics.native import cores
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 

@@ -134,6 +134,25 @@ def test_a_signal_saves_and_nothing_is_lost(train, at_row, undisturbed, tmp_path
     assert [row["steps"] for row in rows(tmp_path / "run")] == list(range(0, STEPS + 1, CHUNK))
 
 
+def test_a_signal_before_the_first_update_makes_none(train, at_row, undisturbed, tmp_path):
+    at_row(1, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert train("--out", "run")[0] == 143
+    assert [row["steps"] for row in rows(tmp_path / "run")] == [0]
+    code, _, err = train("--restore", "run", steps=0)
+    assert code == 0 and last(tmp_path / "run") == undisturbed, err
+
+
+def test_a_signal_is_not_kept_waiting_by_an_evaluation(train, at_row, tmp_path):
+    """An evaluation with pictures may take minutes; the next one is due at the end of the run."""
+    at_row(2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert train("--out", "run", "--eval-every", 10 * STEPS)[0] == 143
+    assert [(row["steps"], "eval/success_rate" in row) for row in rows(tmp_path / "run")] == [
+        (0, True),
+        (CHUNK, False),
+        (2 * CHUNK, False),
+    ]
+
+
 def test_a_signal_during_compilation_leaves_nothing(train, monkeypatch, tmp_path):
     def compile(*_):
         os.kill(os.getpid(), signal.SIGTERM)

@@ -27,8 +27,10 @@ def demonstrations(tmp_path, monkeypatch):
 
     features = {SEEN: Feature(("x",) * size), DONE_BY: Feature(("a",) * env.action_size)}
     about = {"env": "nero_lift", "preset": "default", "through": "task"}
-    with writer(tmp_path / "d", Schema(50.0, "nero", "Lift.", features, about), "arrays") as out:
-        out.put([episode(i) for i in range(20)])
+    made, schema = [episode(i) for i in range(20)], Schema(50.0, "nero", "Lift.", features, about)
+    for name, part in (("d", made), ("first", made[:15]), ("second", made[15:])):
+        with writer(tmp_path / name, schema, "arrays") as out:
+            out.put(part)
     return weights
 
 
@@ -63,11 +65,21 @@ def test_a_run_goes_on_to_the_bit(demonstrations, call, tmp_path):
     np.testing.assert_array_equal(whole.act({"state": seen}), again.act({"state": seen}))
 
 
+def test_several_folders_are_one(demonstrations, call, tmp_path):
+    argv = [*SIZES, *SMALL, "--num-timesteps", 64 * 50]
+    for out, data in (("one", "d"), ("two", "first,second")):
+        code, _, err = call("train", *argv, "--clone.data", data, "--out", out)
+        assert code == 0, err
+    one, two = (policy.checkpoint_policy(tmp_path / name / "policy.safetensors") for name in ("one", "two"))
+    seen = np.ones((3, len(demonstrations)), np.float32)
+    np.testing.assert_array_equal(one.act({"state": seen}), two.act({"state": seen}))
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
         ([], "--learner clone learns from demonstrations: pass --clone.data DIR, a folder that 'demos' wrote"),
-        (["--clone.data", "nowhere"], "nowhere holds no demonstrations of mjx_nero"),
+        (["--clone.data", "d,nowhere"], "nowhere holds no demonstrations of mjx_nero"),
         (["--clone.data", "d", "--preset", "isaac"], "and a policy here has"),
         (["--clone.data", "d", "--num-devices", 2], "--learner clone learns on one device"),
     ],

@@ -1,5 +1,6 @@
 """The command ``demos``: what it writes, shows and plays again. Physics is MuJoCo's, in a task of a fifth of a second."""
 
+import itertools
 import json
 import pathlib
 import re
@@ -13,6 +14,7 @@ from mjx_nero.data import open_dataset, units
 from mjx_nero.envs import registry
 from mjx_nero.tools import cli, demos
 from mjx_nero.tools.demos import making
+from mjx_nero.tools.demos.cfg import DemosCfg
 
 SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays", "--env.episode_length_s", 0.2]
 
@@ -108,6 +110,18 @@ def test_an_episode_may_end_with_its_success(call, tmp_path):
         ends = part.arrays[names.SUCCESS].ravel()
         assert ends[-1] == part.success and not ends[:-1].any() and part.arrays[names.DONE].ravel()[-1]
     assert early.lengths.mean() < 0.8 * whole.lengths.mean()
+
+
+def test_a_number_has_its_slot_wherever_one_begins():
+    """A program rounds not all rows of a batch alike, and a data set that goes on has to be the same to the bit."""
+    fields = {"episode_length_s": 0.2}
+    player = making.prepare(DemosCfg("nero_lift", agent="policy", episodes=7, side_by_side=3, ends="success", env_fields=fields))[
+        1
+    ]
+    play, slots = player._play, []
+    player._play = lambda state, numbers, key: (slots.append(np.asarray(numbers) % 3), play(state, numbers, key))[1]
+    assert [episode.number for episode in itertools.islice(player(5, 0), 7)] == list(range(5, 12))
+    assert len(slots) >= 3 and (np.array(slots) == [0, 1, 2]).all()
 
 
 def test_it_is_shown_and_played_again(made, call):

@@ -13,7 +13,7 @@ class CloneCfg:
     """Hyperparameters. 0 for ``num_envs`` or ``num_timesteps`` lets the machine decide.
 
     Attributes:
-        data: folder of the demonstrations (``demos --out``).
+        data: folders of demonstrations (``demos --out``, ``view --demos``), with commas between them.
         num_envs: number of environments; only evaluations step them.
         num_timesteps: total steps of demonstrations to learn from, repeats included.
         minibatch_size: steps per update.

@@ -63,7 +63,8 @@ class Learner:
         self._sizes = env.observation_size
         self._networks = make_networks(self._sizes, env.action_size, cfg.network)
         self.steps_per_iteration = cfg.minibatch_size * cfg.updates
-        self._seen, self._done = _read(pathlib.Path(cfg.data), env)
+        parts = [_read(pathlib.Path(name.strip()), env) for name in cfg.data.split(",")]
+        self._seen, self._done = (np.concatenate(part) for part in zip(*parts, strict=True))
         total = max(1, -(-cfg.num_timesteps // self.steps_per_iteration)) * cfg.updates
         rate = optax.cosine_decay_schedule(cfg.learning_rate, total)
         self._optimizer = optax.flatten(

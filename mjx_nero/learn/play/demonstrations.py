@@ -24,7 +24,7 @@ from mjx_nero.data import Episode
 from mjx_nero.data import episode as names
 from mjx_nero.data.units import Units
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory
+from mjx_nero.learn import device_memory, waiting
 from mjx_nero.learn.play.pictures import Cameras
 from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
@@ -85,13 +85,16 @@ class Player:
             self._cameras.close()
 
     def __call__(self, first: int, seed: int) -> Iterator[Episode]:
-        """Plays episodes in the order of their numbers, from ``first`` on, without end."""
-        key, numbers = jax.random.PRNGKey(seed), np.arange(first, first + self.size)
-        slots, due, following = self._begin(jnp.asarray(numbers), key), first, first + self.size
+        """Plays episodes in the order of their numbers, from ``first`` on, without end.
+
+        Each number has its slot, wherever one begins: a compiled program rounds not all rows of a batch alike.
+        """
+        key, numbers = jax.random.PRNGKey(seed), first + (np.arange(self.size) - first) % self.size
+        slots, due = self._begin(jnp.asarray(numbers), key), first
         parts: list[list] = [[] for _ in numbers]
         won, done = np.zeros(self.size, bool), dict[int, Episode]()
         while True:
-            slots, played = self._play(slots, jnp.asarray(numbers), key)
+            slots, played = waiting.result_of(self._play, slots, jnp.asarray(numbers), key)
             kept, alive, wins = jax.device_get(played)
             kept = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
             counts, ended = alive.sum(axis=0).astype(int), np.asarray(slots[-1]) == 0
@@ -100,7 +103,7 @@ class Player:
                 parts[i].append(_cut(kept, i, counts[i]))
                 if ended[i]:
                     done[int(numbers[i])] = self._episode(parts[i], bool(won[i]), int(numbers[i]))
-                    parts[i], won[i], numbers[i], following = [], False, following, following + 1
+                    parts[i], won[i], numbers[i] = [], False, numbers[i] + self.size
             while due in done:
                 yield done.pop(due)
                 due += 1

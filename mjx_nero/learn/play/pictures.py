@@ -16,11 +16,11 @@ from typing import Protocol
 import jax
 import numpy as np
 
+from mjx_nero import cores
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.learn.play.batches import Batches
 from mjx_nero.sim.cameras.cfg import MARK
-from mjx_nero.sim.physics.native import cores
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 

@@ -15,7 +15,7 @@ from brax.envs.base import State
 
 from mjx_nero.control import Controller
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory
+from mjx_nero.learn import device_memory, waiting
 from mjx_nero.learn.play import figures, recorder
 from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Key, Scenery
@@ -158,7 +158,7 @@ class Runner:
         self._run, self._episodes, self._terms = run, episodes, terms
 
     def __call__(self, params: Any, seed: int) -> Episodes:
-        totals, frames, memory = self._run(params, *_keys(seed, self._episodes))
+        totals, frames, memory = waiting.result_of(self._run, params, *_keys(seed, self._episodes))
         return _collect(totals, frames, memory, self._terms)
 
     def compiler(self, params: Any) -> Callable[[], None]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from mjx_nero.console import Show
 from mjx_nero.errors import UserError
-from mjx_nero.learn import checkpoint, machines
+from mjx_nero.learn import checkpoint, machines, waiting
 from mjx_nero.learn.play import figures
 from mjx_nero.learn.runs.cfg import RunCfg
 from mjx_nero.learn.runs.checkpoints import Checkpoints
@@ -107,9 +107,12 @@ class Loop:
             self._evaluate(state)
             self._log({})
             self._save(state)
+            if ended := self._ended(self._agree(0.0)[0]):
+                self.checkpoints.wait()
+                return ended
         while True:
             t = time.perf_counter()
-            state, metrics = self.made.advance(state)
+            state, metrics = waiting.result_of(self.made.advance, state)
             means = {name: float(value) for name, value in metrics.items()}  # waits for the device
             tally.steps_per_s = self.made.steps / (time.perf_counter() - t)
             tally.steps += self.made.steps
@@ -122,7 +125,7 @@ class Loop:
             mean.add(self._counted(means))
             stop, tally.wall_s, unsaved = self._agree(time.perf_counter() - saved)
             ended = self._ended(stop)
-            now = {name for name in due if tally.steps >= due[name] or ended}
+            now = {name for name in due if tally.steps >= due[name] or (ended and (name != "eval" or not stop))}
             if 0 < 60 * self.run.checkpoint_minutes <= unsaved:
                 now.add("save")
             due |= {name: _next(tally.steps, every[name]) for name in now}

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import hashlib
 import math
-import os
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from mujoco import rollout
 
+from mjx_nero import cores
 from mjx_nero.sim import forces, touch
 from mjx_nero.sim.physics import Footprint, fusion, host
 from mjx_nero.sim.scene import SimCfg
@@ -32,11 +32,6 @@ from mjx_nero.types import Sim
 _lock = threading.Lock()
 _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDict()
 _KEPT = 8
-
-
-def cores() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class NativePhysics:

@@ -14,7 +14,6 @@ import jax
 
 import mjx_nero
 from mjx_nero.learn.runs import folder as run_folder
-from mjx_nero.sim.physics.native import cores
 
 Row = dict[str, Any]  # one measurement, as JSON has it
 
@@ -27,7 +26,7 @@ def machine() -> Row:
         "devices": len(devices),
         "platform": devices[0].platform,
         "cpu": _cpu(),
-        "cores": cores(),
+        "cores": mjx_nero.cores(),
         "memory_gb": _memory_gb(),
         "os": _os(),
     }
