@@ -8,11 +8,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_nero import console, files
-from mjx_nero.envs import registry
+from mjx_nero import files
 from mjx_nero.envs.task import for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import bundled
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 Row = dict[str, Any]
@@ -112,7 +113,7 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
 
 def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """All seeds of an environment, by the settings that ``train.py --env`` has."""
-    from mjx_nero.learn.runs import cfg as run_cfg  # with Brax and MJX, which help does without
+    from mjx_nero.runs import cfg as run_cfg  # with Brax and MJX, which help does without
     from mjx_nero.tools.benchmark import learning
 
     run, _ = run_cfg.fit_machine(run_cfg.resolve(env, args.preset, None, {}, {}))
@@ -123,7 +124,7 @@ def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """The preset's bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
-    from mjx_nero.learn.play import evaluation
+    from mjx_nero.runs import evaluation
     from mjx_nero.sim.physics import warp_available
 
     path = bundled.shipped(env, args.preset)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import pytest
 
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import compiled
 from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
 from mjx_nero.tools.benchmark import command, drawing, learning, plot, throughput
 from mjx_nero.tools.benchmark.program import Program, spread, warp_mb

@@ -5,7 +5,7 @@ import pathlib
 
 import pytest
 
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 from mjx_nero.tools import results
 
 LEARNT = {"target": 0.95, "seeds": 8, "reached": 7, "seconds_median": 10.04, "seconds_worst": None}

@@ -9,12 +9,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero import config, console, files
-from mjx_nero.envs import registry
+from mjx_nero import config, files
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner as learners
-from mjx_nero.learn.runs import cfg as run_cfg
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import console
 from mjx_nero.sim.physics import impls
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.benchmark import machine, plot
 from mjx_nero.tools.benchmark.machine import Row

@@ -10,9 +10,8 @@ from mjx_nero import config
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import compiled, evaluation
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools import cli
 from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, start, throughput

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import jax
 
-from mjx_nero.learn.runs import compiled, starts, training
-from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.runs import compiled, starts, training
+from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tools.benchmark.program import Row
 
 _EVALUATIONS = 24  # a whole run, where nothing else is asked for
