@@ -58,6 +58,28 @@ def after_this(say: Callable[[str], None]) -> Iterator[Stop]:
         yield stop
 
 
+def check(stop: Stop) -> None:
+    """Ends the program if a signal came.
+
+    Raises:
+        Signalled: it did.
+    """
+    if stop.number is not None:
+        raise Signalled(stop.number)
+
+
+@contextlib.contextmanager
+def ended() -> Iterator[None]:
+    """Ends the process at a signal, with one line and without an exception, which may not cross compiled code that calls back."""
+
+    def handle(number: int, _: Any) -> None:
+        os.write(2, b"interrupted\n")
+        os._exit(128 + number)
+
+    with _handled(handle):
+        yield
+
+
 @contextlib.contextmanager
 def _handled(handle: Callable[[int, Any], None]) -> Iterator[None]:
     before = {}
