@@ -16,10 +16,11 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from mjx_nero.envs import registry
 from mjx_nero.learn import policy
-from mjx_nero.learn.play import evaluation, rollout
+from mjx_nero.learn.play import rollout
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import objects, render
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, results
 from mjx_nero.tools.inspection import things
 

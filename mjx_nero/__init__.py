@@ -12,10 +12,10 @@ from mjx_nero.errors import missing
 
 if TYPE_CHECKING:
     from mjx_nero.envs.env import ManipulationEnv
-    from mjx_nero.envs.registry import env_cfg, list_envs, list_presets, list_robots, make
     from mjx_nero.envs.task import EnvCfg
     from mjx_nero.errors import UserError
-    from mjx_nero.guests import register
+    from mjx_nero.interop.guests import register
+    from mjx_nero.tasks.registry import env_cfg, list_envs, list_presets, list_robots, make
 
 __version__ = "0.6.0.dev0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make", "register"]
@@ -25,8 +25,8 @@ _HOME = {
     "EnvCfg": "mjx_nero.envs.task",
     "ManipulationEnv": "mjx_nero.envs.env",
     "UserError": "mjx_nero.errors",
-    "register": "mjx_nero.guests",
-    **dict.fromkeys(("env_cfg", "list_envs", "list_presets", "list_robots", "make"), "mjx_nero.envs.registry"),
+    "register": "mjx_nero.interop.guests",
+    **dict.fromkeys(("env_cfg", "list_envs", "list_presets", "list_robots", "make"), "mjx_nero.tasks.registry"),
 }
 
 

@@ -33,6 +33,7 @@ _CHECKED = (
     "control.gripper",
     "control.ik",
     "envs",
+    "tasks",
     "urdf",
     "learn.checkpoint",
     "learn.policy",
@@ -54,10 +55,10 @@ from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import __main__, control  # noqa: E402
-from mjx_nero.envs import registry  # noqa: E402
 from mjx_nero.learn import learner  # noqa: E402
 from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
+from mjx_nero.tasks import registry  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)

@@ -16,10 +16,9 @@ import mjx_nero
 from mjx_nero import config, control, env_cfg, list_envs, list_presets
 from mjx_nero.__main__ import COMMANDS
 from mjx_nero.config import bounds
-from mjx_nero.envs import registry
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import training
-from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.runs import evaluation, training
+from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, train
 from mjx_nero.tools import eval as evaluate
 
@@ -285,7 +284,7 @@ def test_an_evaluation_in_mujocos_library_leaves_alone_what_it_does_not_need():
 HELPS = """
 import contextlib, io, json, os, sys
 import mjx_nero.__main__ as all
-import mjx_nero.envs.registry  # once for all commands
+import mjx_nero.tasks.registry  # once for all commands
 for command in all.COMMANDS:
     if not os.fork():
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):

@@ -6,7 +6,7 @@ import math
 import pytest
 from rich.console import Console
 
-from mjx_nero import console
+from mjx_nero.runs import console
 
 
 def test_the_progress_line_fits_80_columns_with_all_that_it_says():

@@ -15,9 +15,9 @@ from PIL import Image
 
 import mjx_nero
 from mjx_nero.__main__ import COMMANDS
-from mjx_nero.envs import registry
 from mjx_nero.learn import header, policy
 from mjx_nero.sim import robot_file
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, results
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -154,7 +154,7 @@ def test_every_page_with_python_has_a_test_that_runs_it():
 def test_adding_an_arm_shows_the_module():
     page = (DOCS / "guides" / "adding_an_arm.md").read_text()
     (snippet,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    module = (ROOT / "mjx_nero" / "envs" / "arms" / "so_arm101.py").read_text()
+    module = (ROOT / "mjx_nero" / "tasks" / "arms" / "so_arm101.py").read_text()
     shown, there = ([line for line in re.sub(r" *#.*", "", text).splitlines() if line] for text in (snippet, module))
     assert there[-len(shown) :] == shown
 

@@ -10,9 +10,9 @@ import mujoco
 import pytest
 
 from mjx_nero import UserError, list_envs, make, register
-from mjx_nero.envs import registry
 from mjx_nero.sim import physics
 from mjx_nero.sim.physics import Footprint
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.types import Sim
 
@@ -115,7 +115,7 @@ def test_a_guest_that_is_not_there_is_one_line(call):
 
 
 def test_a_module_beside_the_user_and_an_entry_point_are_loaded(call, tmp_path, monkeypatch):
-    text = "import mjx_nero\nfrom mjx_nero.envs.arms import nero\nmjx_nero.register(envs={{'{0}': nero.ENVS['nero_reach']}})\n"
+    text = "import mjx_nero\nfrom mjx_nero.tasks.arms import nero\nmjx_nero.register(envs={{'{0}': nero.ENVS['nero_reach']}})\n"
     (tmp_path / "beside_me.py").write_text(text.format("env_beside"))
     assert call("mjx_nero", "inspect", "--load", "beside_me", "nero")[0] == 0 and "env_beside" in list_envs()
 

@@ -7,9 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mjx_nero.config import bounds
+from mjx_nero.envs.gripping import LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.envs.tasks.building import AWAY
-from mjx_nero.envs.tasks.lift_any import LIFTED, NEAR, expert
 from mjx_nero.mdp import towers
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.objects import rests, shapes
@@ -18,6 +17,7 @@ from mjx_nero.sim.scene import ObjectCfg
 LONGER = 3.0  # [s] that the script takes longer than with a box: it lowers what it holds slowly
 OVER, DONE = 0.03, 0.004  # [m] heights over its place: from where a thing comes straight down, and where the hand opens
 STEP = 0.005  # [s] physics steps: with ones of 10 ms, flat things that lie on many corners tremble too fast to be at rest
+AWAY = 0.02  # [m] clearance of the pads beside or above an object that the hand has left
 MEETS = 0.01  # [m] below half of it the hand yields to what the thing stands on
 T = TypeVar("T", bound=Term)
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from mjx_nero.config import bounds
 from mjx_nero.envs import placing
+from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.envs.tasks.lift_any import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import randomization, success
 from mjx_nero.mdp.terms import ObservationGroup, Term
 from mjx_nero.sim import contacts

@@ -13,12 +13,12 @@ import numpy as np
 
 import mjx_nero
 from mjx_nero.config import bounds, values
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import missing, need
 from mjx_nero.interop.batch import Batch
 from mjx_nero.learn import device_memory
 from mjx_nero.sim.render import Renderer
+from mjx_nero.tasks import registry
 from mjx_nero.types import UserError
 
 try:

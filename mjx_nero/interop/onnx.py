@@ -16,8 +16,8 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import description, need
 from mjx_nero.interop.graph import Graph
 from mjx_nero.learn import learner
+from mjx_nero.learn.machines import versions
 from mjx_nero.learn.policy import Policy
-from mjx_nero.learn.runs.folder import versions
 from mjx_nero.sim import team
 from mjx_nero.types import UserError
 

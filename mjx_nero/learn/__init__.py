@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 # Module names before 0.6 -> today's modules, so that older code can still import them from here.
 _MOVED = {
-    "evaluation": "play.evaluation",
-    "ppo_cfg": "ppo.cfg",
-    "rollout": "play.rollout",
-    "run_cfg": "runs.cfg",
-    "training": "runs.training",
+    "evaluation": "mjx_nero.runs.evaluation",
+    "ppo_cfg": "mjx_nero.learn.ppo.cfg",
+    "rollout": "mjx_nero.learn.play.rollout",
+    "run_cfg": "mjx_nero.runs.cfg",
+    "training": "mjx_nero.runs.training",
 }
 
 if not TYPE_CHECKING:  # the package's own code imports the modules themselves
@@ -17,4 +17,4 @@ if not TYPE_CHECKING:  # the package's own code imports the modules themselves
     def __getattr__(name: str) -> Any:
         if name not in _MOVED:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return importlib.import_module(f"{__name__}.{_MOVED[name]}")
+        return importlib.import_module(_MOVED[name])

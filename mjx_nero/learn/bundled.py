@@ -2,7 +2,6 @@
 
 import pathlib
 
-from mjx_nero.envs import registry
 from mjx_nero.sim.robot import ASSETS
 
 
@@ -14,6 +13,4 @@ def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
 
 def names() -> dict[str, pathlib.Path]:
     """Maps the names of all bundled policies to their files: the environment, or environment and preset with an underscore."""
-    envs = registry.list_envs()
-    paths = [shipped(env, preset) for env in envs for preset in registry.list_presets(env)]
-    return {path.stem: path for path in paths if path.is_file()}
+    return {path.stem: path for path in sorted((ASSETS / "policies").glob("*.safetensors"))}

@@ -1,10 +1,14 @@
 """Runs on several machines: one process on each, joined by JAX to one mesh of devices.
 
 Only the first process writes, evaluates and decides; the others follow. With a single process, these functions do nothing.
+``versions`` says what runs on a machine.
 """
 
+import contextlib
 import glob
+import importlib.metadata as metadata
 import os
+import sys
 from typing import Any
 
 import jax
@@ -78,3 +82,13 @@ def _gpus() -> list[int] | None:
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     count = len(named.split(",")) if named else len(glob.glob("/dev/nvidia[0-9]*"))
     return list(range(count)) or None
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that affects a result, and the device."""
+    names = ("mjx-nero", "mujoco", "mujoco-mjx", "jax", "brax", "flax", "optax", "warp-lang")
+    found = {}
+    for name in names:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return {**found, "python": sys.version.split()[0], "device": jax.devices()[0].device_kind}

@@ -156,7 +156,7 @@ class MetricTerm(Term):
         where: another metric; the mean covers only episodes where that metric is above 0. Empty: all episodes.
         figure: name of the result, before the suffix ``_mean`` or ``_rate``. Empty: the metric's own name.
         milestone: the hard part of the task is done once it is true, as a grasp is. Its memory is true from then on, and expert
-            starts lie around that moment (``learn.runs.starts``).
+            starts lie around that moment (``runs.starts``).
     """
 
     at_end: bool = dataclasses.field(default=True, kw_only=True)

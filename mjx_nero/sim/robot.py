@@ -1,4 +1,4 @@
-"""Robots as frozen values: mounting, drives, home pose and gripper, which model files leave open. ``envs.arms`` has the arms."""
+"""Robots as frozen values: mounting, drives, home pose and gripper, which model files leave open. ``tasks.arms`` has the arms."""
 
 import dataclasses
 import pathlib

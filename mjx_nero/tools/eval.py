@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_nero import console, control, files
-from mjx_nero.envs import registry
+from mjx_nero import control, files
 from mjx_nero.errors import UserError
-from mjx_nero.learn.play.cfg import EXPERT, EvalCfg
+from mjx_nero.runs import console
+from mjx_nero.runs.evaluation_cfg import EXPERT, EvalCfg
 from mjx_nero.sim import render
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 if TYPE_CHECKING:
-    from mjx_nero.learn.play.evaluation import Played
+    from mjx_nero.runs.evaluation import Played
 
 RECORDED = 1000  # episodes at most, among which those that fail are looked for
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str]) -> None:
     for path in filter(None, (args.video, args.json)):
         files.check_writable(path)
     video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
-    from mjx_nero.learn.play import evaluation  # with Brax and MJX, which help does without
+    from mjx_nero.runs import evaluation  # with Brax and MJX, which help does without
 
     cfg = EvalCfg(
         args.env,

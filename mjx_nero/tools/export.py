@@ -4,9 +4,9 @@ import pathlib
 from collections.abc import Sequence
 
 from mjx_nero import config, files
-from mjx_nero.envs import registry
 from mjx_nero.interop import need
 from mjx_nero.learn import bundled
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.types import UserError
 

@@ -5,10 +5,10 @@ import pathlib
 import shlex
 from collections.abc import Mapping, Sequence
 
-from mjx_nero import console
 from mjx_nero.config import values
-from mjx_nero.console import Table
 from mjx_nero.errors import UserError
+from mjx_nero.runs import console
+from mjx_nero.runs.console import Table
 from mjx_nero.sim import robot_file
 from mjx_nero.tools import cli
 from mjx_nero.urdf import files, folder

@@ -6,8 +6,9 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero import config, console, files
+from mjx_nero import config, files
 from mjx_nero.envs.task import EnvCfg
+from mjx_nero.runs import console
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tools import cli
 

@@ -4,9 +4,10 @@ import dataclasses
 import pkgutil
 from collections.abc import Sequence
 
-from mjx_nero import console
-from mjx_nero.envs import registry, tasks
+from mjx_nero import tasks
 from mjx_nero.learn.bundled import shipped
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 

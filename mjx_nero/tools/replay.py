@@ -9,14 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.console import Table, screen
-from mjx_nero.envs import identified, registry
+from mjx_nero.envs import identified
 from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.plant import Drives, Plant
 from mjx_nero.interop import need
+from mjx_nero.runs.console import Table, screen
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 _APART = 0.8  # between the two arms [m]

@@ -8,15 +8,17 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_nero import console, files
-from mjx_nero.envs import registry
+from mjx_nero import files
 from mjx_nero.envs.task import for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import bundled
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 Row = dict[str, Any]
 WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
+SEEDS = "seeds"  # of an environment whose training is not complete
 EVALUATIONS = 48  # of a seed, if it needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
 _PAGE = """# Benchmarks
@@ -68,10 +70,14 @@ def main(argv: Sequence[str]) -> None:
     for what in whats:
         for env in envs:
             shown = named(env, args.preset)
-            for name, row in _learning(env, args) if what == "learning" else _policies(env, args):
-                held.setdefault(shown, {})[name] = row | measured_with
+            kinds = held.setdefault(shown, {})
+            found = _learning(env, args, kinds.get(SEEDS), measured_with) if what == "learning" else _policies(env, args)
+            for name, row in found:
+                kinds[name] = row | measured_with
+                if name == "learning":
+                    del kinds[SEEDS]
                 files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
-                print(f"{shown}  {name}  {_seeds(row) if what == 'learning' else _success(row)}", file=sys.stderr)
+                print(f"{shown}  {name}  {_said(name, row)}", file=sys.stderr)
             gc.collect()
     cells = list(rows(held))
     table = console.Table("results", _COLUMNS, left=("measured with",))
@@ -110,20 +116,36 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
     return held
 
 
-def _learning(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """All seeds of an environment, by the settings that ``train.py --env`` has."""
-    from mjx_nero.learn.runs import cfg as run_cfg  # with Brax and MJX, which help does without
+def _learning(env: str, args: argparse.Namespace, before: Row | None, here: Row) -> Iterator[tuple[str, Row]]:
+    """All seeds of an environment, by the settings that ``train.py --env`` has: the seeds so far after each, then their summary.
+
+    Args:
+        before: the seeds that an interrupted command kept. They count if the same was measured ``here``: version and machine.
+    """
+    from mjx_nero.runs import cfg as run_cfg  # with Brax and MJX, which help does without
     from mjx_nero.tools.benchmark import learning
 
     run, _ = run_cfg.fit_machine(run_cfg.resolve(env, args.preset, None, {}, {}))
     run = dataclasses.replace(run, eval_every=run.num_timesteps // EVALUATIONS)
-    *_, total = learning.measure_learning(run, args.seeds, run.env.budget.success)
-    yield "learning", total
+    asked = {
+        "preset": args.preset,
+        "num_envs": run.num_envs,
+        "num_timesteps": run.num_timesteps,
+        "target": run.env.budget.success,
+    }
+    same = before is not None and {**before, "rows": None} == {**asked, **here, "rows": None}
+    rows: list[Row] = []
+    for row in learning.measure_learning(run, args.seeds, run.env.budget.success, before["rows"] if before and same else ()):
+        if row["seed"] == "all":
+            yield "learning", row
+        else:
+            rows.append(row)
+            yield SEEDS, {**asked, "rows": rows}
 
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     """The preset's bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
-    from mjx_nero.learn.play import evaluation
+    from mjx_nero.runs import evaluation, signals
     from mjx_nero.sim.physics import warp_available
 
     path = bundled.shipped(env, args.preset)
@@ -132,7 +154,8 @@ def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
     backends = {"native": "mujoco"} | ({"warp": "mjx"} if warp_available() else {})
     for name, backend in backends.items():
         cfg = evaluation.EvalCfg(env, args.preset, agent="policy", episodes=args.episodes, backend=backend)
-        result = evaluation.play(cfg).result
+        with signals.ended():
+            result = evaluation.play(cfg).result
         yield name, {n: result[n] for n in ("success_rate", "success_rate_95", "episodes", "nan_count", "overflow_count")}
 
 
@@ -140,6 +163,8 @@ def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
     """Returns the table's cells, one row for each environment."""
     for env, kinds in held.items():
         learnt, native, warp = (kinds.get(name) for name in ("learning", "native", "warp"))
+        if not (learnt or native or warp):
+            continue  # its first seeds are not complete
         of = dict.fromkeys(f"{row['version']}, {row['machine']}" for row in (learnt, native, warp) if row)
         spread = [""] * 4
         if learnt:
@@ -173,6 +198,14 @@ def _table(lines: Sequence[tuple[str, ...]]) -> str:
     shown = [i for i in range(len(_COLUMNS)) if any(line[i] for line in lines)]
     rows = [_COLUMNS, ("---",) * len(_COLUMNS), *lines]
     return "".join(f"| {' | '.join(row[i] for i in shown)} |\n" for row in rows)
+
+
+def _said(name: str, row: Row) -> str:
+    """A line's end: what was measured."""
+    if name == SEEDS:
+        last = row["rows"][-1]
+        return f"{last['seed']}: success {last['success_rate']:.3f} after {last['env_steps'] / 1e6:.1f} M steps"
+    return _seeds(row) if name == "learning" else _success(row)
 
 
 def _seeds(row: Row) -> str:

@@ -15,10 +15,10 @@ from mjx_nero.config.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson
-from mjx_nero.learn.runs import compiled, signals, starts, training
-from mjx_nero.learn.runs import folder as run_folder
-from mjx_nero.learn.runs.cfg import RunCfg, fit_machine
-from mjx_nero.learn.runs.loop import Diverged, Tally
+from mjx_nero.runs import compiled, signals, starts, training
+from mjx_nero.runs import folder as run_folder
+from mjx_nero.runs.cfg import RunCfg, fit_machine
+from mjx_nero.runs.loop import Diverged, Tally
 
 SEEDS = "seeds.json"
 Row = dict[str, Any]
@@ -42,8 +42,6 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
     seed.
 
     A seed that diverges becomes a row without success, and the next seed follows. A signal ends them all.
-
-    A seed that diverges is a row without success, and the next one follows; a signal ends them all.
 
     Returns:
         the rows of all seeds in the folder, the folder, and an exit status.

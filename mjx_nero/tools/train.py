@@ -4,10 +4,10 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero.envs import registry
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
-from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 

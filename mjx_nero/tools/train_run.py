@@ -7,14 +7,13 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from mjx_nero import console
 from mjx_nero.envs.env import MAX_SPEED
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
-from mjx_nero.learn.runs import resume, track, training
-from mjx_nero.learn.runs.cfg import RunCfg
-from mjx_nero.learn.runs.checkpoints import saved
-from mjx_nero.learn.runs.folder import CONFIG
+from mjx_nero.runs import console, resume, track, training
+from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.checkpoints import saved
+from mjx_nero.runs.folder import CONFIG
 from mjx_nero.sim import render
 from mjx_nero.tools import cli, seeds
 

@@ -14,10 +14,10 @@ from mjx_nero.control.follow_target import IkFollower, RmpFollower
 from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.pick_place import PHASES, PickPlace, PickPlaceCfg, PickPlaceMemory
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.math import axis_angle, rotate
 from mjx_nero.sim import scene
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.types import View
 
 DT = 0.02

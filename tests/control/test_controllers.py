@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from mjx_nero.learn.play import evaluation
+from mjx_nero.runs import evaluation
 
 HOME = np.array([0.5, 0.0, 0.54])  # of the Cobotta's flange
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mjx_nero.control import ik
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.tools.benchmark import inverse_kinematics
 
 N = 500  # every test of the batched solver has this batch: it is compiled once a robot

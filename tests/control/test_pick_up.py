@@ -11,10 +11,10 @@ import views
 from mjx_nero import UserError, control
 from mjx_nero.control import gripper, pick_up
 from mjx_nero.control.pick_up import PickUp, PickUpCfg
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.arms.so_arm100 import SO_ARM100
 from mjx_nero.sim import grasp
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
+from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
 from mjx_nero.types import ObjectView, View
 
 CFG = PickUpCfg(object="target", heading=(0, 2, 0), turns=(4, 2, 0), lowest=0.03)

@@ -13,11 +13,11 @@ import yaml
 from mjx_nero.control import rmp, rmpflow_config
 from mjx_nero.control.rmp import Rmp
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
-from mjx_nero.envs import registry
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import ASSETS
+from mjx_nero.tasks import registry
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.types import UserError
 
 DT = 1 / 60

@@ -12,8 +12,8 @@ from mjx_nero import math
 from mjx_nero.control.ik import InverseKinematics
 from mjx_nero.control.turn_over import ABOVE, TurnOver, TurnOverCfg
 from mjx_nero.control.turns import Table, Turns
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.mdp import sides
+from mjx_nero.tasks.arms.nero import NERO
 
 LEAN, N = float(np.pi / 4), len(NERO.arm.joints)
 

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn.play import pictures
+from mjx_nero.imitation.recording import pictures
+from mjx_nero.tasks import registry
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ import numpy as np
 
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.deploy.emulators.timeless import Clock
-from mjx_nero.envs import registry
 from mjx_nero.interop import description
+from mjx_nero.tasks import registry
 
 __all__ = ["Bench", "Clock", "Ideal", "metadata"]
 

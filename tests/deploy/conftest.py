@@ -4,7 +4,7 @@ import episodes
 import pytest
 
 from mjx_nero.deploy.loop import Brain
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 
 
 @pytest.fixture(scope="session")

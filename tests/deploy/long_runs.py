@@ -18,7 +18,7 @@ from test_safety import ROBOTS, fuzz, fuzz_feedback
 
 from mjx_nero.deploy import children
 from mjx_nero.deploy.emulators.plant import Faults
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 from mjx_nero.tools.deploy import trial
 
 ARMS = {"so101_lift": "so101", "piper_lift": "piper", "nero_lift": "nero"}

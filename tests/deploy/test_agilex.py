@@ -15,9 +15,9 @@ from mjx_nero.deploy.emulators import agilex as emulated
 from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.guard import Guard, WallClock
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.sim import scene
+from mjx_nero.tasks import registry
 
 
 @pytest.fixture(scope="module", params=["piper", "nero"])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mjx_nero.deploy import body as bodies
-from mjx_nero.envs import registry
 from mjx_nero.interop import description
 from mjx_nero.sim import kinematics, linkage, scene
+from mjx_nero.tasks import registry
 
 ROBOTS = registry.list_robots()
 

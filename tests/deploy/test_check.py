@@ -11,8 +11,8 @@ from mjx_nero.deploy import check, identified, setup
 from mjx_nero.deploy.emulators.plant import Faults, Plant
 from mjx_nero.deploy.guard import Guard
 from mjx_nero.envs import identified as in_training
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
+from mjx_nero.tasks import registry
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from mjx_nero.deploy.drivers import bcap, cobotta, rg6
 from mjx_nero.deploy.emulators import bcap as emulated
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.guard import Guard, WallClock, urgent
-from mjx_nero.envs import registry
-from mjx_nero.envs.arms import cobotta_pro_900
 from mjx_nero.errors import UserError
 from mjx_nero.sim import scene
+from mjx_nero.tasks import registry
+from mjx_nero.tasks.arms import cobotta_pro_900
 
 
 def test_a_packet_is_the_makers():

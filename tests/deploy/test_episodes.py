@@ -1,8 +1,8 @@
 """Whole episodes through runtime, driver and emulated servos, and what is found in a log of them."""
 
 from mjx_nero.deploy.emulators.plant import Faults
-from mjx_nero.envs import registry
 from mjx_nero.identify import log as logs
+from mjx_nero.tasks import registry
 from mjx_nero.tools.deploy import trial
 
 

@@ -7,9 +7,9 @@ import pytest
 
 import mjx_nero
 from mjx_nero.deploy.executor import PARTS, Executor, Joints
-from mjx_nero.envs import registry
 from mjx_nero.mdp import actions
 from mjx_nero.mdp.terms import Term
+from mjx_nero.tasks import registry
 
 STEPS = 60
 

@@ -7,9 +7,9 @@ from mjx_nero.deploy import setup
 from mjx_nero.deploy.guard import Guard
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Fault
-from mjx_nero.envs import registry
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.excitation import RATE, sweeps
+from mjx_nero.tasks import registry
 from mjx_nero.tools.identification import arm as recording
 
 

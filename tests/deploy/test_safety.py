@@ -12,8 +12,8 @@ from mjx_nero.deploy.arm import Feedback
 from mjx_nero.deploy.fence import FenceCfg
 from mjx_nero.deploy.guard import Guard
 from mjx_nero.deploy.safety import Fault, Limits, Safety, SafetyCfg
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
+from mjx_nero.tasks import registry
 
 ROBOTS = registry.list_robots()
 

@@ -22,7 +22,8 @@ import jax
 import numpy as np
 
 import mjx_nero
-from mjx_nero.envs import registry, wrappers
+from mjx_nero.envs import wrappers
+from mjx_nero.tasks import registry
 
 STEPS, NUM_ENVS = 100, 4
 EPISODE_S = 1.5  # [s] shorter than 100 control steps: episodes end and start anew

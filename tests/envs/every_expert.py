@@ -2,7 +2,7 @@
 
 import pytest
 
-from mjx_nero.learn.play import evaluation
+from mjx_nero.runs import evaluation
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 
 from mjx_nero import list_envs
 from mjx_nero.learn import policy
-from mjx_nero.learn.play import evaluation
+from mjx_nero.runs import evaluation
 
 NAMES = [name for name in list_envs() if policy.shipped(name).exists()]
 REAL = [name for name in NAMES if policy.shipped(name, "sim2real") != policy.shipped(name)]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, env_cfg, make
-from mjx_nero.envs.tasks import clutter
-from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import metrics, rewards
 from mjx_nero.mdp.terms import MetricTerm, RewardTerm
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import contacts, scene
 from mjx_nero.sim.scene import ObjectCfg
+from mjx_nero.tasks import clutter
 
 NAMES = ("box", "bar", "cylinder", "sphere", "capsule", "pill")
 CFG = env_cfg("nero_clutter")

@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from mjx_nero import UserError, control, env_cfg, make
 from mjx_nero.control.gripper import ParallelGripper
-from mjx_nero.envs import fitted, regions, registry
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.arms.so_arm100 import SO_ARM100
-from mjx_nero.envs.tasks import building
-from mjx_nero.learn.play import evaluation
+from mjx_nero.envs import regions
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import contacts, grasp, robot_file, scene
 from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.tasks import building, fitted, registry
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
+from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
 from mjx_nero.urdf import import_urdf
 
 OWN = {"nero": "nero", "piper": "piper", "cobotta_pro_900": "cobotta", "so_arm100": "so100", "so_arm101": "so101"}

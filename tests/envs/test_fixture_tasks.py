@@ -9,9 +9,8 @@ from mjx_nero import control, env_cfg, make
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import for_controllers
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import resume, starts
-from mjx_nero.learn.runs.cfg import Asked
+from mjx_nero.runs import evaluation, resume, starts
+from mjx_nero.runs.cfg import Asked
 
 TASKS = ("open_drawer", "open_door", "turn_knob")
 

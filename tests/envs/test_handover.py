@@ -10,12 +10,12 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.hand_over import HandOver
-from mjx_nero.envs import registry
-from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import handover, observations, success
 from mjx_nero.mdp.terms import MetricTerm, ObservationTerm
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import kinematics, scene, team
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.inspection import report
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, control, env_cfg, make
-from mjx_nero.envs import registry, wrappers
-from mjx_nero.envs.tasks import lift_any
-from mjx_nero.envs.tasks.lift_any import HELD_OUT, SEEN, THING
-from mjx_nero.learn.play import evaluation
+from mjx_nero.envs import wrappers
 from mjx_nero.learn.ppo import learner as ppo
-from mjx_nero.learn.runs import cfg as run_cfg
 from mjx_nero.mdp import observations, rewards
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import grasp, objects, scene
 from mjx_nero.sim.objects import bank, body, events, grasps, rests, shapes
 from mjx_nero.sim.physics.mjx import JaxPhysics
+from mjx_nero.tasks import lift_any, registry
+from mjx_nero.tasks.lift_any import HELD_OUT, SEEN, THING
 from mjx_nero.types import SHAPE, ObjectView, ShapeView, Start
 
 WORLDS = 64

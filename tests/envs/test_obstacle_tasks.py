@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, env_cfg, make
-from mjx_nero.envs import regions, registry
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.tasks import reach_obstacles
-from mjx_nero.learn.play import evaluation
+from mjx_nero.envs import regions
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import scene, touch
 from mjx_nero.sim.scene import ObjectCfg, ObstacleCfg, SceneCfg, SimCfg
+from mjx_nero.tasks import reach_obstacles, registry
+from mjx_nero.tasks.arms.nero import NERO
 
 N = 8
 

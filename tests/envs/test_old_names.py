@@ -3,7 +3,7 @@
 import pytest
 
 from mjx_nero import UserError, config, env_cfg
-from mjx_nero.learn.runs import resume
+from mjx_nero.runs import resume
 
 
 def groups(cfg, field):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, env_cfg, make
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import contacts, scene
 from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.tasks.arms.nero import NERO
 
 
 @pytest.fixture(scope="module")

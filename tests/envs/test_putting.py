@@ -12,13 +12,12 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, list_presets, make
 from mjx_nero.envs import wrappers
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import starts
+from mjx_nero.runs import evaluation, starts
 from mjx_nero.sim import fixtures, objects, scene
 from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks.arms.nero import NERO
 
 ROBOTS = ("nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101")
 PEGS = {"default": ("box", 0.024), "tight": ("box", 0.0255), "round": ("can", 0.024), "round_tight": ("can", 0.0255)}

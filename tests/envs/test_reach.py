@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, env_cfg, list_envs, make
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.tasks import reach
 from mjx_nero.math import quat_mul
 from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.tasks import reach
+from mjx_nero.tasks.arms.nero import NERO
 
 REACHES = [name for name in list_envs() if name.endswith("_reach")]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, env_cfg, list_envs, make
-from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import sides
+from mjx_nero.runs import evaluation
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ import pytest
 
 from mjx_nero import UserError, env_cfg, make
 from mjx_nero.control.pick_place import PickPlaceCfg
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.tasks import place, stack
-from mjx_nero.learn.play import evaluation
 from mjx_nero.mdp import towers
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import contacts, scene
 from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.tasks import place, stack
+from mjx_nero.tasks.arms.nero import NERO
 
 ROBOTS = ("nero", "cobotta_pro_900", "piper", "so_arm100", "so_arm101")
 

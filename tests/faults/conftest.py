@@ -6,7 +6,7 @@ from faults_run import FLAGS, STEPS, last
 from kinematic import Kinematic
 
 from mjx_nero import ManipulationEnv
-from mjx_nero.learn.runs import compiled, logs
+from mjx_nero.runs import compiled, logs
 
 
 @pytest.fixture

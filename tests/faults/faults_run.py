@@ -5,7 +5,7 @@ import json
 
 from safetensors.numpy import load
 
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import compiled
 
 FLAGS = ["--num-envs", 8, "--ppo.unroll_length", 4, "--ppo.num_minibatches", 2, "--ppo.num_epochs", 1]
 FLAGS += ["--ppo.network.actor", "(8,)", "--ppo.network.critic", "(8,)", "--env.episode_length_s", 0.2, "--no-video"]

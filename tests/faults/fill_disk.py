@@ -15,7 +15,7 @@ import time
 from kill_many import arrays, chunk, command, flags, newest, surroundings
 
 from mjx_nero.learn import checkpoint
-from mjx_nero.learn.runs import checkpoints
+from mjx_nero.runs import checkpoints
 
 LONGEST = 60.0  # seconds from the full disk to the end of the run
 

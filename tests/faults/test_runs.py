@@ -12,8 +12,8 @@ from faults_run import CHUNK, STEPS, last, rows
 
 from mjx_nero import files
 from mjx_nero.learn import checkpoint
-from mjx_nero.learn.runs import compiled, loop
-from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.runs import compiled, loop
+from mjx_nero.runs import folder as run_folder
 
 # --- nothing goes wrong
 

@@ -8,8 +8,8 @@ import signal
 import pytest
 from faults_run import STEPS, last, rows
 
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import loop, track
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import loop, track
 from mjx_nero.tools import seeds
 
 

@@ -14,11 +14,11 @@ import fuzz
 import numpy as np
 import server
 
-from mjx_nero.envs import registry
 from mjx_nero.learn import checkpoint, policy
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import checkpoints, logs, resume, training, trust
-from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import checkpoints, logs, resume, training, trust
+from mjx_nero.runs import folder as run_folder
+from mjx_nero.tasks import registry
 from mjx_nero.tools import seeds, train_run
 from mjx_nero.tools.view import agents
 from mjx_nero.tools.view import opening as view_opening

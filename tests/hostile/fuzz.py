@@ -35,12 +35,13 @@ from hypothesis import strategies as st  # noqa: E402
 
 from mjx_nero import UserError, config, files  # noqa: E402
 from mjx_nero.control import rmpflow_config  # noqa: E402
-from mjx_nero.envs import identified, registry  # noqa: E402
+from mjx_nero.envs import identified  # noqa: E402
 from mjx_nero.identify import log as arm_log  # noqa: E402
 from mjx_nero.learn import checkpoint, header  # noqa: E402
-from mjx_nero.learn.runs import cfg as run_cfg  # noqa: E402
-from mjx_nero.learn.runs import logs, resume, training  # noqa: E402
+from mjx_nero.runs import cfg as run_cfg  # noqa: E402
+from mjx_nero.runs import logs, resume, training  # noqa: E402
 from mjx_nero.sim import model_file, robot_file  # noqa: E402
+from mjx_nero.tasks import registry  # noqa: E402
 from mjx_nero.tools import (  # noqa: E402
     public_robots,
     results,

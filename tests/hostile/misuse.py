@@ -185,7 +185,7 @@ def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bo
         training: the first wait begins when its first update is made.
     """
     from mjx_nero import UserError
-    from mjx_nero.learn.runs import resume
+    from mjx_nero.runs import resume
 
     env = {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     with open(folder / "said", "w") as said:

@@ -11,10 +11,11 @@ import pytest
 from kinematic import Kinematic
 
 from mjx_nero import ManipulationEnv, UserError
-from mjx_nero.envs import registry, wrappers
+from mjx_nero.envs import wrappers
 from mjx_nero.imitation.distill import teachers
 from mjx_nero.imitation.distill.cfg import DistillCfg, StudentCfg
 from mjx_nero.learn import learner, policy
+from mjx_nero.tasks import registry
 from mjx_nero.types import Picture
 
 EDGE = 16

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero.learn.play.batches import Batches
+from mjx_nero.imitation.recording.batches import Batches
 
 
 def test_callers_that_wait_are_served_together():

@@ -11,7 +11,7 @@ from mjx_nero import UserError
 from mjx_nero.config.registry import Registry
 from mjx_nero.learn import checkpoint, learner
 from mjx_nero.learn.learner import Kind
-from mjx_nero.learn.runs import resume
+from mjx_nero.runs import resume
 
 META = {
     "env": "nero_lift",

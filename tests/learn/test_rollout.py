@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.learn.play import evaluation, figures, rollout
+from mjx_nero.learn.play import figures, rollout
 from mjx_nero.learn.play.recorder import Record
 from mjx_nero.mdp import metrics as terms
 from mjx_nero.mdp.terms import MetricTerm
+from mjx_nero.runs import evaluation
 from mjx_nero.sim import physics
 from mjx_nero.types import Scenery
 

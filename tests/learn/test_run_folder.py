@@ -8,9 +8,9 @@ import pytest
 
 from mjx_nero import config, files
 from mjx_nero.errors import UserError
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import checkpoints, logs, resume, training, trust
-from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import checkpoints, logs, resume, training, trust
+from mjx_nero.runs import folder as run_folder
 from mjx_nero.tools import seeds
 from mjx_nero.tools.view import agents
 

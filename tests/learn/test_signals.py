@@ -5,7 +5,7 @@ import sys
 
 PROGRAM = """
 import ctypes, os, signal, time
-from mjx_nero.learn.runs import signals
+from mjx_nero.runs import signals
 
 def within():
     for _ in range({times}):

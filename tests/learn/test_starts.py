@@ -14,8 +14,8 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg
 from mjx_nero.learn import checkpoint
 from mjx_nero.learn.learner import ROWS
-from mjx_nero.learn.runs import starts
 from mjx_nero.mdp import curriculum, events
+from mjx_nero.runs import starts
 from mjx_nero.types import PHASE, Bank, Shown, Start
 
 N, PHASES = 16, wrappers.PHASES

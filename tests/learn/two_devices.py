@@ -14,7 +14,7 @@ from mjx_nero import ManipulationEnv, UserError, make
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import checkpoint
 from mjx_nero.learn.ppo.learner import Learner, PpoCfg
-from mjx_nero.learn.runs import compiled, resume, training
+from mjx_nero.runs import compiled, resume, training
 
 
 def scripted(learner):

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero.envs import registry
 from mjx_nero.mdp import images, looks
 from mjx_nero.mdp.randomization import Model
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim import scene
 from mjx_nero.sim.cameras.look import Look
+from mjx_nero.tasks import registry
 from mjx_nero.types import Picture, UserError, View
 
 MODEL = Model(

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import mjx_nero
-from mjx_nero.envs import registry
 from mjx_nero.mdp import images
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm
 from mjx_nero.sim import cameras, scene
 from mjx_nero.sim.cameras import opengl, places
 from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
+from mjx_nero.tasks import registry
 from mjx_nero.types import Scenery, UserError
 
 # Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 8 degrees from a metre above the table.

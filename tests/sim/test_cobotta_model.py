@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.sim.scene import robot_model
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
 
 # Joints of the URDF: parent link, child link, origin (m), yaw (rad; roll and pitch are zero throughout), axis, limits.
 # The last one is fixed.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.envs import registry
 from mjx_nero.sim.physics import dynamics, kernels, newton
 from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.types import Sim
 
 wp = pytest.importorskip("warp")

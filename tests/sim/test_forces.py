@@ -9,12 +9,12 @@ import pytest
 import slides
 
 from mjx_nero import UserError
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import forces, scene
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.types import Sim
 
 # A plate of half a kilogram on a lift. Its flange is turned by a quarter about x, so that its y points up.

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.envs.arms.cobotta_pro_900 import COBOTTA_PRO_900
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import kinematics, linkage
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.scene import robot_model
+from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
+from mjx_nero.tasks.arms.nero import NERO
 
 # Turned and shifted bodies; a slide and a hinge with an anchor off the body's origin in one body, two more hinges in another.
 CHAIN = """

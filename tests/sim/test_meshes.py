@@ -12,10 +12,10 @@ import pytest
 import trimesh
 
 from mjx_nero import UserError
-from mjx_nero.envs import registry
 from mjx_nero.sim import objects, scene
 from mjx_nero.sim.objects import making, rests, solid, store
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+from mjx_nero.tasks import registry
 
 EDGES = (0.04, 0.06, 0.1)
 NAMES = objects.names()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.envs import registry
 from mjx_nero.learn import policy
+from mjx_nero.tasks import registry
 
 wp = pytest.importorskip("warp")
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_nero.envs import registry
 from mjx_nero.sim import scene
 from mjx_nero.sim.parts import Part, Parts
+from mjx_nero.tasks import registry
 from mjx_nero.types import Start
 
 

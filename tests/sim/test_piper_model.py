@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjx_nero.envs.arms.piper import PIPER
 from mjx_nero.sim.scene import SceneCfg, SimCfg, build
+from mjx_nero.tasks.arms.piper import PIPER
 
 # Joint limits of the URDF: rad for the arm, m for the fingers.
 RANGES = {

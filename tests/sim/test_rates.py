@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mjx_nero import ManipulationEnv
-from mjx_nero.envs import registry
 from mjx_nero.mdp import images
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.cameras import opengl, raytracer
+from mjx_nero.tasks import registry
 
 STEPS, EVERY = 7, 3
 

@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from mjx_nero import UserError, make
-from mjx_nero.envs.arms.nero import NERO
-from mjx_nero.envs.arms.so_arm100 import SO_ARM100
 from mjx_nero.sim import robot_file
 from mjx_nero.sim.robot import GripperCfg
+from mjx_nero.tasks.arms.nero import NERO
+from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
 
 
 @pytest.fixture

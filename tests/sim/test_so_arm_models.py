@@ -10,11 +10,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from mjx_nero import env_cfg
-from mjx_nero.envs.arms.so_arm100 import SO_ARM100
-from mjx_nero.envs.arms.so_arm101 import SO_ARM101
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import ASSETS, RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
+from mjx_nero.tasks.arms.so_arm101 import SO_ARM101
 
 
 @dataclasses.dataclass(frozen=True)

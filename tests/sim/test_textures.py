@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_nero.envs import registry
 from mjx_nero.mdp import looks
 from mjx_nero.mdp.randomization import Model
 from mjx_nero.mdp.terms import Term
@@ -16,6 +15,7 @@ from mjx_nero.sim import cameras, scene
 from mjx_nero.sim.cameras import textures
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import Look
+from mjx_nero.tasks import registry
 from mjx_nero.types import Scenery, UserError
 
 # Straight down on the table's middle, all of which and a little more it sees: 1.2 m of y over 64 pixels, x upwards.

@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import scene, touch
 from mjx_nero.sim.obstacles import FIELDS, Obstacles
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.sim.scene import ObstacleCfg, SceneCfg, SimCfg
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.types import ObstacleView, Sim
 
 # Three links of 0.2 m in the plane of x and z; folded twice by 2.6 rad the third lies beside the first.

@@ -1,6 +1,8 @@
 """The benchmark as a user calls it: rows, files, mistakes, and what is left when it is interrupted or memory ends."""
 
 import json
+import os
+import signal
 import types
 
 import imageio.v3 as imageio
@@ -9,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import pytest
 
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import compiled
 from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
 from mjx_nero.tools.benchmark import command, drawing, learning, plot, throughput
 from mjx_nero.tools.benchmark.program import Program, spread, warp_mb
@@ -205,6 +207,42 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     assert (summary["seed"], summary["seeds"], summary["reached"], summary["target"]) == ("all", 3, 2, 0.95)
     assert (summary["env_steps_median"], summary["env_steps_worst"]) == (40, None)  # of 20, 40 and never
     assert summary["seconds_worst"] is None
+
+
+def test_learning_goes_on_with_the_seeds_that_are_missing(call, tmp_path, monkeypatch):
+    """A kill in seed 1 keeps seed 0; the same command trains the others, another command all."""
+    runs, begun = Runs([[0.0, 1.0]] * 3), []
+    monkeypatch.setattr(compiled, "make_learner", lambda run: runs)
+    monkeypatch.setattr(
+        compiled, "starter", lambda runs, bank: lambda seed: begun.append(seed) or runs.init(jax.random.PRNGKey(seed))
+    )
+    monkeypatch.setattr(compiled, "compile", Runs.compiled)
+    argv = [
+        "--what",
+        "learning",
+        "--num-envs",
+        8,
+        "--impl",
+        "native",
+        "--num-timesteps",
+        70,
+        "--eval-every",
+        29,
+        "--json",
+        "r.json",
+    ]
+    whole, evaluate = Runs.evaluate, lambda self, state: os.kill(os.getpid(), signal.SIGTERM) or {"success_rate": 0.0}
+    monkeypatch.setattr(Runs, "evaluate", lambda self, state: (evaluate if int(state["seed"]) == 1 else whole)(self, state))
+    code, _, err = call("benchmark", *argv, "--seeds", 3)
+    assert code == 128 + signal.SIGTERM and "stopped after 1 rows, which are kept" in err and "Traceback" not in err
+    assert [row["seed"] for row in json.loads((tmp_path / "r.json").read_text())["rows"]] == [0]
+    monkeypatch.setattr(Runs, "evaluate", whole)
+    begun.clear()
+    code, out, _ = call("benchmark", *argv, "--seeds", 3)
+    assert code == 0 and begun[1:] == [1, 2] and "3 of 3" in out  # the first state is the one to compile with
+    assert [row["seed"] for row in json.loads((tmp_path / "r.json").read_text())["rows"]] == [0, 1, 2, "all"]
+    begun.clear()
+    assert call("benchmark", *argv, "--seeds", 2)[0] == 0 and begun[1:] == [0, 1]
 
 
 def test_summary_of_seeds():

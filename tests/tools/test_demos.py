@@ -11,7 +11,7 @@ import pytest
 
 from mjx_nero.data import episode as names
 from mjx_nero.data import open_dataset, units
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, demos
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg

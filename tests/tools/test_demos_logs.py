@@ -5,7 +5,7 @@ import pytest
 
 from mjx_nero.data import episode as names
 from mjx_nero.data import open_dataset
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 from mjx_nero.tools.demos import logs
 
 JOINTS = registry.robot("so_arm101").joints

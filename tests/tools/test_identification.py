@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from mjx_nero import UserError, __main__
-from mjx_nero.envs import identified, registry
+from mjx_nero.envs import identified
 from mjx_nero.identify import Drives, Log, Plant, RecordCfg, identify, record
 from mjx_nero.identify import fit as fitting
 from mjx_nero.identify import log as logs
@@ -15,6 +15,7 @@ from mjx_nero.identify.excitation import RATE, sweeps
 from mjx_nero.identify.plant import POSITIVE, in_force
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools.identification.report import save, save_plot
 
 SHAPE = '<geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="0.8"/>'

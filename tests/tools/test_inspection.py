@@ -10,11 +10,11 @@ import pytest
 from rich.console import Console
 
 import mjx_nero
-from mjx_nero.envs import registry
 from mjx_nero.sim import contacts, robot_file
 from mjx_nero.sim.cameras import opengl
 from mjx_nero.sim.robot import ASSETS, GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import list_envs, motion
 from mjx_nero.tools.inspection import cameras, report
 from mjx_nero.types import UserError

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mjx_nero.learn import checkpoint, policy
-from mjx_nero.learn.play import evaluation, rollout
-from mjx_nero.learn.runs import logs, training
+from mjx_nero.learn.play import rollout
+from mjx_nero.runs import evaluation, logs, training
 from mjx_nero.sim import render
 from mjx_nero.sim.physics import host
 from mjx_nero.sim.physics.native import NativePhysics

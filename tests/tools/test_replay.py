@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.identify import RecordCfg, log, record
 from mjx_nero.identify.plant import Plant
 from mjx_nero.sim import scene
+from mjx_nero.tasks import registry
 from mjx_nero.tools import replay
 
 ROBOT = registry.robot("so_arm101")

@@ -5,8 +5,9 @@ import pathlib
 
 import pytest
 
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 from mjx_nero.tools import results
+from mjx_nero.tools.benchmark import learning
 
 LEARNT = {"target": 0.95, "seeds": 8, "reached": 7, "seconds_median": 10.04, "seconds_worst": None}
 LEARNT |= {"env_steps_median": 2_400_000, "env_steps_worst": None, "version": "9.9", "machine": "a GPU"}
@@ -69,6 +70,31 @@ def test_command(call, tmp_path):
     held = json.loads((tmp_path / "r.json").read_text())["so101_reach"]
     assert held["learning"] == LEARNT and held["native"]["episodes"] == 4 and held["native"]["version"] != "9.9"
     assert "7 of 8" in (tmp_path / "r.md").read_text() and "so101_reach" in out
+
+
+def test_seeds_are_kept_one_by_one(call, tmp_path, monkeypatch):
+    """A command that ends in seed 2 leaves two; the next one gets them, unless other settings are asked for."""
+    given = []
+
+    def measure(run, seeds, target, kept=()):
+        given.append([row["seed"] for row in kept])
+        for seed in range(seeds):
+            if seed == 2 and len(given) == 1:
+                raise KeyboardInterrupt
+            yield {"seed": seed, "success_rate": 1.0, "env_steps": 10}
+        yield {"seed": "all", **LEARNT}
+
+    monkeypatch.setattr(learning, "measure_learning", measure)
+    argv = ("results", "--json", "r.json", "--what", "learning", "--envs", "nero_reach", "--seeds")
+    code, _, err = call("mjx_nero", *argv, 3)
+    held = json.loads((tmp_path / "r.json").read_text())["nero_reach"]
+    assert code == 130 and "Traceback" not in err and [row["seed"] for row in held["seeds"]["rows"]] == [0, 1]
+    code, out, _ = call("mjx_nero", *argv, 3)
+    assert code == 0 and given == [[], [0, 1]] and "7 of 8" in out
+    assert json.loads((tmp_path / "r.json").read_text())["nero_reach"].keys() == {"learning"}
+    held["seeds"]["num_envs"] += 1
+    (tmp_path / "r.json").write_text(json.dumps({"nero_reach": held}))
+    assert call("mjx_nero", *argv, 3)[0] == 0 and given[-1] == []
 
 
 @pytest.mark.parametrize(

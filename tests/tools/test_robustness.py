@@ -7,7 +7,7 @@ import jax
 import pytest
 
 from mjx_nero import UserError, __main__
-from mjx_nero.envs.registry import env_cfg
+from mjx_nero.tasks.registry import env_cfg
 from mjx_nero.tools.robustness import command, measure, seen
 from mjx_nero.tools.robustness.sweeps import ALL, Point, sweeps
 

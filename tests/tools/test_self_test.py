@@ -25,7 +25,7 @@ def imported(tmp_path_factory) -> tuple[Path, str]:
     path = make.write(folder / "in", make.robot(make.base(), *make.six(), *make.fingers(folder, "link6")))
     with pytest.MonkeyPatch.context() as patch:
         said: list[str] = []
-        patch.setattr("mjx_nero.console.line", lambda screen, text, style="": said.append(text))
+        patch.setattr("mjx_nero.runs.console.line", lambda screen, text, style="": said.append(text))
         __main__.main(["import-urdf", str(path), "--out", str(folder / "out")])
     return folder / "out", "\n".join(said)
 

@@ -21,7 +21,7 @@ from mujoco import rollout
 import mjx_nero
 from mjx_nero.envs import wrappers
 from mjx_nero.learn.ppo import learner as ppo
-from mjx_nero.learn.runs import cfg as run_cfg
+from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.sim.physics import fusion
 from mjx_nero.tools.benchmark import throughput
 

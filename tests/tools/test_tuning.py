@@ -11,9 +11,9 @@ import pytest
 import yaml
 from rich.console import Console
 
-from mjx_nero.envs import registry
 from mjx_nero.sim.robot import GripperCfg
 from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import tuning
 from mjx_nero.tools.tuning import Load, propose
 from mjx_nero.types import UserError

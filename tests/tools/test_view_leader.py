@@ -15,10 +15,10 @@ from mjx_nero.deploy.emulators import feetech as emulated
 from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.emulators.timeless import Clock
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.interop import description
 from mjx_nero.sim import scene
+from mjx_nero.tasks import registry
 from mjx_nero.tools.view import agents, leader
 from mjx_nero.tools.view.hand import NAME as HAND
 from mjx_nero.tools.view.hand import Hand

@@ -9,10 +9,10 @@ import time
 
 import numpy as np
 
-from mjx_nero.envs import registry
 from mjx_nero.identify.fit import identify
 from mjx_nero.identify.plant import POSITIVE, Plant
 from mjx_nero.identify.simulate import RecordCfg, record
+from mjx_nero.tasks import registry
 
 
 def compare(robot: str, seed: int, cfg: RecordCfg, dt: float = 0.005, finer: int = 1) -> dict:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError
-from mjx_nero.envs.arms.nero import NERO
 from mjx_nero.sim import fixtures, scene
 from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks.arms.nero import NERO
 from mjx_nero.urdf.fixture import import_fixture
 
 # A chest of 40 cm with a lid, hinged at its far edge; the handle is a link at the near one.

@@ -15,8 +15,8 @@ from scipy import optimize
 from test_nero_model import EXTENTS, MASSES
 
 import mjx_nero
-from mjx_nero.envs import registry
 from mjx_nero.sim import grasp, robot_file, scene
+from mjx_nero.tasks import registry
 from mjx_nero.tools.import_urdf import main
 from mjx_nero.types import UserError
 from mjx_nero.urdf import drawing, drives, files, geometry, import_urdf, inertia, meshes, primitives, read

@@ -11,8 +11,8 @@ import pytest
 import urdf_files as make
 from urdf_files import ROOM, base, fingers, six
 
-from mjx_nero.envs import registry
 from mjx_nero.sim import contacts, robot_file, scene
+from mjx_nero.tasks import registry
 from mjx_nero.tools import tuning
 from mjx_nero.tools.import_urdf import main
 from mjx_nero.types import UserError

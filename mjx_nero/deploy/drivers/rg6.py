@@ -15,7 +15,7 @@ DEVICE, FORCE, WIDTH, GRIP = 65, 0, 267, 1
 BUSY, TRIPPED = 1, 8 | 32
 WIDEST = 0.16  # [m]
 _NEWTONS = 40.0  # of 120
-_CRANK, _CLOSED, _OFFSET = 0.08, 0.6331, 0.000488  # the model's linkage: envs/arms/cobotta_pro_900.py
+_CRANK, _CLOSED, _OFFSET = 0.08, 0.6331, 0.000488  # the model's linkage: tasks/arms/cobotta_pro_900.py
 _CHANGE = 0.002  # [m] of the target that is worth a new motion
 _PERIOD = 0.02  # [s] between questions
 

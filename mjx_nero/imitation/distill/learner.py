@@ -61,7 +61,7 @@ class Learner:
     """A student on a batch of environments.
 
     Args:
-        env: batch of environments from ``wrappers.for_training``, with the observation groups of ``envs.tasks.seeing``.
+        env: batch of environments from ``wrappers.for_training``, with the observation groups of ``tasks.seeing``.
         cfg: with ``num_envs`` filled in.
         num_devices: must be one.
 

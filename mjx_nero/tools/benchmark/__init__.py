@@ -3,3 +3,5 @@
 ``throughput`` has steps, resets, training and controllers of many environments; ``learning`` the time to success of several
 seeds; ``inverse_kinematics`` poses; ``drawing`` frames. ``command`` takes the flags, keeps the rows and shows them.
 """
+
+SIZES = (1024, 4096, 16384)  # numbers of environments, if none are given

@@ -9,14 +9,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_nero import config, console, files
-from mjx_nero.envs import registry
+from mjx_nero import config, files
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner as learners
-from mjx_nero.learn.runs import cfg as run_cfg
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import console
 from mjx_nero.sim.physics import impls
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
-from mjx_nero.tools.benchmark import machine, plot
+from mjx_nero.tools.benchmark import SIZES, machine, plot
 from mjx_nero.tools.benchmark.machine import Row
 
 WHATS = {
@@ -59,18 +60,20 @@ def main(argv: Sequence[str]) -> None:
     _check_files(args.json, args.plot, whats)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
-    todo = jobs.jobs(args, cfg, dotted.get(args.learner, {}), whats, argv)
     head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
     here = machine.machine()
     report = {"machine": here, "versions": machine.versions(), "command": command(argv), "complete": False}
     title = f"{', '.join(head.values())} on {machine.name(here)}"
+    kept = _kept(args.json, report)
+    todo = jobs.jobs(args, cfg, dotted.get(args.learner, {}), whats, argv, kept)
     rows: list[Row] = []
     try:
         for row in jobs.measured(todo):
             spread = {"num_devices": args.num_devices} if row["what"] in _ON_DEVICES else {}
             rows.append({**head, **row, **spread})
             print(_line(row), file=sys.stderr)
-            _save(args.json, {**report, "rows": rows})  # each time: even a killed process leaves what it has measured
+            left = [row for row in kept if row not in rows]
+            _save(args.json, {**report, "rows": [*rows, *left]})  # each time: a killed process leaves what it has measured
         _save(args.json, {**report, "complete": True, "rows": rows})
     except BaseException:
         print(f"stopped after {len(rows)} rows{', which are kept' if rows else ''}", file=sys.stderr)
@@ -80,6 +83,19 @@ def main(argv: Sequence[str]) -> None:
         if args.plot and rows:
             with files.whole(args.plot) as part:
                 plot.plot(rows, title, part)
+
+
+def _kept(path: pathlib.Path | None, report: Row) -> list[Row]:
+    """The seeds that the same command measured here before it was interrupted."""
+    if path is None or not path.exists():
+        return []
+    try:
+        before = files.read_json(path)
+        if {**before, "rows": None} != {**report, "rows": None}:
+            return []
+        return [row for row in before["rows"] if row["what"] == "learning" and isinstance(row["seed"], int)]
+    except (UserError, KeyError, TypeError):
+        return []
 
 
 def command(argv: Sequence[str]) -> str:
@@ -97,7 +113,7 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--num-envs",
         type=_sizes,
-        help="list of numbers (default: 1024,4096,16384; learning: the number that train.py would take)",
+        help=f"list of numbers (default: {','.join(map(str, SIZES))}; learning: the number that train.py would take)",
     )
     parser.add_argument("--learner", help="learner for ppo and learning (default: the task's own)")
     parser.add_argument(
@@ -116,7 +132,11 @@ def _parser() -> cli.Parser:
     parser.add_argument("--target", type=cli.share, default=0.95, help="success rate that ends learning (default: %(default)s)")
     parser.add_argument("--num-timesteps", type=cli.positive, help="greatest number of env steps per seed (default: train.py's)")
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
-    parser.add_argument("--json", type=cli.path(".json"), help="write the rows, the machine and all versions as JSON")
+    parser.add_argument(
+        "--json",
+        type=cli.path(".json"),
+        help="write the rows, the machine and all versions as JSON; the same command goes on with the seeds that are missing",
+    )
     parser.add_argument("--plot", type=cli.path(".png"), help="picture (PNG) of rates and memory over the number of environments")
     return parser
 

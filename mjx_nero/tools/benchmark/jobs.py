@@ -10,15 +10,12 @@ from mjx_nero import config
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.play import evaluation
-from mjx_nero.learn.runs import cfg as run_cfg
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import cfg as run_cfg
+from mjx_nero.runs import compiled, evaluation
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools import cli
-from mjx_nero.tools.benchmark import drawing, inverse_kinematics, learning, start, throughput
+from mjx_nero.tools.benchmark import SIZES, drawing, inverse_kinematics, learning, start, throughput
 from mjx_nero.tools.benchmark.program import Row
-
-SIZES = (1024, 4096, 16384)  # numbers of environments, if none are given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,9 +33,18 @@ class Job:
 
 
 def jobs(
-    args: argparse.Namespace, cfg: EnvCfg, hyperparameters: Mapping[str, str], whats: list[str], argv: Sequence[str]
+    args: argparse.Namespace,
+    cfg: EnvCfg,
+    hyperparameters: Mapping[str, str],
+    whats: list[str],
+    argv: Sequence[str],
+    kept: Sequence[Row] = (),
 ) -> list[Job]:
-    """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here."""
+    """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here.
+
+    Args:
+        kept: rows of seeds that an interrupted command left.
+    """
     make_run = functools.partial(run_of, args, hyperparameters)
     found = []
     for impl in dict.fromkeys(resolve_impl(impl) for impl in cli.choices(args.impl, "impl", impls())):
@@ -46,7 +52,8 @@ def jobs(
             if what == "learning":
                 for n in args.num_envs or [0]:
                     run = make_run(cfg, impl, n)
-                    rows = functools.partial(learning.measure_learning, run, args.seeds, args.target)
+                    own = [row for row in kept if (row["impl"], row["num_envs"]) == (impl, run.num_envs)]
+                    rows = functools.partial(learning.measure_learning, run, args.seeds, args.target, own)
                     compiled.make_learner(run)
                     found.append(Job(what, impl, run.num_envs, rows))
             elif what == "start":

@@ -3,68 +3,86 @@
 import math
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import jax
 
-from mjx_nero.learn.runs import compiled, starts, training
-from mjx_nero.learn.runs.cfg import RunCfg
+from mjx_nero.learn.learner import Learner
+from mjx_nero.runs import compiled, signals, starts, training
+from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tools.benchmark.program import Row
 
 _EVALUATIONS = 24  # a whole run, where nothing else is asked for
 
 
-def measure_learning(run: RunCfg, seeds: int, target: float) -> Iterator[Row]:
+def measure_learning(run: RunCfg, seeds: int, target: float, kept: Sequence[Row] = ()) -> Iterator[Row]:
     """A row a seed, then one about all.
 
     Each seed trains until an evaluation's success reaches ``target``, or its env steps are used up. Seconds are wall time of
     training, evaluations and whatever a training begins with (an expert's states), without compilation. All seeds are judged by
-    the same episodes.
+    the same episodes. A signal ends the seed at its next update, and outside of compiled code, which no exception may cross.
 
     Args:
         run: of ``run_cfg.fit_machine``; ``eval_every`` 0 evaluates 24 times a whole run.
+        kept: rows of an earlier, interrupted measurement of the same; their seeds are not trained again.
+
+    Raises:
+        signals.Signalled: a signal came.
     """
+    rows = [row for row in kept if row["seed"] in range(seeds)]
+    yield from rows
+    missing = sorted({*range(seeds)} - {row["seed"] for row in rows})
     learner = compiled.make_learner(run)
     head = {"what": "learning", "impl": learner.env.unwrapped.impl, "num_envs": run.num_envs, "target": target}
-    between = run.eval_every or run.num_timesteps // _EVALUATIONS
-    chunk = max(1, between // learner.steps_per_iteration)
+    if missing:
+        between = run.eval_every or run.num_timesteps // _EVALUATIONS
+        chunk = max(1, between // learner.steps_per_iteration)
+        for row in _measured(run, learner, chunk, missing, target):
+            rows.append({**head, **row})
+            yield rows[-1]
+    yield {**head, **summary(rows)}
+
+
+def _measured(run: RunCfg, learner: Learner, chunk: int, seeds: Sequence[int], target: float) -> Iterator[Row]:
+    """Compiles the run once and trains these seeds."""
     begun = time.perf_counter()
     fresh = compiled.starter(learner, starts.maker(learner, training.speaker()))
     made = compiled.compile(run, learner, chunk, lambda: fresh(0))
-    calls = math.ceil(run.num_timesteps / made.steps)
-    state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call
-    made.evaluate(state)
-    compile_s = time.perf_counter() - begun
+    with signals.after_this(training.speaker()) as stop:
+        state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call
+        made.evaluate(state)
+        compile_s, calls = time.perf_counter() - begun, math.ceil(run.num_timesteps / made.steps)
+        for seed in seeds:
+            signals.check(stop)
+            yield {"seed": seed, **_trained(made, fresh, calls, seed, target, stop), "compile_s": round(compile_s, 1)}
 
-    rows = []
-    for seed in range(seeds):
-        begun = time.perf_counter()
-        state = jax.block_until_ready(fresh(seed))
-        evaluating, nans, overflows, success, done = 0.0, 0.0, 0.0, 0.0, 0
-        while done < calls and success < target:
-            state, metrics = jax.block_until_ready(made.advance(state))
-            done += 1
-            lost = {name: float(metrics.get(f"sum/{name}", 0.0)) * chunk for name in ("nan", "overflow")}
-            nans, overflows = nans + lost["nan"], overflows + lost["overflow"]
-            evaluated = time.perf_counter()
-            success = made.evaluate(state)["success_rate"]
-            evaluating += time.perf_counter() - evaluated
-        rows.append(
-            {
-                **head,
-                "seed": seed,
-                "reached": success >= target,
-                "seconds": round(time.perf_counter() - begun, 2),
-                "evaluation_s": round(evaluating, 2),
-                "env_steps": done * made.steps,
-                "success_rate": round(success, 5),
-                "compile_s": round(compile_s, 1),
-                "nan_count": round(nans),
-                "overflow_count": round(overflows),
-            }
-        )
-        yield rows[-1]
-    yield {**head, **summary(rows)}
+
+def _trained(
+    made: compiled.Compiled, fresh: Callable[[int], Any], calls: int, seed: int, target: float, stop: signals.Stop
+) -> Row:
+    """Trains one seed until it succeeds or has made ``calls`` updates."""
+    begun = time.perf_counter()
+    state = jax.block_until_ready(fresh(seed))
+    evaluating, nans, overflows, success, done = 0.0, 0.0, 0.0, 0.0, 0
+    while done < calls and success < target:
+        state, metrics = jax.block_until_ready(made.advance(state))
+        done += 1
+        lost = {name: float(metrics.get(f"sum/{name}", 0.0)) * made.chunk for name in ("nan", "overflow")}
+        nans, overflows = nans + lost["nan"], overflows + lost["overflow"]
+        evaluated = time.perf_counter()
+        success = made.evaluate(state)["success_rate"]
+        evaluating += time.perf_counter() - evaluated
+        signals.check(stop)
+    return {
+        "reached": success >= target,
+        "seconds": round(time.perf_counter() - begun, 2),
+        "evaluation_s": round(evaluating, 2),
+        "env_steps": done * made.steps,
+        "success_rate": round(success, 5),
+        "nan_count": round(nans),
+        "overflow_count": round(overflows),
+    }
 
 
 def summary(rows: list[Row]) -> Row:

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 import mjx_nero
-from mjx_nero.learn.runs import folder as run_folder
+from mjx_nero.learn import machines
 
 Row = dict[str, Any]  # one measurement, as JSON has it
 
@@ -42,7 +42,7 @@ def name(machine: Row) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide a result, and the commit of a checkout."""
-    found = run_folder.versions()
+    found = machines.versions()
     del found["device"]
     for package in ("jaxlib", "numpy"):
         found[package] = metadata.version(package)

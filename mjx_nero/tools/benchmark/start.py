@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from mjx_nero.errors import UserError
-from mjx_nero.learn.runs import compiled
-from mjx_nero.learn.runs.cfg import RunCfg
-from mjx_nero.learn.runs.spans import Span, Spans
+from mjx_nero.runs import compiled
+from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
 
 _CHILD = "from mjx_nero.tools.benchmark import command; command.begin()"

@@ -11,7 +11,7 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
-from mjx_nero.learn.runs import compiled
+from mjx_nero.runs import compiled
 from mjx_nero.tools.benchmark.program import Program, Row, device_peak_mb, spread, warp_mb
 
 

@@ -6,9 +6,9 @@ import pathlib
 import time
 from collections.abc import Sequence
 
-from mjx_nero import console
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos.cfg import DemosCfg
 

@@ -6,10 +6,11 @@ import pathlib
 import imageio.v3 as imageio
 import numpy as np
 
-from mjx_nero import console, files
+from mjx_nero import files
 from mjx_nero.data import Dataset, open_dataset, stats
 from mjx_nero.data import episode as names
 from mjx_nero.errors import UserError
+from mjx_nero.runs import console
 
 BINS, SHEET = 16, 24  # of a histogram; episodes on a sheet
 _BARS = " ▁▂▃▄▅▆▇█"

@@ -13,10 +13,10 @@ from mjx_nero import files
 from mjx_nero.config.values import short
 from mjx_nero.data import Episode, Schema, writer
 from mjx_nero.data import episode as names
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.identify.log import number
+from mjx_nero.tasks import registry
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg
 

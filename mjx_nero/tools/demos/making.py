@@ -14,18 +14,21 @@ import mjx_nero
 from mjx_nero import config, files
 from mjx_nero.data import Feature, Schema, units
 from mjx_nero.data import episode as names
-from mjx_nero.envs import registry, things
+from mjx_nero.envs import things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import teachers
+from mjx_nero.imitation.recording import demonstrations
+from mjx_nero.imitation.recording.demonstrations import Player
+from mjx_nero.imitation.recording.pictures import Cameras
 from mjx_nero.learn import bundled, policy
-from mjx_nero.learn.play import demonstrations, evaluation, rollout
-from mjx_nero.learn.play.cfg import EXPERT
-from mjx_nero.learn.play.demonstrations import Player
-from mjx_nero.learn.play.pictures import Cameras
+from mjx_nero.learn.play import rollout
+from mjx_nero.runs import evaluation
+from mjx_nero.runs.evaluation_cfg import EXPERT
 from mjx_nero.sim import team
 from mjx_nero.sim.fingerprint import fingerprint
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos.cfg import DemosCfg
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 
-from mjx_nero import console
 from mjx_nero.data import Dataset, Episode, open_dataset, units
 from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
-from mjx_nero.learn.play.demonstrations import start
+from mjx_nero.imitation.recording.demonstrations import start
+from mjx_nero.runs import console
 from mjx_nero.sim import render
 from mjx_nero.tools.demos import making
 from mjx_nero.types import Scenery

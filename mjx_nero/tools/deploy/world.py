@@ -88,7 +88,7 @@ def _is_point(text: str) -> bool:
 
 @functools.cache
 def _cfg(name: str, preset: str, robot: str | None) -> Any:
-    from mjx_nero.envs import registry
+    from mjx_nero.tasks import registry
 
     return registry.env_cfg(name, preset, robot)
 

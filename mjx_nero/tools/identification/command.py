@@ -4,15 +4,16 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import config, console, files
+from mjx_nero import config, files
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.fit import identify
 from mjx_nero.identify.plant import Plant
 from mjx_nero.identify.simulate import RecordCfg, record
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import FAULT, arms
 from mjx_nero.tools.identification.report import save, save_plot, table

@@ -8,10 +8,10 @@ import numpy as np
 import yaml
 
 from mjx_nero import files
-from mjx_nero.console import Table
 from mjx_nero.identify.fit import Fit
 from mjx_nero.identify.log import Log
 from mjx_nero.identify.plant import POSITIVE, Drives
+from mjx_nero.runs.console import Table
 
 _HEAD = """\
 # Drives of {robot}, identified from {log}: values with 95% intervals. For make(identified=FILE) and --env.identified FILE.

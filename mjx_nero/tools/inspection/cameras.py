@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_nero import console
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp.images import Lens
+from mjx_nero.runs import console
 from mjx_nero.sim.cameras import places
 
 WORLDS = 32

@@ -12,7 +12,6 @@ import numpy as np
 from mjx_nero import config
 from mjx_nero.config import docs
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp.terms import Term
@@ -20,6 +19,7 @@ from mjx_nero.sim import grasp, linkage, render, scene, team
 from mjx_nero.sim.contacts import Pair, constraint_rows, contact_pairs, sized
 from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.types import UserError
 
 

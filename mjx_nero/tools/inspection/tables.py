@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.console import Table
+from mjx_nero.runs.console import Table
 from mjx_nero.tools.inspection.report import Report, Task
 from mjx_nero.tools.motion import Move
 

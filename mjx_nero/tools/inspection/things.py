@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mjx_nero import console
+from mjx_nero.runs import console
 from mjx_nero.sim import objects, render
 from mjx_nero.sim.objects import rests
 from mjx_nero.sim.scene import ObjectCfg

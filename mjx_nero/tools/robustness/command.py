@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 import mjx_nero
-from mjx_nero import config, console, files
-from mjx_nero.envs import registry
+from mjx_nero import config, files
 from mjx_nero.errors import UserError
+from mjx_nero.runs import console
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.robustness import sweeps
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.envs.tasks import seeing
 from mjx_nero.mdp import images, looks
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.terms import Term
+from mjx_nero.tasks import seeing
 
 LATE = "pictures late [control steps]"
 LATEST = 5  # control steps

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.envs.tasks import sim2real
 from mjx_nero.mdp.terms import Term
+from mjx_nero.tasks import sim2real
 from mjx_nero.tools.robustness import seen
 
 ALL = "all at once"

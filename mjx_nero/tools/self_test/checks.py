@@ -15,7 +15,6 @@ from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Range
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.pick_place import PHASES, PickPlace, PickPlaceMemory
-from mjx_nero.envs import registry
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.mdp import rewards
@@ -23,6 +22,7 @@ from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import scene, touch
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import motion
 from mjx_nero.tools.self_test.play import play
 from mjx_nero.tools.self_test.result import Result

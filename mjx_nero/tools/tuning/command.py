@@ -4,9 +4,10 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import console, files
-from mjx_nero.envs import registry
+from mjx_nero import files
+from mjx_nero.runs import console
 from mjx_nero.sim.scene import SimCfg
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.tuning.proposal import tune
 from mjx_nero.tools.tuning.report import save_gains, save_plot, table

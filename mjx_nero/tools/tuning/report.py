@@ -6,8 +6,8 @@ import pathlib
 import yaml
 
 from mjx_nero import files
-from mjx_nero.console import Table
 from mjx_nero.identify.response import SECONDS
+from mjx_nero.runs.console import Table
 from mjx_nero.tools.tuning.proposal import Tuning, gains
 
 

@@ -12,7 +12,7 @@ from mjx_nero import control, files
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import rollout
-from mjx_nero.learn.runs.checkpoints import POLICY, saved
+from mjx_nero.runs.checkpoints import POLICY, saved
 from mjx_nero.tools.view import hand
 
 SLIDERS = "joint sliders"

@@ -3,8 +3,8 @@
 import pathlib
 from collections.abc import Sequence
 
-from mjx_nero.envs import registry
 from mjx_nero.errors import UserError
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
 

@@ -19,13 +19,13 @@ from mjx_nero import math
 from mjx_nero.data.units import LEROBOT
 from mjx_nero.deploy.arm import ArmError, Feedback
 from mjx_nero.deploy.guard import WallClock
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.interop import description
 from mjx_nero.learn.play import rollout
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import kinematics, scene
+from mjx_nero.tasks import registry
 from mjx_nero.tools.view.hand import NAME as HAND
 from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.log import LOG

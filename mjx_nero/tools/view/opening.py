@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from mjx_nero import config, files
 from mjx_nero.config import values
 from mjx_nero.data import open_dataset
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn import policy
-from mjx_nero.learn.runs.folder import CONFIG
+from mjx_nero.runs.folder import CONFIG
 from mjx_nero.sim import team
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.view import agents
 from mjx_nero.types import UserError

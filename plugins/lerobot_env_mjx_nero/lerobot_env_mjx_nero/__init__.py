@@ -7,7 +7,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from mjx_nero.envs import registry
+from mjx_nero.tasks import registry
 
 GYM_ID = "lerobot_env_mjx_nero/mjx_nero-v0"
 

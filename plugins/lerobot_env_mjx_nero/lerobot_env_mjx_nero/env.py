@@ -9,11 +9,11 @@ import gymnasium
 import jax
 import numpy as np
 
-from mjx_nero.envs import registry
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn.play.demonstrations import environment_state, joint_state, told
-from mjx_nero.learn.play.pictures import Cameras
+from mjx_nero.imitation.recording.demonstrations import environment_state, joint_state, told
+from mjx_nero.imitation.recording.pictures import Cameras
 from mjx_nero.sim.render import Renderer
+from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos import making
 

@@ -1,0 +1,1 @@
+"""Records the episodes of whoever can do the task, with pictures, as data sets of demonstrations."""

@@ -1,0 +1,69 @@
+"""Insert peg: take a peg that stands on the table, and put it into the hole of a block. For any robot with a gripper.
+
+The policy knows the block's pose to a millimetre and half a degree, and feels the rest by its wrist and its fingers. The peg is
+square, or round with a rounded end.
+"""
+
+import functools
+import math
+
+from mjx_nero.envs.task import EnvCfg, Presets
+from mjx_nero.sim import grasp
+from mjx_nero.sim import scene as scenes
+from mjx_nero.sim.fixtures import FixtureCfg
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import ObjectCfg, SceneCfg
+from mjx_nero.tasks import putting
+from mjx_nero.tasks.putting import Putting
+
+HOLE, DEEP = 0.026, 0.025  # [m] width and depth of the hole (assets/fixtures/make.py)
+LONG = 0.065  # [m] length of the peg
+LOOSE, TIGHT = 0.002, 0.0005  # [m] the hole is so much wider than the peg
+OFF, TURN = 0.001, 0.01  # [m, rad] the block stands so far from where it is said to stand
+DENSITY = 1000.0  # [kg/m3]
+OVER = 0.01  # [m] the script carries the peg so high over the block
+ABOVE = 0.025  # [m] a hand that lags comes from so high above the peg, which it would knock over
+PRESS = 0.002  # [m] on the rim
+AWAY = 0.08  # [m] the hand rises so far once it has let go
+
+
+def peg(width: float, square: bool) -> ObjectCfg:
+    """A peg that stands, of plastic."""
+    shape, size = ("box", (width, width, LONG)) if square else ("can", (width / 2, LONG))
+    area = (1.0 if square else math.pi / 4) * width**2
+    return ObjectCfg(shape=shape, size=tuple(round(x, 6) for x in size), mass=float(f"{DENSITY * area * LONG:.3g}"))
+
+
+def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) -> EnvCfg:
+    """Success: the peg stands on the ground of the hole, at rest, and the pads touch nothing."""
+    width = round(HOLE - clearance, 6)
+    robot, file = putting.hand(robot, width), "socket_square" if square else "socket_round"
+    scene = SceneCfg(
+        objects={"peg": peg(width, square)}, fixtures={"socket": FixtureCfg(file)}, sensors=("wrist", "fingers"), goal="none"
+    )
+    task = Putting(
+        robot,
+        scenes.around(robot, scene),
+        ("socket/hole", "peg"),
+        edge=LONG,
+        aside=0.003,
+        rise=LONG / 2,
+        top=DEEP + 0.005,
+        off=OFF,
+        turn=TURN if square else 0.0,
+        fold=4 if square else 0,
+    )
+    grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), LONG + ABOVE, object="peg", turns=(task.fold,))
+    put = {**grip, "foot": LONG / 2, "over": DEEP + OVER, "top": DEEP, "turns": task.fold, "reach": 0.002}
+    put |= {"press": PRESS, "away": AWAY}
+    return task.cfg({"put_in": put})
+
+
+def presets() -> Presets:
+    """Maps preset -> robot -> config, the default first."""
+    return {
+        "default": inserting,
+        "tight": functools.partial(inserting, clearance=TIGHT),
+        "round": functools.partial(inserting, square=False),
+        "round_tight": functools.partial(inserting, clearance=TIGHT, square=False),
+    }

@@ -1,0 +1,196 @@
+"""Lift: pick a cube off the table and hold it at a commanded point.
+
+A preset is one list, long or not, and reads as one.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_nero.config.bounds import Range
+from mjx_nero.envs import regions
+from mjx_nero.envs.task import (
+    SHOWN,
+    CurriculumCfg,
+    EnvCfg,
+    Presets,
+    arm_state,
+    joint_actions,
+    nearer,
+    step_weights,
+    velocity_actions,
+)
+from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, groups
+from mjx_nero.sim import grasp
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import SceneCfg
+from mjx_nero.tasks import seeing
+from mjx_nero.tasks import sim2real as sim2reals
+
+CLOSING = 0.3  # [s] least closing time of the script's fingers
+
+
+@dataclasses.dataclass(frozen=True)
+class LiftSetup:
+    """Numbers that differ from robot to robot: the cube, where it lies, and where it must go [m].
+
+    Attributes:
+        cube: ``x`` and ``y`` of the cube at the start, in the world frame.
+        goal: ``x``, ``y`` and ``z`` of the commanded point, in the robot's root frame.
+        grasp_radius: greatest distance of a held object from the grasp point.
+    """
+
+    scene: SceneCfg
+    cube: tuple[Range, Range]
+    goal: tuple[Range, Range, Range]
+    grasp_radius: float = 0.04
+
+    @property
+    def lifted(self) -> dict[str, float]:
+        """Height of the object's centre above which it is off the table [m]: 1 cm above a resting cube."""
+        return {"minimal_height": self.scene.objects["cube"].rest_height + 0.01}
+
+    @property
+    def held(self) -> dict[str, float]:
+        """Height and greatest distance from the grasp point of a held object [m]."""
+        return {**self.lifted, "grasp_radius": self.grasp_radius}
+
+    def controllers(self, robot: RobotCfg) -> dict[str, dict[str, Any]]:
+        """Settings of the script that picks the cube up."""
+        edge = self.scene.objects["cube"].size[0]
+        fields = {
+            "lowest": grasp.lowest(robot.pad),
+            "beyond": grasp.beyond(robot, edge),
+            "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+        }
+        return {"pick_up": {**fields, **regions.ik(robot, "ik.")}}
+
+
+def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
+    """The Isaac Lab recipe's MDP, with the recipe's own numbers.
+
+    Kept for comparison. Its lifting reward has a loophole: a cube knocked into the air scores like a held one. The recipe
+    switches observation corruption on but gives no term a noise range, so none applies.
+    """
+    return EnvCfg(
+        robot=robot,
+        episode_length_s=5.0,
+        actions=joint_actions(scale=0.5),
+        scene=setup.scene,
+        metrics=metrics.grasping(**setup.held),
+        command=CommandTerm(
+            commands.uniform_position,
+            params=dict(zip("xyz", setup.goal, strict=True)),
+            resample_s=5.0,
+        ),
+        observations={
+            "state": ObservationGroup(
+                {
+                    "joint_pos": ObservationTerm(observations.joint_pos_rel),
+                    "joint_vel": ObservationTerm(observations.joint_vel_rel),
+                    "object_position": ObservationTerm(observations.object_position),
+                    "target_object_position": ObservationTerm(observations.command),
+                    "actions": ObservationTerm(observations.last_action),
+                }
+            ),
+        },
+        events={
+            "reset_object_position": Term(
+                events.object_position_uniform,
+                params={"x": setup.cube[0], "y": setup.cube[1], "z": (0.0, 0.0)},
+            ),
+        },
+        rewards={
+            "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.05}),
+            "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=setup.lifted),
+            "object_goal_tracking": RewardTerm(rewards.object_goal_distance, weight=16.0, params={"std": 0.3, **setup.lifted}),
+            "object_goal_tracking_fine_grained": RewardTerm(
+                rewards.object_goal_distance, weight=5.0, params={"std": 0.05, **setup.lifted}
+            ),
+            "action_rate": RewardTerm(rewards.action_rate_l2, weight=-1e-4),
+            "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+        },
+        curriculum=CurriculumCfg(weights=step_weights(10_000, action_rate=-1e-1, joint_vel=-1e-1)),
+        terminations={
+            "time_out": DoneTerm(terminations.time_out, time_out=True),
+            "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
+            # The simulated table has no edge to fall from, so leaving the drawn table counts as a fall.
+            "object_off_table": DoneTerm(
+                terminations.object_off_table,
+                params={"center": setup.scene.table_center, "size": setup.scene.table_size},
+            ),
+        },
+    )
+
+
+def default(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
+    """The preset that learns to grasp. Rewards need a held cube (``carrying``), and relative positions are observed."""
+    recipe, held = isaac(robot, setup), setup.held
+    state = {
+        **arm_state(),
+        "ee_to_object": ObservationTerm(observations.ee_to_object, noise=0.002),
+        "object_to_goal": ObservationTerm(observations.object_to_goal, noise=0.002),
+        "target_object_position": ObservationTerm(observations.command),
+        "actions": ObservationTerm(observations.last_action),
+    }
+    seen = {
+        "object_velocity": ObservationTerm(observations.object_velocity),
+        "object_orientation": ObservationTerm(observations.object_orientation),
+    }
+    return dataclasses.replace(
+        recipe,
+        actions=velocity_actions(hysteresis=0.5),
+        observations=groups(state, seen),
+        rewards=carrying(held),
+        curriculum=CurriculumCfg(),
+        controllers=setup.controllers(robot),
+        training=SHOWN,
+    )
+
+
+def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
+    """Lists rewards for reaching, holding and carrying an object to the goal; height and tracking count only while it is held.
+
+    Args:
+        held: parameters of ``rewards.held``.
+        object: the parameter ``object``, if it is not the cube.
+    """
+    return {
+        "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1, **object}),
+        "holding_object": RewardTerm(rewards.object_is_held, weight=5.0, params=held),
+        **nearer("goal_tracking", rewards.held_goal_distance, **held),
+        "at_goal": RewardTerm(rewards.held_at_goal, weight=10.0, params={"threshold": 0.02, **held}),
+        "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
+        "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
+    }
+
+
+def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
+    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
+    return sim2reals.randomized(default(robot, setup))
+
+
+def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:
+    """The default by pictures: nobody tells where the cube is. See ``seeing``."""
+    return seeing.seen(default(robot, setup), sees)
+
+
+def sim2real_rgb(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
+    """``sim2real`` by pictures of a random look: see ``seeing.lifelike``."""
+    return seeing.lifelike(sim2real(robot, setup))
+
+
+SEEN = {name: functools.partial(seen, sees=name) for name in seeing.PRESETS}
+
+
+def presets(setup: LiftSetup) -> Presets:
+    """Maps preset -> robot -> config, the default first."""
+    return {
+        "default": functools.partial(default, setup=setup),
+        "isaac": functools.partial(isaac, setup=setup),
+        "sim2real": functools.partial(sim2real, setup=setup),
+        **{name: functools.partial(factory, setup=setup) for name, factory in SEEN.items()},
+        "sim2real_rgb": functools.partial(sim2real_rgb, setup=setup),
+    }
