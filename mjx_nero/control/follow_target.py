@@ -90,7 +90,7 @@ class IkArm:
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg):
-        self._ik, self.dt = InverseKinematics(robot, cfg=cfg), dt
+        self._ik, self.dt = InverseKinematics(robot, cfg=cfg, point=robot.grip), dt
         self._max_step = np.array(robot.arm.speed, np.float32) * dt
         self._lead = np.array(robot.arm.lead, np.float32)
 

@@ -76,6 +76,8 @@ class InverseKinematics:
         robot: its arm is what moves.
         frame: site or body to place; the grasp point unless given.
         cfg: tolerances and budget.
+        point: of the frame, in its own axes [m]: this is what has to be where the pose puts it. It tells only where the
+            orientation cannot be met: a hand that leans then still has an object between its fingers.
 
     Attributes:
         chain: poses and Jacobians of ``frame`` as a function of the arm joints.
@@ -84,8 +86,15 @@ class InverseKinematics:
         KeyError: the robot has no such frame.
     """
 
-    def __init__(self, robot: RobotCfg, frame: str | None = None, cfg: IkCfg = IkCfg()):
+    def __init__(
+        self,
+        robot: RobotCfg,
+        frame: str | None = None,
+        cfg: IkCfg = IkCfg(),
+        point: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ):
         model = scene.robot_model(robot)
+        self._point = np.array(point, np.float32) if any(point) else None
         self.cfg = cfg
         self.chain = Chain(model, robot.arm.joints, [frame or robot.ee_site])
         self._hinge = np.array([model.joint(j).type[0] == mujoco.mjtJoint.mjJNT_HINGE for j in robot.arm.joints])
@@ -108,15 +117,25 @@ class InverseKinematics:
         """
         return jax.tree.map(lambda x: x[0], self.solve_batch(pos[None], quat[None], q0[None], key))
 
-    def local(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"]) -> Solution:
-        """One pose from ``q0`` alone: for control loops, whose targets are near and where a jump to another solution harms."""
-        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], jax.random.PRNGKey(0), 0))
+    def local(
+        self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"], weight: float | Array | None = None
+    ) -> Solution:
+        """One pose from ``q0`` alone: for control loops, whose targets are near and where a jump to another solution harms.
+
+        Args:
+            weight: of the orientation [m/rad]; None: the config's.
+        """
+        key = jax.random.PRNGKey(0)
+        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], key, 0, self._weight(weight)))
+
+    def _weight(self, weight: float | Array | None) -> float | Array:
+        return self.cfg.orientation_weight if weight is None else weight
 
     def solve_batch(self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key) -> Solution:
         """``solve`` for many poses at once. Quicker than ``vmap``: the starts go to the poses that are still unsolved."""
-        return self._solve(pos, quat, q0, key, self.cfg.restarts)
+        return self._solve(pos, quat, q0, key, self.cfg.restarts, self._weight(None))
 
-    def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int) -> Solution:
+    def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int, weight: Array) -> Solution:
         # On a GPU the default precision of products is too coarse for kinematics.
         with jax.default_matmul_precision("highest"):
             norm = jnp.linalg.norm(quat, axis=-1)
@@ -124,7 +143,7 @@ class InverseKinematics:
             pos = jnp.where(valid[:, None], pos, 0.0)
             quat = jnp.where(valid[:, None], quat / norm[:, None], jnp.array([1.0, 0.0, 0.0, 0.0]))
             q0 = self._within(jnp.where(jnp.isfinite(q0), q0, self._center))
-            return self._search(pos, quat, q0, valid, key, restarts)
+            return self._search(pos, quat, q0, valid, key, restarts, weight)
 
     def _search(
         self,
@@ -134,10 +153,11 @@ class InverseKinematics:
         valid: Bool[Array, " b"],
         key: Key,
         restarts: int,
+        weight: Array,
     ) -> Solution:
         b = len(pos)
         nothing = Solution(q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
-        found = self._descents(q0, jnp.arange(b), pos, quat, q0, ~valid, nothing)
+        found = self._descents(q0, jnp.arange(b), pos, quat, q0, ~valid, nothing, weight)
 
         def unsolved(carry):
             restart, found = carry
@@ -149,7 +169,7 @@ class InverseKinematics:
             left = jnp.argsort(solved)  # the unsolved poses come first
             target = left[jnp.arange(max(b, self.cfg.starts)) % jnp.maximum(jnp.sum(~solved), 1)]
             start = self._starts(jax.random.fold_in(key, restart), pos[target], quat[target])
-            return restart + 1, self._descents(start, target, pos, quat, q0, solved, found)
+            return restart + 1, self._descents(start, target, pos, quat, q0, solved, found, weight)
 
         if restarts:
             _, found = jax.lax.while_loop(unsolved, again, (0, found))
@@ -170,6 +190,7 @@ class InverseKinematics:
         q0: Float[Array, "b nj"],
         solved: Bool[Array, " b"],
         found: Solution,
+        weight: Array,
     ) -> Solution:
         """Runs all descents until every pose is solved or the budget is spent; keeps what is better than ``found``."""
 
@@ -179,7 +200,7 @@ class InverseKinematics:
 
         def step(carry):
             i, trial, q = carry
-            trial, following = jax.vmap(self._step)(q, pos[target], quat[target])
+            trial, following = jax.vmap(self._step, (0, 0, 0, None))(q, pos[target], quat[target], weight)
             return i + 1, trial, jnp.where(trial.success[:, None], q, following)
 
         n = len(target)
@@ -200,16 +221,19 @@ class InverseKinematics:
         return jnp.where(found.success, jnp.linalg.norm(found.q - q0, axis=1), _FAR + error)
 
     def _step(
-        self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]
+        self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"], weight: Array
     ) -> tuple[Solution, Float[Array, " nj"]]:
         """Returns the distance of ``q`` from the target, and the configuration after one step."""
         at, turn, jacobian = (x[0] for x in self.chain.jacobians(q))
+        if self._point is not None:
+            arm = math.rotate(turn, jnp.asarray(self._point))
+            at, pos = at + arm, pos + math.rotate(quat, jnp.asarray(self._point))
+            jacobian = jacobian.at[:3].add(jnp.cross(jacobian[3:], arm, axisa=0, axisc=0))
         linear, angular = _residual(at, turn, pos, quat)
         counts = jnp.array([1.0, 1.0, 0.0 if self.cfg.free_turn else 1.0])
         angular = angular * counts
         position, orientation = jnp.linalg.norm(linear), jnp.linalg.norm(angular)
         met = (position <= self.cfg.position_tolerance) & (orientation <= self.cfg.orientation_tolerance)
-        weight = self.cfg.orientation_weight
         error = jnp.concatenate(
             [linear * jnp.minimum(1.0, self.cfg.max_distance / jnp.maximum(position, 1e-6)), weight * angular]
         )
@@ -222,6 +246,8 @@ class InverseKinematics:
 
     def _distance(self, q: Float[Array, " nj"], pos: Float[Array, "3"], quat: Float[Array, "4"]) -> Float[Array, ""]:
         at, turn = (x[0] for x in self.chain.poses(q))
+        if self._point is not None:
+            at, pos = (place + math.rotate(by, jnp.asarray(self._point)) for place, by in ((at, turn), (pos, quat)))
         linear, angular = _residual(at, turn, pos, quat)
         return jnp.linalg.norm(linear) + self.cfg.orientation_weight * jnp.linalg.norm(angular)
 

@@ -24,6 +24,8 @@ UNREACHABLE = 100.0  # counts as so many radians to move
 _ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
 _LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
 _SLOW = 0.2  # [rad/s]
+# [m/rad] weight of the hand's orientation at the goal. Where the hand has to lean, 0.03 leaves it centimetres beside the goal.
+_HELD = 0.003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +43,7 @@ class PickUpCfg:
         above: the hand comes down from so high over the object, and lifts it so high before it carries it away.
         speed: of the grasp point [m/s].
         closing: how long the fingers take [s], beside the lag of their drives.
-        ik: of the arm's motion. Orientation weighs little: where a goal cannot be reached with the hand pointing down, it tilts.
+        ik: of the arm's motion. At the goal orientation weighs hardly anything: where the hand cannot point down, it tilts.
     """
 
     object: str = "cube"
@@ -100,7 +102,7 @@ class PickUp:
         if cfg.aside and len(cfg.aside) != len(cfg.turns):
             raise UserError(f"aside takes one value an object, got {cfg.aside} for {len(cfg.turns)}")
         self.dt, self.cfg = dt, cfg
-        self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
+        self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik, point=robot.grip)
         self._n = len(robot.arm.joints)
         self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
         self._opening = np.array(grasp.opening(robot), np.float32)
@@ -140,7 +142,8 @@ class PickUp:
         way = wanted - memory.pos
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
-        found = self.ik.local(pos, self.hand(memory.yaw), memory.q).q
+        upright = jnp.where(phase == CARRY, min(_HELD, self.cfg.ik.orientation_weight), self.cfg.ik.orientation_weight)
+        found = self.ik.local(pos, self.hand(memory.yaw), memory.q, upright).q
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
         fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self.gentle)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
@@ -148,7 +151,8 @@ class PickUp:
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
 
         lost = (phase >= UP) & (self.off(memory, view) > self.lost)
-        ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - wanted), far < 1e-3)
+        held, meant = (math.rotate(quat, jnp.asarray(self._grip)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
+        ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), far < 1e-3)
         memory = dataclasses.replace(
             self.again(memory, view, lost),
             phase=jnp.where(lost, ABOVE, phase + ended),

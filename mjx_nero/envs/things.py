@@ -11,12 +11,14 @@ from mjx_nero.envs import placing
 from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import randomization, success
-from mjx_nero.mdp.terms import ObservationGroup, Term
+from mjx_nero.mdp.terms import ONCE, ObservationGroup, Term
 from mjx_nero.sim import contacts
 from mjx_nero.sim.objects import body, events, rests
 from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.types import UserError
 
+LONGER = 2.0  # [s] that the script takes longer than with a cube: it looks for a grasp, and lifts slowly what it may lose
+STEP = 0.005  # [s] physics steps: with ones of 10 ms, what is held at a rim slips out
 _UPRIGHT = np.cos(np.radians(3.0))
 SCRIPTS = ("pick_up", "grasp_thing")  # of tasks that lift one object
 LIFTS, PUSHES, PLACES = "lifts", "pushes", "places"
@@ -81,7 +83,14 @@ def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
 
 def _lifted(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
     lies = Term(events.at_rest, params={"files": (item.file,), "scale": item.scale, "object": name})
-    return dataclasses.replace(cfg, events={**cfg.events, "reset_object_shape": lies}, controllers=expert(cfg.robot, name, item))
+    return dataclasses.replace(
+        cfg,
+        sim=cfg.sim.finer(STEP),
+        episode_length_s=cfg.episode_length_s + LONGER,
+        command=dataclasses.replace(cfg.command, resample_s=ONCE),
+        events={**cfg.events, "reset_object_shape": lies},
+        controllers=expert(cfg.robot, name, item),
+    )
 
 
 def _pushed(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:

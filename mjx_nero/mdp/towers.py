@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative, Positive
-from mjx_nero.mdp.rewards import held
+from mjx_nero.mdp.rewards import held, stillness
 from mjx_nero.types import UserError, View
 
 GOAL = "goal"  # the bottom of a tower that is not built on an object
@@ -250,12 +250,11 @@ def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:
 
 
 def rested(view: View, *, place: Place, max_speed: Positive, std: Positive) -> Scalar:
-    """exp(-(v / std)^2) while the tower is built (see ``built``), else 0, where v is the joints' root-mean-square speed.
+    """``rewards.stillness`` while the tower is built (see ``built``), else 0.
 
     Without it nothing tells a hand that has done its work to stay: it swings away, and sooner or later meets something.
 
     Args:
         std: speed at which most of the reward is lost [rad/s].
     """
-    speed = jnp.mean(jnp.square(view.joint_vel)) / std**2
-    return completed(view, place=place, max_speed=max_speed) * jnp.exp(-speed)
+    return completed(view, place=place, max_speed=max_speed) * stillness(view, std=std)

@@ -1,5 +1,6 @@
 """Jacobians and inverse kinematics against MuJoCo's kinematics in double precision, and against a closed form."""
 
+import functools
 import sys
 
 import jax
@@ -8,11 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_nero import math
 from mjx_nero.control import ik
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.tasks.arms.nero import NERO
+from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
 from mjx_nero.tools.benchmark import inverse_kinematics
 
 N = 500  # every test of the batched solver has this batch: it is compiled once a robot
@@ -175,6 +178,24 @@ def test_local_never_restarts(arm):
     assert 0.5 < np.mean(alone.success) < np.mean(helped.success)
     same = np.all(np.abs(alone.q - helped.q) < 1e-3, axis=1)  # but where rounding tips a descent from afar
     assert np.mean(same[alone.success]) > 0.98
+
+
+def test_a_hand_that_cannot_be_turned_so_still_has_its_point_in_place():
+    """Five joints, and poses turned by 0.4 rad from ones that they meet: by its frame alone the point is 3 mm beside."""
+    arm, point = Arm(SO_ARM100), (0.02, 0.0, 0.0)
+    q = 0.5 * arm.random(6, 32)
+    pos, quat = arm.poses(q)
+    quat = jax.vmap(math.quat_mul, (None, 0))(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(0.4)), quat)
+    place = pos + jax.vmap(math.rotate, (0, None))(quat, jnp.array(point))
+    far = []
+    for own, weight in (((0.0, 0.0, 0.0), 0.003), (point, 0.003), (point, 0.1)):
+        solver = ik.InverseKinematics(arm.robot, point=own)
+        found = jax.jit(jax.vmap(functools.partial(solver.local, weight=weight)))(pos, quat, jnp.array(q, jnp.float32))
+        at, turn = (x[:, 0] for x in jax.vmap(solver.chain.poses)(found.q))
+        there = at + jax.vmap(math.rotate, (0, None))(turn, jnp.array(point))
+        far.append(np.median(np.linalg.norm(there - place, axis=1)))
+    assert far[1] < 1e-3 < 2e-3 < far[0]
+    assert far[1] < far[2]  # the more the orientation weighs, the farther the point is off
 
 
 @pytest.mark.slow

@@ -217,7 +217,9 @@ def test_jax_says_what_it_cannot(worlds):
 
 def test_object_in_the_place_of_the_cube():
     """``--object``: its rests, its grasps, its size; tasks that have no such object say so."""
-    cfg = env_cfg("nero_lift", **{"object.file": "hammer", "object.scale": 0.8})
+    cfg, cube = env_cfg("nero_lift", **{"object.file": "hammer", "object.scale": 0.8}), env_cfg("nero_lift")
+    assert (cfg.sim.dt, cfg.sim.decimation) == (cube.sim.dt / 2, 2 * cube.sim.decimation)
+    assert cfg.episode_length_s == cube.episode_length_s + 2.0 < cfg.command.resample_s
     item = cfg.scene.objects["cube"]
     assert (item.shape, item.file, item.scale) == ("mesh", "hammer", 0.8)
     assert cfg.controllers["grasp_thing"]["files"] == ("hammer",) and list(cfg.events)[-1] == "reset_object_shape"

@@ -37,7 +37,7 @@ SLOW = """
 import os, signal, threading, time
 import jax, numpy as np
 from mjx_nero.learn import waiting
-from mjx_nero.learn.runs import signals
+from mjx_nero.runs import signals
 
 def minutes(x):
     time.sleep(60)
