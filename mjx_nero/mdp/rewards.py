@@ -146,14 +146,6 @@ def stillness(view: View, *, std: Positive) -> Float[Array, ""]:
     return jnp.exp(-jnp.mean(jnp.square(view.joint_vel)) / std**2)
 
 
-def object_left_at_pose(
-    view: View, *, threshold: Positive, angle: Positive, std: Positive, fold: Count = 1, object: str = "cube"
-) -> Float[Array, ""]:
-    """``stillness`` while the object is at its goal (``object_at_pose``), else 0: a hand that has done its work may rest."""
-    there = object_at_pose(view, threshold=threshold, angle=angle, fold=fold, object=object)
-    return there * stillness(view, std=std)
-
-
 def action_rate_l2(view: View) -> Float[Array, ""]:
     """Squared change of the action since the previous step."""
     return jnp.sum(jnp.square(view.action - view.last_action))

@@ -16,7 +16,6 @@ BOX = (1.6, 1.0, 0.8)  # edges of the box, in edges of the cube that the gripper
 EDGE = 0.05  # [m] edge of that cube for a robot without a gripper
 TURN = (-math.pi / 3, math.pi / 3)  # [rad] heading of the box at the start and at the goal
 ANGLE = math.radians(15)
-RESTING = 0.3  # [rad/s] speed of the joints at which a hand that has done its work no longer rests
 FOLD = 2  # the box looks the same after half a turn
 
 
@@ -83,7 +82,6 @@ def default(robot: RobotCfg) -> EnvCfg:
                 rewards.object_goal_pose, weight=10.0, params={"std": 0.03, "angle_std": 0.2, "fold": FOLD, **object}
             ),
             "at_goal": RewardTerm(rewards.object_at_pose, weight=10.0, params=at_goal),
-            "resting": RewardTerm(rewards.object_left_at_pose, weight=10.0, params={**at_goal, "std": RESTING}),
             "action_rate": RewardTerm(rewards.action_rate_l2, weight=-5e-3),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },

@@ -116,8 +116,6 @@ REWARDS = [
     (rewards.object_at_pose, {"threshold": 0.09, "angle": 1.6}, view(**LYING), 0.0),
     # joints of 2 and 3 rad/s
     (rewards.stillness, {"std": 6.5**0.5}, view(), math.exp(-1)),
-    (rewards.object_left_at_pose, {"threshold": 0.11, "angle": 1.6, "std": 6.5**0.5}, view(**LYING), math.exp(-1)),
-    (rewards.object_left_at_pose, {"threshold": 0.09, "angle": 1.6, "std": 6.5**0.5}, view(**LYING), 0.0),
     (rewards.action_rate_l2, {}, view(), 0.25 + 4.0 + 0.0),
     (rewards.gripper_action_l2, {}, view(), 4.0),
     (rewards.joint_vel_l2, {}, view(), 4.0 + 9.0),
