@@ -72,7 +72,7 @@ class Player:
         robot = env.cfg.robot
         self._hand = kinematics.Chain(env.physics_model, robot.joints, [robot.ee_site]) if deltas else None
         self._steps = min(SEGMENT, env.episode_length) if early else env.episode_length
-        self._begin, self._play, self._refill = (jax.jit(f) for f in (self._begin_all, self._play_all, self._refill_all))
+        self._play, self._refill = jax.jit(self._play_all), jax.jit(self._refill_all)
         one = jax.eval_shape(
             self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
         )
@@ -90,7 +90,8 @@ class Player:
         Each number has its slot, wherever one begins: a compiled program rounds not all rows of a batch alike.
         """
         key, numbers = jax.random.PRNGKey(seed), first + (np.arange(self.size) - first) % self.size
-        slots, due = self._begin(jnp.asarray(numbers), key), first
+        empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(self._begin_all, jnp.asarray(numbers), key))
+        slots, due = self._refill(empty, jnp.ones(self.size, bool), jnp.asarray(numbers), key), first
         parts: list[list] = [[] for _ in numbers]
         won, done = np.zeros(self.size, bool), dict[int, Episode]()
         while True:
