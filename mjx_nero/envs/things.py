@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.envs import placing
 from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
@@ -25,6 +26,17 @@ LIFTS, PUSHES, PLACES = "lifts", "pushes", "places"
 T = TypeVar("T", bound=Term)
 
 
+def overridden(cfg: EnvCfg, fields: Mapping[str, Any]) -> EnvCfg:
+    """Returns the task with fields by dotted name. Those of ``object`` come first, so that the others hold with that object.
+
+    Raises:
+        UserError: a name or value is wrong, or the object does not suit the task.
+    """
+    thing = {name: value for name, value in fields.items() if name.startswith("object.")}
+    others = {name: value for name, value in fields.items() if name not in thing}
+    return config.override(applied(config.override(cfg, thing)), others)
+
+
 def applied(cfg: EnvCfg) -> EnvCfg:
     """Returns the task with ``cfg.object`` in the place of its one object.
 
@@ -41,8 +53,8 @@ def applied(cfg: EnvCfg) -> EnvCfg:
     thing, was = cfg.object, cfg.scene.objects[name]
     item = ObjectCfg(shape="mesh", file=thing.file, scale=thing.scale, density=thing.density, **GRIP)
     item = dataclasses.replace(item, pos=was.pos, quat=(1.0, 0.0, 0.0, 0.0) if what == LIFTS else _stands(item, what))
-    if was == item:
-        return cfg
+    if (was.shape, was.file, was.scale, was.density) == (item.shape, item.file, item.scale, item.density):
+        return cfg  # it is there already
     scene = dataclasses.replace(cfg.scene, objects={name: item})
     changed: dict[str, Any] = {
         "scene": scene,

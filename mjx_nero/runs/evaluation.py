@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_nero import config, control
+from mjx_nero import control
 from mjx_nero.envs import things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
@@ -80,7 +80,7 @@ def play(cfg: EvalCfg) -> Played:
         UserError: a name or field is unknown, or a policy does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
-    env_cfg = things.applied(config.override(env_cfg, cfg.env_fields))
+    env_cfg = things.overridden(env_cfg, cfg.env_fields)
     name = _controller_name(cfg, env_cfg)
     env_cfg = for_controllers(env_cfg) if name else env_cfg
     env_cfg = dataclasses.replace(env_cfg, metrics={**metrics.calmness(len(env_cfg.robot.arm.joints)), **env_cfg.metrics})

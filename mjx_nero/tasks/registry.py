@@ -90,7 +90,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
     cfg = dataclasses.replace(cfg, sim=cfg.sim.finer(cfg.robot.max_step))
     if chosen.folder:  # imported: nobody has counted the contacts that its work makes
         cfg = dataclasses.replace(cfg, sim=contacts.sized(chosen, cfg.scene, cfg.sim))
-    return things.applied(config.override(cfg, overrides))
+    return things.overridden(cfg, overrides)
 
 
 def make(

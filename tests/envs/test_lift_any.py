@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, control, env_cfg, make
-from mjx_nero.envs import wrappers
+from mjx_nero.envs import things, wrappers
 from mjx_nero.learn.ppo import learner as ppo
 from mjx_nero.mdp import observations, rewards
 from mjx_nero.runs import cfg as run_cfg
@@ -220,6 +220,9 @@ def test_object_in_the_place_of_the_cube():
     cfg, cube = env_cfg("nero_lift", **{"object.file": "hammer", "object.scale": 0.8}), env_cfg("nero_lift")
     assert (cfg.sim.dt, cfg.sim.decimation) == (cube.sim.dt / 2, 2 * cube.sim.decimation)
     assert cfg.episode_length_s == cube.episode_length_s + 2.0 < cfg.command.resample_s
+    asked = env_cfg("nero_lift", **{"episode_length_s": 4.0, "object.file": "hammer", "scene.objects.cube.pos": (0.4, 0.0, 0.1)})
+    assert (asked.episode_length_s, asked.scene.objects["cube"].pos) == (4.0, (0.4, 0.0, 0.1))
+    assert things.applied(asked) == asked
     item = cfg.scene.objects["cube"]
     assert (item.shape, item.file, item.scale) == ("mesh", "hammer", 0.8)
     assert cfg.controllers["grasp_thing"]["files"] == ("hammer",) and list(cfg.events)[-1] == "reset_object_shape"

@@ -56,7 +56,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
         UserError: unknown names or fields, a policy that does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
-    env_cfg = things.applied(config.override(env_cfg, cfg.env_fields))
+    env_cfg = things.overridden(env_cfg, cfg.env_fields)
     acts = cfg.agent == "policy"
     size = min(cfg.side_by_side, cfg.episodes)
     name = next(iter(env_cfg.controllers), EXPERT) if cfg.agent == EXPERT else cfg.agent
