@@ -1,6 +1,8 @@
 """A hand on the arm: it goes where the user wants it, and what it does becomes an episode."""
 
 import dataclasses
+import threading
+import time
 
 import jax
 import numpy as np
@@ -83,6 +85,30 @@ def test_what_the_hand_does_is_saved(shown, tmp_path):
     place = list(found.schema.features[names.ENVIRONMENT].names).index("cube.x")
     np.testing.assert_array_equal(first[names.ENVIRONMENT][:, place], first[names.QPOS][:, 9])
     session.recorders.clear()
+
+
+def test_a_recording_that_ended_takes_no_further_step(shown, tmp_path):
+    """Not even of a step that the session was about to hand over when the user ended it."""
+    session, _, _ = shown
+    session.recorders.clear()
+    recording, seen = Recording(session, tmp_path / "d", "nero_lift", "default", "arrays"), []
+    session.recorders.append(seen.append)
+    session.reset()
+    session.step()
+    session.recorders.clear()
+    ended = threading.Event()
+    steps = threading.Thread(target=lambda: [recording(seen[0]) for _ in iter(ended.is_set, True)])
+    steps.start()
+    try:
+        for _ in range(200):
+            recording.begin()
+            wait(lambda: len(recording) > 0)
+            recording.discard()
+            time.sleep(1e-3)
+            assert len(recording) == 0 and not recording.on
+    finally:
+        ended.set()
+        steps.join()
 
 
 def test_a_tape_shows_what_was_recorded(shown, tmp_path):

@@ -160,15 +160,17 @@ class Recording:
         kept = making.features(env, self._units, "joints")
         self.schema = Schema(1 / env.dt, robot, making.sentence(env_name), kept, about)
         self._steps: list[tuple[np.ndarray, Record]] = []
-        self.on = False
+        self.on, self._lock = False, threading.Lock()  # the session steps in its own thread
         session.recorders.append(self)
 
     def __call__(self, record: Record) -> None:
         """Takes a step; the end of the task's episode ends the recording, too."""
-        if self.on:
-            one = jax.tree.map(lambda x: np.array(x[0]), record)
-            self._steps.append((self._session.frame.qpos[0].astype(np.float32), one))  # the frame is still that before the step
-            self.on = not one.done
+        with self._lock:
+            if self.on:
+                before = self._session.frame.qpos[0].astype(np.float32)  # the frame is still that before the step
+                one = jax.tree.map(lambda x: np.array(x[0]), record)
+                self._steps.append((before, one))
+                self.on = not one.done
 
     def __len__(self) -> int:
         return len(self._steps)
@@ -180,11 +182,13 @@ class Recording:
 
     def begin(self) -> None:
         """Starts to record."""
-        self._steps, self.on = [], True
+        with self._lock:
+            self._steps, self.on = [], True
 
     def discard(self) -> None:
         """Discards the recording."""
-        self._steps, self.on = [], False
+        with self._lock:
+            self._steps, self.on = [], False
 
     def save(self) -> str:
         """Adds the recording to the data set as a success, as the user says, and prints a line.
@@ -192,7 +196,8 @@ class Recording:
         Raises:
             UserError: nothing was recorded, or it cannot be written.
         """
-        self.on = False
+        with self._lock:
+            self.on = False
         if not self._steps:
             raise UserError("nothing was recorded: press Record first")
         with writer(self._out, self.schema, self._form) as form:
