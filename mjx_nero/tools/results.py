@@ -23,18 +23,20 @@ EVALUATIONS = 48  # of a seed, if it needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
 _PAGE = """# Benchmarks
 
-Success of the bundled policies, and what training took, one table a task. This page is written by one command from the figures in
-[{json}]({json}), and by nothing else:
+Success rates of the bundled policies and training times, one table per task. One command writes this page from the figures in
+[{json}]({json}):
 ```
 python -m mjx_nero results --json docs/{json} --markdown docs/{page} --what none
 ```
-Without `--what none` the command first measures everything that the machine can, which takes hours on a GPU; `--what policies
---envs nero_lift` measures one environment's policy, and `--preset sim2real` that of a preset. Times count only if the program is
-alone on the GPU.
+Without `--what none`, the command first measures everything that the machine can, which takes hours on a GPU. `--what policies
+--envs nero_lift` measures the policy of one environment, and `--preset sim2real` that of a preset. Times count only if nothing else runs
+on the GPU.
 
 - **policy**: success rate of the bundled policy, with its 95% Wilson interval.
-- **seeds**: how many seeds of the default training reached the target; **seconds** (with evaluations, without compilation) and
-  **env steps** until they did. A column is missing where nothing of it has been measured yet.
+- **seeds**: how many seeds of the default training reached the target.
+- **seconds**, **env steps**: how long these seeds took, with evaluations but without compilation.
+
+A table has no column for what nobody has measured yet.
 """
 
 
