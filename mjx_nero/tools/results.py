@@ -28,9 +28,9 @@ Success rates of the bundled policies and training times, one table per task. On
 ```
 python -m mjx_nero results --json docs/{json} --markdown docs/{page} --what none
 ```
-Without `--what none`, the command first measures everything that the machine can, which takes hours on a GPU. `--what policies
---envs nero_lift` measures the policy of one environment, and `--preset sim2real` that of a preset. Times count only if nothing else runs
-on the GPU.
+Without `--what none`, the command first measures everything that the machine can, which takes hours on a GPU.
+`--what policies --envs nero_lift` measures the policy of one environment, and `--preset sim2real` that of a preset. Times
+count only if nothing else runs on the GPU.
 
 - **policy**: success rate of the bundled policy, with its 95% Wilson interval.
 - **seeds**: how many seeds of the default training reached the target.
