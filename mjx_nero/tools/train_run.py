@@ -77,7 +77,10 @@ def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[s
 def report(summary: dict[str, Any], films: bool) -> None:
     """Describes a run's result for people."""
     pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
-    print(f"{pace}, success {summary['evaluation']['success_rate']:.1%}")
+    success, best = summary["evaluation"]["success_rate"], summary.get("best")
+    print(f"{pace}, success {success:.1%}")
+    if best and best["success_rate"] > success:
+        print(f"best.safetensors did better: {best['success_rate']:.1%}, after {best['env_steps']:,} env steps")
     names = "policy.safetensors, best.safetensors, curve.png, metrics.jsonl, checkpoints/"
     print(f"{summary['folder']}: {names}{', video.mp4 (to be drawn now)' if films else ''}", flush=True)
     if summary["nan_count"] or summary["overflow_count"]:

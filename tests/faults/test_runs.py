@@ -26,6 +26,7 @@ def test_what_a_run_leaves(train, tmp_path):
     best = json.loads((run / "summary.json").read_text())
     newest = {f"{steps:012d}.safetensors" for steps in (512, 640)}
     assert newest <= set(saved) and len(saved) <= 3 and best["env_steps"] == STEPS
+    assert best["best"]["success_rate"] >= best["evaluation"]["success_rate"] and best["best"]["env_steps"] <= STEPS
     names = {"best.safetensors", "checkpoints", "config.json", "curve.png", "metrics.jsonl", "policy.safetensors", "summary.json"}
     assert {p.name for p in run.iterdir()} == names | {"tensorboard"}
     assert [row["steps"] for row in rows(run)] == list(range(0, STEPS + 1, CHUNK))

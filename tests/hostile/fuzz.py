@@ -220,7 +220,8 @@ def _expand(folder: pathlib.Path, root: make.etree._Element) -> None:
 
 
 LOST = {"nan_count": 0, "overflow_count": 0, "lost": {"metrics.jsonl": 1}}
-SUMMARY = {"env_steps": 1024, "train_s": 1.5, "steps_per_s": 700, **LOST}
+BEST = {"success_rate": 0.9, "env_steps": 64}
+SUMMARY = {"env_steps": 1024, "train_s": 1.5, "steps_per_s": 700, "best": BEST, **LOST}
 SEED = {"seed": 0, "success_rate": 0.5, "success_rate_95": [0.4, 0.6], "seconds_to_95": None, "env_steps": 10, "train_s": 1.0}
 CURVES = {"cube mass [kg]": [{"value": 0.5, "success_rate": 0.9, "success_rate_95": [0.8, 0.95]}]}
 

@@ -138,6 +138,14 @@ def test_a_run_tells_what_its_physics_lost(capsys):
     assert capsys.readouterr().out.splitlines()[-1] == says
 
 
+@pytest.mark.parametrize(("best", "says"), [(0.875, True), (0.75, False)])
+def test_a_run_that_ends_below_its_best_says_so(best, says, capsys):
+    summary = {"env_steps": 1000, "train_s": 2.0, "steps_per_s": 500, "evaluation": {"success_rate": 0.75}, "folder": "run"}
+    summary |= {"nan_count": 0, "overflow_count": 0, "lost": {}, "best": {"success_rate": best, "env_steps": 400}}
+    train_run.report(summary, films=False)
+    assert ("best.safetensors did better: 87.5%, after 400 env steps" in capsys.readouterr().out.splitlines()) == says
+
+
 def test_eval_of_the_shipped_policy(call, tmp_path):
     code, out, _ = call("eval", "--episodes", 64, "--backend", "mujoco", "--json", "result.json")
     assert code == 0 and "success rate" in out
