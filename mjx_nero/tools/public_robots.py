@@ -19,7 +19,7 @@ from mjx_nero.tools import cli
 TRIES = 16
 ENOUGH = 14  # of them succeed
 _LONGEST = 300  # seconds for an import and its self-test
-_COLUMNS = ("robot", "repository, commit", "file", "flags", "gripper", "opening", "grasped", "placed", "remarks")
+_COLUMNS = ("robot", "repository, commit", "file", "flags", "opening", "grasped", "placed", "warnings")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("list", type=cli.path(".yaml"), help="repositories with their commits, and robots")
     parser.add_argument("--folder", type=cli.path(), required=True, help="folder of the repositories, each as OWNER+NAME")
     parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write the table of all figures in the JSON file")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write the tables of all figures in the JSON file")
     parser.add_argument("--robots", help="list of robots (default: all that the JSON file lacks); none: only the table")
     parser.add_argument("--jobs", type=cli.at_most(100), default=1, help="number of robots at once (default: %(default)s)")
     args, _ = parser.parse(argv)
@@ -137,21 +137,23 @@ def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
 
 
 def markdown(commits: Mapping[str, str], robots: Mapping[str, Public], held: Mapping[str, dict[str, Any]]) -> str:
-    """Returns the table as Markdown, one row for each robot that was tried."""
+    """Returns two tables as Markdown: one row for each robot that was tried, then what is wrong with those that fail."""
     tested = [row["self_test"] for row in held.values() if "failed" not in row]
     good, placed = (sum(row["script"] == "pick_place" and row[name] >= ENOUGH for row in tested) for name in ("good", "placed"))
-    lines = [_COLUMNS, tuple("---" for _ in _COLUMNS)]
+    lines, failing = [_COLUMNS, ("---",) * len(_COLUMNS)], [("robot", "what the import says"), ("---", "---")]
     for name, robot in robots.items():
         if row := held.get(name):
             where = f"{robot.repository} {commits[robot.repository]}"
             flags = " ".join([robot.flags, *(f"--package {package}" for package in robot.packages)]).strip()
             opening = f"{1000 * row['opening']:.0f} mm" if row.get("opening") else ""
-            said = row.get("reason") or "; ".join([*row["warnings"], *([] if row["self_test"]["passed"] else [_said(row)])])
-            cells = name, where, robot.file, flags and f"`{flags}`", ", ".join(row.get("gripper", [])), opening
-            lines.append((*cells, _share(row, "good"), _share(row, "placed"), re.sub(r"[|<]", r"\\\g<0>", said)))
-    table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    counts = f"{len(tested)} of {len(held)} robots are imported. {good} grasp the cube in at least {ENOUGH} of {TRIES} tries"
-    return f"{counts}, {placed} put it where it belongs as often.\n\n{table}"
+            warned = str(len(row.get("warnings", ())) or "")
+            cells = name, where, robot.file, flags and f"`{flags}`", opening
+            lines.append((*cells, _share(row, "good"), _share(row, "placed"), warned))
+            if wrong := row.get("reason") or (not row["self_test"]["passed"] and _said(row)):
+                failing.append((name, re.sub(r"[|<]", r"\\\g<0>", wrong)))
+    every, failed = ("".join(f"| {' | '.join(line)} |\n" for line in rows) for rows in (lines, failing))
+    counts = f"The importer accepts {len(tested)} of {len(held)} robots. {good} grasp the cube in at least {ENOUGH} of {TRIES}"
+    return f"{counts} tries, {placed} also put it where it belongs in as many.\n\n{every}\n## Those that fail\n{failed}"
 
 
 def _said(row: Mapping[str, Any]) -> str:

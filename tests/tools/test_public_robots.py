@@ -1,4 +1,4 @@
-"""The table of public robots: its list, what it says of a robot, and of one that it cannot import or play with."""
+"""The tables of public robots: their list, what they say of a robot, and of one that fails."""
 
 import json
 from pathlib import Path
@@ -60,20 +60,27 @@ def test_a_robot_that_fails_stands_in_the_table_with_its_reason(tmp_path):
     assert "no joint that moves" in rows["Box"]["reason"] and rows["Other"]["reason"] == "there is no file a+b/x.urdf"
     text = table.read_text()
     assert (
-        text.startswith("0 of 2 robots are imported. 0 grasp")
+        text.startswith("The importer accepts 0 of 2 robots. 0 grasp")
         and "| Box | a/b abc1234 | box.urdf |" in text
-        and rows["Box"]["reason"] in text
+        and f"| Box | {rows['Box']['reason']} |" in text.split("## Those that fail")[1]
     )
 
 
 def test_the_table_counts_robots_that_mostly_succeed():
     robots = {"A": public_robots.Public("a/b", "a.urdf", "--arg x:=1", ("c+d/e",)), "B": public_robots.Public("a/b", "b.urdf")}
-    row = {"gripper": ["jaw"], "opening": 0.08, "warnings": ["B: a|b"]}
-    tried = {"script": "pick_place", "tries": 16, "good": 14, "placed": 13, "passed": False, "line": "self-test: lost"}
+    row = {"gripper": ["jaw"], "opening": 0.08, "warnings": ["B: small"]}
+    tried = {"script": "pick_place", "tries": 16, "good": 14, "placed": 13, "passed": False, "line": "self-test: a|lost"}
     held = {"A": row | {"self_test": tried}, "B": row | {"self_test": tried | {"script": "reach", "good": 16}}}
     text = public_robots.markdown({"a/b": "abc1234"}, robots, held)
     assert (
-        text.startswith("2 of 2 robots are imported. 1 grasp the cube in at least 14 of 16 tries, 0 put it")
-        and "`--arg x:=1 --package c+d/e` | jaw | 80 mm | 14 of 16 | 13 of 16 | B: a\\|b; self-test: lost |" in text
-        and "| b.urdf |  | jaw | 80 mm |  |  |" in text
+        text.startswith("The importer accepts 2 of 2 robots. 1 grasp the cube in at least 14 of 16 tries, 0 also put it")
+        and "`--arg x:=1 --package c+d/e` | 80 mm | 14 of 16 | 13 of 16 | 1 |" in text
+        and "| b.urdf |  | 80 mm |  |  | 1 |" in text
+        and "| A | self-test: a\\|lost |" in text.split("## Those that fail")[1]
     )
+
+
+def test_the_page_has_the_tables_of_its_figures():
+    commits, robots = public_robots.read(LIST)
+    held = public_robots.figures(LIST.with_suffix(".json"))
+    assert public_robots.markdown(commits, robots, held) in LIST.with_suffix(".md").read_text()
