@@ -287,7 +287,7 @@ def test_an_imported_arm_follows_a_target(hand):
             {"pick": None},
             r"nero has no pick, where on the table it can grasp: give it in its config as ranges of x, y and z",
         ),
-        ("lift", {"pick": None, "folder": "x"}, "give it in its robot.yaml as ranges of x, y and z .*, or import it anew$"),
+        ("lift", {"pick": None, "folder": "x"}, "give it in its robot.yaml as ranges of x, y and z .*, or import it again$"),
         ("lift", {"hold": None}, "nero has no hold, where it can hold what it has grasped: give it in its config"),
         ("follow_target", {"pick": None, "workspace": None}, "nero has no workspace, where it can work: give it in its config"),
     ],

@@ -75,9 +75,9 @@ def test_names_and_places_are_checked(robots, text):
 
 def test_a_term_names_a_robot_that_is_there():
     cfg = env_cfg("nero_handover")
-    with pytest.raises(UserError, match=r"to_goal.params.robot is 'tacker', and the scene's further robots are: taker"):
+    with pytest.raises(UserError, match=r"to_goal.params.robot is 'tacker', but the scene's further robots are: taker"):
         dataclasses.replace(cfg, metrics={"to_goal": MetricTerm(success.ee_distance, params={"robot": "tacker"})})
-    with pytest.raises(UserError, match="events.reset_object_yaw.params.robot means nothing"):
+    with pytest.raises(UserError, match="events.reset_object_yaw.params.robot has no effect"):
         event = cfg.events["reset_object_yaw"]
         event = dataclasses.replace(event, params={**event.params, "robot": "taker"})
         dataclasses.replace(cfg, events={**cfg.events, "reset_object_yaw": event})

@@ -163,7 +163,7 @@ def test_bad_cameras_are_refused(fields, message):
 @pytest.mark.parametrize(
     "term, camera, message",
     [
-        (images.rgb, "back", r"reads the camera 'back', and the scene's cameras \(scene.cameras\) are: front"),
+        (images.rgb, "back", r"reads the camera 'back', but the scene's cameras \(scene.cameras\) are: front"),
         (images.depth, "front", r"reads depth of the camera 'front': add it to scene.cameras.front.kinds"),
     ],
 )
