@@ -83,7 +83,7 @@ def test_a_term_names_a_robot_that_is_there():
         dataclasses.replace(cfg, events={**cfg.events, "reset_object_yaw": event})
     with pytest.raises(UserError, match="is 'tacker/arm', and the drives' groups are: arm, gripper, taker/arm, taker/gripper"):
         make("nero_handover", impl="native", **{"actions.taker_arm.params.group": "tacker/arm"})
-    with pytest.raises(UserError, match="hand_over: taker is 'taker', and the scene's further robots are: none"):
+    with pytest.raises(UserError, match="hand_over: taker is 'taker', but the scene's further robots are: none"):
         HandOver(NERO, 0.02)
     with pytest.raises(UserError, match="so_arm101 has 5 joints: to hand a bar over, an arm needs 6"):
         env_cfg("handover", robot="so_arm101")

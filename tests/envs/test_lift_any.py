@@ -231,8 +231,8 @@ def test_object_in_the_place_of_the_cube():
     assert pushed.success.condition.params["fold"] == 1 and not pushed.controllers
     for env_name, thing, says in (
         ("nero_clutter", "mug", "one object that a task lifts, pushes or places, but this task has several objects of their own"),
-        ("nero_stack", "mug", "and this task has several objects"),
-        ("nero_reach", "mug", "and this task has none"),
+        ("nero_stack", "mug", "but this task has several objects"),
+        ("nero_reach", "mug", "but this task has none"),
         ("nero_push", "screwdriver", "does not stand as its file has it"),
         ("nero_lift", "mugg", "did you mean 'mug'"),
     ):
