@@ -63,7 +63,7 @@ def test_the_scene_of_one_robot_has_no_others():
     "robots, text",
     [
         ({"cube": beside(NERO)}, "scene.robots.cube needs another name"),
-        ({"a/b": beside(NERO)}, "'a/b' is no name"),
+        ({"a/b": beside(NERO)}, "'a/b' is not a name"),
         ({"taker": beside(NERO, 0.1)}, "the first robot and taker stand 0.1 m from one another"),
         ({"a": beside(NERO), "b": beside(COBOTTA, 1.05)}, "a and b stand 0.05 m from one another"),
     ],
@@ -106,7 +106,7 @@ def test_a_view_of_one_robot_is_as_if_it_were_alone(env, state):
 
 def test_what_knows_one_robot_says_so(env):
     with pytest.raises(
-        UserError, match="a data set of demonstrations knows scenes of one robot only, and this one has taker, too"
+        UserError, match="a data set of demonstrations supports only scenes of one robot, but this one also has taker"
     ):
         making.units_of(env, "si")
 

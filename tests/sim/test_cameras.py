@@ -146,7 +146,7 @@ def test_without_cameras_nothing_changes():
 @pytest.mark.parametrize(
     "fields, message",
     [
-        ({"link": "hand"}, r"scene.cameras.front.link is 'hand', and the scene's links are: base_link, .*"),
+        ({"link": "hand"}, r"scene.cameras.front.link is 'hand', but the scene's links are: base_link, .*"),
         ({"size": (64, 4000)}, r"size must be at least 1 and at most 2048, got 4000"),
         ({"size": (0, 64)}, r"size must be at least 1"),
         ({"fovy": 180.0}, r"fovy must be at least 1"),
