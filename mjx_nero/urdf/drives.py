@@ -48,7 +48,7 @@ def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
         if name not in joints:
             raise UserError(f"{path} names joint {short(name)}{hint(str(name), joints)}: choose from {', '.join(joints)}")
         if not isinstance(row, Mapping) or not {"stiffness", "damping"} <= set(row) or not set(row) <= set(COLUMNS):
-            raise UserError(f"{path}: {name} takes stiffness and damping, and at will effort and speed; got {short(row)}")
+            raise UserError(f"{path}: {name} takes stiffness and damping, and optionally effort and speed; got {short(row)}")
         out[str(name)] = {
             column: read(kind, row[column], f"{path}: {name}.{column}") for column, kind in COLUMNS.items() if column in row
         }

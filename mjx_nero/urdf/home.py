@@ -65,10 +65,10 @@ class Search:
         return {**self.start, **{j: float(v) + 0.0 for j, v in arm if j in self.free}}
 
     def amid(self, box: Box | None, down: bool, tilt: float = 0.0) -> Float[np.ndarray, "n k"]:
-        """Finds poses with the grasp point in the middle of a box, hand down or leaning by up to ``tilt``, links clear of the
-        table and of one another.
+        """Finds poses with the grasp point in the middle of a box and the links clear of the table and of one another.
 
-        Poses farthest from joint limits and singularities come first.
+        If ``down``, the hand points down or leans by up to ``tilt``. Poses farthest from joint limits and singularities come
+        first.
         """
         cloud = self.cloud
         if box is None or not self.free:

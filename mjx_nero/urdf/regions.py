@@ -92,8 +92,8 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
 
     The table in front of the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach. A cell counts
     if inverse kinematics reaches it with the hand pointing down and its fingers opening along y, at the height of a grasp and
-    ``OVER`` it, with nothing below the table. If there are no such cells either way round, any turn about the vertical will do;
-    if there are still none, the hand may lean by one of ``LEANS``.
+    ``OVER`` above it, with nothing below the table. If there are no such cells either way round, any turn about the vertical will
+    do; if there are still none, the hand may lean by one of ``LEANS``.
 
     ``pick`` is the rectangle of such cells, up to ``LONG`` by ``WIDE``, with the largest area weighted by nearness to the middle
     in front of the shoulder. It shrinks until inverse kinematics reaches 27 of its points, including the corners. ``hold`` rises

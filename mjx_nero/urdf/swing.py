@@ -42,8 +42,10 @@ class Meeting:
 
     @property
     def worth(self) -> float:
-        """Distance by which the two part, minus their least distance [m]; -inf for a finger that never comes near a fixed
-        shape."""
+        """Distance by which the two part, minus their least distance [m].
+
+        It is -inf for a finger that never comes near a fixed shape.
+        """
         parted = float(np.ptp(self.apart) - self.apart.min())
         return parted if not self.fixed else BESIDE * parted if parted > 0 else -np.inf
 
