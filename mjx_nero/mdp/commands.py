@@ -42,6 +42,6 @@ def uniform_pose(key: Key, *, x: Range, y: Range, z: Range, roll: Range, pitch: 
 
 
 def circle(position: Float[Array, "3"], time: Float[Array, ""], *, radius: float, frequency: float) -> Float[Array, "3"]:
-    """Moves the goal on a vertical circle about ``position`` in the world's yz plane [m], at ``frequency`` turns a second."""
+    """Moves the goal on a vertical circle about ``position`` in the world's yz plane [m], at ``frequency`` turns per second."""
     phase = 2 * jnp.pi * frequency * time
     return position + radius * jnp.stack([jnp.zeros_like(phase), jnp.cos(phase), jnp.sin(phase)])

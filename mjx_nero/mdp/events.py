@@ -138,7 +138,7 @@ def visited(key: Key, start: Start, *, bank: Bank, chances: Float[Array, " phase
     """Replaces the start by a state that an expert has visited, with the given probabilities.
 
     Args:
-        bank: visited states, one a row.
+        bank: visited states, one per row.
         chances: probabilities of the usual start and of each of the expert's phases (``curriculum.chances``).
     """
     phases, n = len(chances) - 1, len(bank.arrived)

@@ -130,7 +130,7 @@ def reached(view: View, *, hands: Hands, std: Positive) -> Scalar:
 
 
 def held(view: View, *, hands: Hands) -> Scalar:
-    """1 while somebody holds the object."""
+    """1 while either robot holds the object."""
     return (hands.gives(view) | hands.passed(view)).astype(jnp.float32)
 
 
@@ -150,7 +150,7 @@ def pointed(view: View, *, hands: Hands, std: Positive) -> Scalar:
 
 
 def met(view: View, *, hands: Hands, std: Positive) -> Scalar:
-    """1 - tanh(d / std) while somebody holds the object, where d is the distance of the taker's hand from its place."""
+    """1 - tanh(d / std) while either robot holds the object, where d is the distance of the taker's hand from its place."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(hands.way(view, True)) / std)
     return (hands.gives(view) | hands.passed(view)) * near
 

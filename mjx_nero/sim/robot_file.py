@@ -48,7 +48,7 @@ _PLAIN = (
     "hold",
 )
 _HEAD = """\
-# A robot for mjx_nero: edit at will. Units: m, rad, kg, N, s; quaternions wxyz.
+# A robot for mjx_nero: edit it freely. Units: m, rad, kg, N, s; quaternions wxyz.
 # arm, gripper: one line per joint: stiffness [N m/rad or N/m] and damping of its drive, limits of effort and speed, home.
 # workspace: box from which reach tasks draw their commands, in the base frame before base_quat rotates it.
 # down: orientation of ee_site when the gripper points straight down. floor: height of the floor under a robot beside the table.

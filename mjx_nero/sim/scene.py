@@ -37,7 +37,7 @@ class SceneCfg:
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
         fixtures: fixtures by name, such as cabinets, perhaps with joints of their own (``sim.fixtures``).
-        robots: further robots by name, beside the task's own (``sim.team``).
+        robots: further robots by name, besides the task's own (``sim.team``).
         self_collision: a robot's links collide with one another; ``sim.touch`` measures those forces, too.
         sensors: names of ``Sim.readings`` besides ``touch``. ``hand``: the force with which robots press objects; ``wrist`` and
             ``fingers``: force and torque between arm and hand, and the forces at the pads, of the task's own robot.
@@ -209,7 +209,7 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
 
 
 def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
-    """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that meet obstacles only."""
+    """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that only meet obstacles."""
     return team.mounted(robot, whole).compile()
 
 

@@ -83,7 +83,7 @@ def check(robot: RobotCfg, others: Robots, things: Iterable[str]) -> None:
 
 
 def alone(robots: Robots, what: str) -> None:
-    """Refuses scenes of several robots; ``robots`` are those beside the first.
+    """Refuses scenes of several robots; ``robots`` are those besides the first.
 
     Raises:
         UserError: there are others, which ``what`` does not support.

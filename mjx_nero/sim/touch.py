@@ -21,7 +21,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
-COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
+COLLISION = 3  # geom group of the robots' collision shapes, including those that do not collide yet
 NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
 # Shapes that every backend can collide with a box.
 MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}

@@ -92,7 +92,7 @@ def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
 def _ready(robot: RobotCfg) -> RobotCfg:
     """Opens slow fingers no further than a cube needs.
 
-    A jaw that turns by 85 degrees before it meets a cube hardly ever grasps one by chance, and chance grasps start the learning.
+    A jaw that turns by 85 degrees before it meets a cube seldom grasps one by chance, and learning starts from chance grasps.
     """
     edge = grasp.cube_for(robot).size[0]
     return grasp.opened(robot, OPEN * edge) if grasp.closing_time(robot, edge) > SLOW else robot

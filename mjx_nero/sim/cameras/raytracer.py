@@ -93,7 +93,7 @@ class RayTracer:
                 ("depth", depth_out, seen.depth_data),
                 ("segmentation", segmentation_out, seen.seg_data),
             ):
-                if self._pixels[kind]:  # otherwise nobody reads it
+                if self._pixels[kind]:  # otherwise it is not used
                     wp.copy(out, made)
 
         draw.__annotations__ = {

@@ -29,8 +29,8 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 # Fields of MuJoCo's C library alone. A mesh that a world lacks has no contact bits there; here its geom has no mesh.
 _OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
 
-# Warp's current device belongs to the process, not to a thread. Whoever changes it holds this lock, so that nobody else makes
-# anything meanwhile: kernels with arrays on another device than their own end the process.
+# Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
+# makes anything meanwhile: kernels with arrays on another device than their own end the process.
 WARP = threading.Lock()
 
 
@@ -81,7 +81,7 @@ class WarpPhysics:
             wp.copy(qvel_out, data.qvel)
             wp.copy(warmstart_out, data.qacc_warmstart)
             wp.copy(overflow_out, data.overflow)
-            if strongest is not None:  # otherwise nobody reads it
+            if strongest is not None:  # otherwise it is not used
                 wp.copy(force_out, strongest)
 
         names = ("qpos", "qvel", "given", "warmstart", "qpos_out", "qvel_out", "warmstart_out")

@@ -53,7 +53,7 @@ def make(model, data) -> Callable[[], None]:
         return lambda: mujoco_warp.solve(model, data)
     numbers = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "SIZE": size}
     numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
-    numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
+    numbers["FORCES"] = int(model.nsensordata > 0)  # only sensors use them
     arrays: dict[str, Any] = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_warmstart")}
     arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
     arrays |= {f"efc_J_{name}": getattr(data.efc, f"J_{name}") for name in ("rownnz", "rowadr", "colind")}
