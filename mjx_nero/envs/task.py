@@ -184,7 +184,7 @@ class EnvCfg:
         randomization: random model fields, drawn anew in every episode (``mdp.randomization``).
         sensors: errors between the true state and the ``sensed`` observation groups, in this order (``mdp.sensors``). Unlike
             observation noise, they are always on.
-        look: random appearance in the cameras' pictures, drawn anew in every episode (``mdp.looks``). Physics does not change.
+        look: random appearance in the cameras' pictures, drawn anew in every episode (``mdp.looks``). Physics is not affected.
         obstacles: places the scene's obstacles once each episode's start and goal are drawn (``mdp.obstacles``).
         pushes: sudden velocities added to objects (``mdp.pushes``).
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.

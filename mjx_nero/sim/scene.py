@@ -94,7 +94,7 @@ class SimCfg:
     ls_iterations: Iterations = 50  # most iterations of its line search (MJX-JAX 20); at 20, MuJoCo's C library may throw a cube
     ramp: bool = False  # spreads a change of the drives' targets over the control step: stiff drives would jerk otherwise
     impratio: Positive = 10.0  # stiffness of friction relative to normal forces: high enough that grasps do not creep
-    elliptic: bool = True  # elliptic friction cones; False: pyramids
+    elliptic: bool = True  # elliptic friction cones; False: pyramidal
     contacts_per_env: Slots = 24  # Warp: contact slots per environment, shared by all environments
     constraints_per_env: Slots = 128  # Warp: constraint rows of one environment
     solver: Annotated[str, OneOf("newton", "mujoco_warp")] = "newton"  # Warp: the package's own kernels, or the engine's
