@@ -42,7 +42,7 @@ class HandOverCfg:
         lowest: least height of the pads' middle above the table, of giver and taker.
         beyond: how far the pads' middle is below the grasp point, of giver and taker.
         closing: time that the fingers take to close [s], besides the lag of their drives, of giver and taker.
-        above: height over the object from which hands come down, and to which they lift it.
+        above: height over the object at which hands start their descent, and to which they lift it.
         speed: speed of a grasp point on its way up or down [m/s].
         ik: settings of the arms' motion.
     """

@@ -40,9 +40,9 @@ def overridden(cfg: EnvCfg, fields: Mapping[str, Any]) -> EnvCfg:
 def applied(cfg: EnvCfg) -> EnvCfg:
     """Returns the task with ``cfg.object`` in place of its one object.
 
-    A thing to lift starts in any of its resting poses. A thing to push stands as its file has it. So does a thing to place, if it
-    can; otherwise it lies in its most frequent resting pose. Terms measure heights and grasps from the thing's surface, and the
-    script uses its grasps.
+    A thing to lift starts in any of its resting poses. A thing to push stands in the orientation of its file. So does a thing to
+    place, if it can; otherwise it lies in its most frequent resting pose. Terms measure heights and grasps from the thing's
+    surface, and the script uses its grasps.
 
     Raises:
         UserError: the task does not have exactly one object to lift, push or place, or the thing is unusable or cannot stand.
@@ -83,13 +83,13 @@ def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
     """Returns the orientation of a thing: its file's, if it stands so, or else its most frequent resting pose without yaw.
 
     Raises:
-        UserError: the thing is to be pushed, and does not stand.
+        UserError: the thing is to be pushed, but cannot stand.
     """
     (solid,) = item.solids
     if any(rests.up(quat)[2] > _UPRIGHT for quat in solid.rest_quat):
         return item.quat
     if what == PUSHES:
-        raise UserError(f"{item.file} does not stand as its file has it, but an object to push must: turn it in the file")
+        raise UserError(f"{item.file} cannot stand in its orientation, but an object to push must: turn it in the file")
     return placing.tilted(*placing.tilt(rests.up(solid.rest_quat[int(np.argmax(solid.rest_share))])))
 
 

@@ -36,7 +36,7 @@ class Pair:
 
 
 def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
-    """Lists the pairs of geoms that MuJoCo lets meet.
+    """Lists the pairs of geoms that MuJoCo lets collide.
 
     These are the explicit pairs, and those whose contact bits match, except within a body, between a body and its parent, and
     between excluded bodies.

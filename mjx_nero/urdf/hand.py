@@ -31,7 +31,7 @@ TOOL_AXIS = 50.0  # [degrees] the working axis of a tool's frame is the one with
 ON_AXIS = 5e-3  # [m] the last joint turns a tool this near to its axis, and carries others around
 SHARES, NUDGE = 41, 0.02  # samples between closed and open; step in share that shows how the fingers move
 ASIDE = 4e-3  # [m] gap between cube and fixed jaw as the hand comes down, as arms are exact to a few millimetres
-ROUNDS = 3  # of fitting pads to a held cube, whose size follows from the pads
+ROUNDS = 3  # rounds of fitting pads to a held cube: the cube's size follows from the pads in turn
 
 
 def find(

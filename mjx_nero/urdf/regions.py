@@ -19,7 +19,7 @@ from mjx_nero.urdf.workspace import Box
 CELLS = 16  # cells along the reach
 NEAR, ASIDE = 0.25, 0.3125  # shares of the reach: least distance ahead of the shoulder, greatest to its side
 LONG, WIDE = 0.25, 0.4  # shares of the reach: greatest size of a region, ahead and aside
-SPARE = 0.02  # share of the reach by which the hand reaches beyond the region, if one such exists
+SPARE = 0.02  # share of the reach: margin that the hand can reach beyond the region, if there is such a region
 OVER = 0.06  # [m] height above the grasp at which the hand still points down, to approach from above
 TALL = 0.4  # share of the reach: greatest height above the table for holding
 WIDTH = 0.15  # share of the reach: a hand with a narrower region tries to lean further

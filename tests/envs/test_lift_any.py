@@ -233,7 +233,7 @@ def test_object_in_the_place_of_the_cube():
         ("nero_clutter", "mug", "one object that a task lifts, pushes or places, but this task has several objects of their own"),
         ("nero_stack", "mug", "but this task has several objects"),
         ("nero_reach", "mug", "but this task has none"),
-        ("nero_push", "screwdriver", "does not stand as its file has it"),
+        ("nero_push", "screwdriver", "cannot stand in its orientation"),
         ("nero_lift", "mugg", "did you mean 'mug'"),
     ):
         with pytest.raises(UserError, match=says):

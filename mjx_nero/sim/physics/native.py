@@ -157,7 +157,7 @@ class NativePhysics:
     def _make(self, n: int) -> tuple:
         m, steps = self.model, self.decimation
         state = 1 + m.nq + m.nv
-        start = np.ones((n, state))  # time starts at 1, so that a time after MuJoCo's reset, which is from 0, differs
+        start = np.ones((n, state))  # time starts at 1, so MuJoCo's automatic reset, which restarts it at 0, shows
         sensors = np.empty((n, steps, m.nsensordata))
         # With drawn fields every environment has its own model. ``present`` holds that model's current fields; NaN: not yet set.
         models = [copy.copy(m) for _ in range(n)] if self._fields else [m] * n
