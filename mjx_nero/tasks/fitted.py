@@ -134,7 +134,7 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
 
 
 # These tasks take all they need from the robot, so ``nero_place`` and ``place --robot nero`` are the same task. For the other
-# tasks an arm may bring its own numbers, as ``nero_lift`` brings those of its recipe.
+# tasks an arm may have its own numbers, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.presets(),
     "open_drawer": open_drawer.presets(),

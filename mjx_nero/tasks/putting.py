@@ -60,7 +60,7 @@ class Putting(Tower):
         return {"place": dataclasses.replace(place, rise=self.rise)}
 
     def controllers(self) -> dict[str, dict[str, Any]]:
-        """Lists none: each task brings its own."""
+        """Returns none: each task adds its own."""
         return {}
 
     def success(self) -> SuccessCfg:

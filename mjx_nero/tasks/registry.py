@@ -1,4 +1,4 @@
-"""Robots and environments by name. Every module of ``arms`` brings its own."""
+"""Robots and environments by name. Every module of ``arms`` adds its own."""
 
 import contextlib
 import dataclasses
