@@ -78,8 +78,8 @@ class FollowJoint:
     | grasp point | in front of the handle | at the handle | stays | along the joint's path, to its target |
     | fingers | open | open | close | closed |
 
-    A phase ends when the arm has arrived, or when its time is up. The fixture's file says how the
-    handle moves with its joint, slide or hinge.
+    A phase ends when the arm has arrived, or when its time is up. The fixture's file says how the handle moves with its joint,
+    slide or hinge.
 
     Args:
         robot: the robot that pulls.

@@ -90,7 +90,7 @@ def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str
     """Returns joint -> home position [rad, m], and the turn of the hand there (wxyz).
 
     The home is the candidate from which the hand reaches the most of ``place.pick``. Of two turns that do equally well, the
-    nearer one wins, because turning the hand by half a turn costs time.
+    nearer one wins, because half a turn of the hand costs time.
 
     If no candidate in the middle of the workspace leads to all of ``pick``, others over its middle are tried. Without any
     candidate the home is ``start``; or, if a shape is below the table there, the nearest random pose in which none is.

@@ -1,8 +1,8 @@
 """Finds grasps: places where a hand with two pads can hold a thing that lies on a table, from straight above.
 
 A grasp is a level line through the thing: the pads close along it from both sides. Lines in many directions, at many places and
-heights are tried. One is good if the surface stands across it at both ends, if there is room for the open fingers beside the
-thing and above the table, and if the pads lie flat on it, near the centre of mass.
+heights are tried. One is good if the surface is nearly perpendicular to it at both ends, if there is room for the open fingers
+beside the thing and above the table, and if the pads lie flat on it, near the centre of mass.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ ROOM = (0.012, 0.006)  # [m] room for the open hand on each side of the thing: t
 CLEAR = 0.0015  # [m] between a finger and what it must not touch
 STEEP = np.cos(np.radians(35.0))  # least cosine between a line and the surface's normal
 FINEST = 40  # candidates to examine closely
-APART = (0.01, np.radians(25.0))  # [m, rad] grasps that differ by less are alike
+APART = (0.01, np.radians(25.0))  # [m, rad] grasps that differ by less count as the same
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +200,7 @@ def _fine(each: tuple, parts: list[np.ndarray], hand: Hand) -> tuple:
 def _unlike(
     sorted_ones: list[tuple], most: int, share: float, test: Callable[[tuple], tuple | None] = lambda x: x
 ) -> list[tuple]:
-    """The first entries of a list that pass the test and differ from all before them."""
+    """The first entries of a list that pass the test and differ from all earlier ones."""
     out: list[tuple] = []
     for each in sorted_ones:
         if len(out) == most:
