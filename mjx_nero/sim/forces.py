@@ -1,7 +1,8 @@
 """Force and torque at the wrist, and the forces at the fingers' pads, measured in the last physics step of a control step.
 
-The wrist's are MuJoCo's force and torque sensors: what the arm exerts on the hand, in the axes of the flange, with the hand's own
-weight and inertia. A pad's is the net force of its contacts. A real sensor's errors are in ``mdp.sensors.Gauge``.
+The wrist's readings are MuJoCo's force and torque sensors: what the arm exerts on the hand, in the axes of the flange, including
+the hand's own weight and inertia. A pad's reading is the net force of its contacts. ``mdp.sensors.Gauge`` has the errors of real
+sensors.
 """
 
 import dataclasses
@@ -34,7 +35,7 @@ def add(spec: mujoco.MjSpec, robot: RobotCfg, names: Collection[str]) -> None:
     base = spec.body(robot.base_link)
     pads = [geom for geom in base.find_all(mujoco.mjtObj.mjOBJ_GEOM) if "pad" in geom.name and geom.conaffinity]
     if not pads:
-        raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, and {robot.name} has none")
+        raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, but {robot.name} has none")
     for geom in pads:
         spec.add_sensor(
             name=f"{FINGERS}:{geom.name}",
@@ -61,7 +62,7 @@ class Gauge:
 
     Attributes:
         addresses: place of each sensor's three numbers among the values.
-        norms: the reading is a length of each [N]; otherwise all numbers.
+        norms: the reading is the length of each sensor's force [N]; otherwise all three numbers.
     """
 
     addresses: np.ndarray
@@ -79,8 +80,10 @@ class Gauge:
 
 
 def gauges(model: mujoco.MjModel) -> dict[str, Gauge]:
-    """Makes the gauges of a model's sensors, by name in ``Sim.readings``: ``wrist`` [6], force [N] and torque [N m], and
-    ``fingers`` [pads] [N]. Empty if the scene has no such sensor."""
+    """Makes the gauges of a model's sensors, by name in ``Sim.readings``. Empty if the scene has no such sensor.
+
+    ``wrist`` [6] is force [N] and torque [N m]; ``fingers`` [pads] are forces [N].
+    """
     found = {}
     for name in (WRIST, FINGERS):
         ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(f"{name}:")]
@@ -92,10 +95,10 @@ def gauges(model: mujoco.MjModel) -> dict[str, Gauge]:
 def on_warp(m: mujoco.MjModel, model: Any, data: Any, out: Any) -> Callable[[], None]:
     """Makes a function that measures in MuJoCo Warp, between a step's solver and its integrator, as MuJoCo's sensors do.
 
-    The package's own kernels leave out what only sensors need, so that it is computed here, once a control step.
+    The package's own kernels leave out what only sensors need, so it is computed here, once per control step.
 
     Args:
-        m: the model; model, data: MuJoCo Warp's.
+        m: the compiled model; model, data: MuJoCo Warp's.
         out: the readings [worlds, numbers], all gauges' one after another.
     """
     found, parts, end = gauges(m), [], 0
@@ -129,7 +132,7 @@ def _wrench(m: mujoco.MjModel, model: Any, data: Any, out: Any) -> Callable[[], 
         out: wp.array2d(dtype=float),  # type: ignore
     ):
         w = wp.tid()
-        # Of the tree's centre of mass, in the world's axes: torque, then force.
+        # About the tree's centre of mass, in the world's axes: torque, then force.
         force = wp.spatial_bottom(inner[w, body])
         torque = wp.spatial_top(inner[w, body]) - wp.cross(place[w, site] - middle[w, root], force)  # type: ignore[operator]
         axes = wp.transpose(turn[w, site])

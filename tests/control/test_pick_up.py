@@ -115,7 +115,7 @@ def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
 
 @pytest.mark.parametrize("fields", [{"turns": (4, 2)}, {"heading": (0, 3), "turns": (1, 1)}, {"turns": (-1,)}])
 def test_what_does_not_say_how_objects_lie_is_refused(fields):
-    with pytest.raises(UserError, match="heading and turns are an axis .0, 1, 2. and a number an object, got"):
+    with pytest.raises(UserError, match="heading and turns take an axis .0 to 2. and a number per object, got"):
         control.make("pick_up", COBOTTA_PRO_900, 0.02, fields)
-    with pytest.raises(UserError, match="aside takes one value an object, got .0.01, 0.02. for 1"):
+    with pytest.raises(UserError, match="aside takes one value per object, got .0.01, 0.02. for 1"):
         control.make("pick_up", COBOTTA_PRO_900, 0.02, {"aside": (0.01, 0.02)})

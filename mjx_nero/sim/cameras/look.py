@@ -37,7 +37,7 @@ class Look:
         terms: by name, each ``(key, model) -> {field: (rows, values)}``.
 
     Attributes:
-        names: of the fields that differ.
+        names: names of the fields that differ.
 
     Raises:
         UserError: a term names something that the model lacks, or draws a field that cannot differ.
@@ -77,7 +77,7 @@ class Look:
 
 
 def rows(model: mujoco.MjModel, scenery: Scenery) -> Iterator[tuple[str, int, Any]]:
-    """Yields what a scenery says of objects and obstacles, as fields of the drawn model: name, row and value."""
+    """Yields the looks of a scenery's objects and obstacles as fields of the drawn model: name, row and value."""
     for name, look in scenery.objects.items():
         row = int(model.geom(name).id)
         yield from (("geom_size", row, look.size), ("geom_rgba", row, look.rgba))
@@ -87,7 +87,7 @@ def rows(model: mujoco.MjModel, scenery: Scenery) -> Iterator[tuple[str, int, An
 
 
 def nominal(model: mujoco.MjModel, field: str) -> np.ndarray:
-    """A field of the model, in float32, or in int32 where it has whole numbers."""
+    """A field of the model, as int32 if it holds integers, otherwise as float32."""
     found = np.array(getattr(model, field))
     return found.astype(np.int32 if np.issubdtype(found.dtype, np.integer) else np.float32)
 

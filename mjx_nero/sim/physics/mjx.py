@@ -59,7 +59,7 @@ class JaxPhysics:
 
     @property
     def compiler_options(self) -> dict[str, str | bool]:
-        """Always None, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
+        """Empty, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
         return {}
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:

@@ -29,8 +29,8 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 # Fields of MuJoCo's C library alone. A mesh that a world lacks has no contact bits there; here its geom has no mesh.
 _OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
 
-# Warp's current device is the process's and not a thread's: whoever changes it keeps others from making anything meanwhile, as
-# kernels that find their arrays on another device than they were loaded for end the process.
+# Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
+# makes anything meanwhile: kernels with arrays on another device than their own end the process.
 WARP = threading.Lock()
 
 
@@ -47,7 +47,7 @@ class WarpPhysics:
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step; leading axes are environments."""
-        # The drawn fields travel with the targets: without any these go alone.
+        # The drawn fields travel with the targets. Without fields, the targets go alone.
         lead = sim.qpos.shape[:-1]
         drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
         targets = [ctrl, sim.ctrl] if self._cfg.ramp else [ctrl]
@@ -81,7 +81,7 @@ class WarpPhysics:
             wp.copy(qvel_out, data.qvel)
             wp.copy(warmstart_out, data.qacc_warmstart)
             wp.copy(overflow_out, data.overflow)
-            if strongest is not None:  # otherwise nobody reads it
+            if strongest is not None:  # otherwise it is not used
                 wp.copy(force_out, strongest)
 
         names = ("qpos", "qvel", "given", "warmstart", "qpos_out", "qvel_out", "warmstart_out")
@@ -118,7 +118,7 @@ class WarpPhysics:
         """Returns the size of MuJoCo Warp's data, and the free memory."""
         import warp as wp
 
-        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes' are theirs to ask
+        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes ask for their own
         return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
 
     @functools.cached_property
@@ -158,7 +158,7 @@ class WarpPhysics:
         """Makes what ``n`` environments need on the current device.
 
         Returns:
-            MuJoCo Warp's data, the targets that it goes to, the drawn fields as one array, the function that steps, the readings
+            MuJoCo Warp's data, the targets to ramp to, the drawn fields as one array, the function that steps, the readings
             (each None if there are none), and objects that must stay alive.
         """
         import warp as wp
@@ -186,7 +186,7 @@ class WarpPhysics:
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, wanted, drawn, run, strongest, run
         kernels.load(run)
-        run()  # makes what kernels keep between launches, which cannot be done while a graph is captured
+        run()  # allocates what kernels keep between launches, which cannot be done while a graph is captured
         with wp.ScopedCapture() as capture:
             run()
         return data, wanted, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
@@ -227,10 +227,11 @@ class WarpPhysics:
         return ours, strongest
 
     def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None], Callable[[], None]]:
-        """Makes the array of each world's readings, the function that updates the strongest contacts [N], which come first, and
-        the one that measures the rest (``sim.forces``).
+        """Makes the array of each world's readings, and two functions that fill it.
 
-        After the solver it equals MuJoCo's contact sensors, for each of which MuJoCo Warp would search all contacts once more.
+        The first one updates the strongest contacts [N], which come first in the array. The second one measures the rest
+        (``sim.forces``). After the solver the first one equals MuJoCo's contact sensors, for each of which MuJoCo Warp would
+        search all contacts once more.
         """
         import warp as wp
         from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
@@ -277,7 +278,7 @@ class WarpPhysics:
 
 
 def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
-    """Makes an array of targets, and the function that moves ``ctrl`` towards them by one of so many equal steps."""
+    """Makes an array of targets, and the function that moves ``ctrl`` towards them by one of ``left`` equal steps."""
     import warp as wp
 
     wanted: Any = wp.zeros_like(ctrl)
@@ -295,13 +296,13 @@ def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
 
 
 def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:
-    """Replaces fields of the model by views of one array [n, numbers], one row a world. None without fields.
+    """Replaces fields of the model by views of one array [n, numbers], one row per world. None without fields.
 
-    Whole numbers are read as they lie in memory (see ``whole_numbers``).
+    Integers are read as they lie in memory (see ``whole_numbers``).
 
     Args:
-        model: MuJoCo Warp's.
-        shapes: of the fields, by name.
+        model: MuJoCo Warp's model.
+        shapes: shapes of the fields, by name.
     """
     import warp as wp
 
@@ -315,7 +316,7 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
         item = drawn.strides[1] * size // rows
         shape: tuple[int, ...] = (n, rows)
         strides: tuple[int, ...] = (row, item)
-        if getattr(model, name).ndim == 3:  # two vectors a row
+        if getattr(model, name).ndim == 3:  # two vectors per row
             shape, strides = (n, rows, 2), (row, item, item // 2)
         view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=shape, strides=strides)
         setattr(model, name, view)
@@ -324,7 +325,7 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
 
 
 def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any) -> Callable[[], None]:
-    """Makes the function that converts fields of ``world_fields`` which are whole numbers, but given as floats: ids of meshes."""
+    """Makes the function that converts those fields of ``world_fields`` that are integers given as floats: ids of meshes."""
     import warp as wp
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -339,7 +340,7 @@ def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any)
     at, jobs = 0, []
     for name, shape in shapes.items():
         if getattr(model, name).dtype is wp.int32:
-            # Two rows or more: MuJoCo Warp takes meshes to be everywhere where all worlds share one row.
+            # At least two rows: with a single one, MuJoCo Warp assumes that all worlds have the same meshes.
             out = wp.zeros((max(2, drawn.shape[0]), shape[0]), dtype=int)
             setattr(model, name, out)
             jobs.append((at, out, shape[0]))
