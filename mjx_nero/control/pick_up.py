@@ -151,10 +151,11 @@ class PickUp:
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
 
         lost = (phase >= UP) & (self.off(memory, view) > self.lost)
+        falls = (phase == ABOVE) & (memory.tries > 0)
         held, meant = (math.rotate(quat, jnp.asarray(self._grip)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), far < 1e-3)
         memory = dataclasses.replace(
-            self.again(memory, view, lost),
+            self.again(memory, view, lost | falls),
             phase=jnp.where(lost, ABOVE, phase + ended),
             count=jnp.where(lost | ended, 0, memory.count + 1),
             q=q,
@@ -211,9 +212,10 @@ class PickUp:
         return jnp.where(round, 0.0, jnp.arctan2(axis[1], axis[0])) + jnp.asarray(self._choices)[index]
 
     def _pick(self, view: View, yaw: Float[Array, ""]) -> Float[Array, "3"]:
-        """Computes where the grasp point has to be."""
-        seen = view.objects[self.cfg.object].pos_w
-        height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
+        """Computes where the grasp point must be."""
+        seen, table = view.objects[self.cfg.object].pos_w, view.root_pos_w[2]
+        low = jnp.maximum(0.0, grasp.CLEAR - (seen[2] - table) / 2)  # a low object must not be at the pads' lower edges
+        height = jnp.maximum(seen[2], table + self.cfg.lowest - low) + self.cfg.beyond
         aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
         return seen.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 

@@ -85,7 +85,7 @@ class PutInMemory:
     count: Int[Array, ""]  # steps made in this stage
     grip: Float[Array, "3"]  # from the object to the set-point of the grasp point [m]
     turned: Float[Array, ""]  # how far the search has gone along its spiral [rad]
-    upright: Float[Array, "4"]  # turns a hand that points down so that the object is upright
+    upright: Float[Array, "4"]  # turns a hand that points down so that the object is as upright as at the goal
 
 
 class PutIn:
@@ -145,7 +145,7 @@ class PutIn:
         end = self._end(view)
         way = view.goal_pos_w - end
         steers = (stage == OVER) | (stage == IN) & (-way[2] > self.cfg.top - _STROKE)
-        leans = jnp.cross(math.rotate(turned, jnp.asarray(_UP)), jnp.asarray(_UP))
+        leans = jnp.cross(math.rotate(turned, self._own_up(view)), jnp.asarray(_UP))
         upright = math.quat_mul(math.quat_exp(jnp.where(steers, _SHARE, 0.0) * leans), memory.upright)
         share = jnp.where((stage == OVER) & slow, GRIP_FILTER, 0.0)
         grip = memory.grip + share * (pick.pos - end - memory.grip)
@@ -212,7 +212,12 @@ class PutIn:
     def _end(self, view: View) -> Float[Array, "3"]:
         """The place of the object's centre if it stood upright on the same end [m]."""
         seen = view.objects[self._object]
-        return seen.pos_w + self.cfg.foot * (jnp.asarray(_UP) - math.rotate(seen.quat_w, jnp.asarray(_UP)))
+        return seen.pos_w + self.cfg.foot * (jnp.asarray(_UP) - math.rotate(seen.quat_w, self._own_up(view)))
+
+    @staticmethod
+    def _own_up(view: View) -> Float[Array, "3"]:
+        """What is up in the object's frame when it lies as it does at the goal: a thing may belong there on any of its sides."""
+        return math.rotate(math.quat_conj(view.goal_quat_w), jnp.asarray(_UP))
 
     def _ended(self, memory: PutInMemory, way: Float[Array, "3"], off: Float[Array, ""]) -> Bool[Array, ""]:
         """True if the stage is done, or its time is up."""

@@ -263,9 +263,10 @@ def test_object_in_the_place_of_the_box(file, stands):
 
 
 @pytest.mark.slow
-def test_expert_places_a_mug():
-    """Eight episodes; ``docs/guides/objects.md`` has more."""
-    fields = {"object.file": "mug"}
+@pytest.mark.parametrize("file", ["mug", "dumbbell"])
+def test_expert_places_a_thing(file):
+    """Eight episodes; ``docs/guides/objects.md`` has more. The dumbbell lies on another side than its file's."""
+    fields = {"object.file": file}
     played = evaluation.play(evaluation.EvalCfg("nero_place", impl="native", controller="expert", episodes=8, env_fields=fields))
     assert played.result["success_rate"] >= 0.75, played.result
 
