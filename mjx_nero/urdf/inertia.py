@@ -165,7 +165,7 @@ def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
 
 
 def _lack(tensor: Matrix) -> float:
-    """How far the least second moment is below 0, as a share of the largest; infinite if none is positive, 0 for zeros."""
+    """Depth of the least second moment below 0, as a share of the largest; infinite if none is positive, 0 for zeros."""
     values = np.linalg.eigvalsh(tensor)
     moments = values.sum() / 2 - values
     if moments.max() <= 0:
