@@ -216,7 +216,7 @@ class PutIn:
 
     @staticmethod
     def _own_up(view: View) -> Float[Array, "3"]:
-        """The direction that is up in the object's frame when it lies as at the goal: a thing may belong there on any of its sides."""
+        """The object's own direction that is up at the goal, since a thing may belong there on any of its sides."""
         return math.rotate(math.quat_conj(view.goal_quat_w), jnp.asarray(_UP))
 
     def _ended(self, memory: PutInMemory, way: Float[Array, "3"], off: Float[Array, ""]) -> Bool[Array, ""]:

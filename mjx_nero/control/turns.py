@@ -19,7 +19,7 @@ _WAYS = 8  # directions in which the hand leans: multiples of an eighth of a tur
 
 @struct.dataclass
 class Table:
-    """What the arm can do at the spot, by the direction in which the hand leans and the side to which its fingers open."""
+    """Abilities of the arm at the spot, by the direction in which the hand leans and the side to which its fingers open."""
 
     fails: Float[Array, "ways 2"]  # 0 if the arm gets there
     q: Float[Array, "ways 2 nj"]  # over the spot [rad]

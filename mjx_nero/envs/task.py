@@ -105,7 +105,7 @@ def arm_state() -> dict[str, ObservationTerm]:
 
 @dataclasses.dataclass(frozen=True)
 class SuccessCfg:
-    """What counts as success: ``condition`` holds at the end of the episode. ``distance`` is the length that it judges [m].
+    """Success: ``condition`` holds at the end of the episode. ``distance`` is the length that it judges [m].
 
     Attributes:
         hold_s: how long the condition must have held by then [s].

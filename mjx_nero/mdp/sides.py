@@ -23,7 +23,7 @@ NORMALS = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lying:
-    """How a box has to lie, and when it counts as held or left.
+    """The pose in which a box has to lie, and when it counts as held or left.
 
     Attributes:
         object: the box.
