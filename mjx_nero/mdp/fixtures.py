@@ -170,7 +170,7 @@ def handle_turn(view: View, *, handle: Handle, std: Positive) -> Float[Array, ""
 def gripping(
     view: View, *, handle: Handle, near: Positive, open: tuple[float, ...], close: tuple[float, ...]
 ) -> Float[Array, ""]:
-    """Share by which the fingers' targets are closed, from 0 to 1, while the handle is within ``near`` [m] of the grasp point; else 0.
+    """Closing of the fingers' targets, from 0 to 1, while the handle is within ``near`` [m] of the grasp point; else 0.
 
     Args:
         open, close: targets of open and of closed fingers [rad or m]. The fingers come last in ``View.ctrl``.
