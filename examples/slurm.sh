@@ -1,6 +1,6 @@
 #!/bin/bash
-# Trains under Slurm, on all GPUs of as many machines as asked for: sbatch examples/slurm.sh --env nero_lift
-# When its time is nearly up, or when it is preempted, the run saves and goes back into the queue; the same command goes on.
+# Trains under Slurm, on all GPUs of the allocated machines: sbatch examples/slurm.sh --env nero_lift
+# When its time is nearly up, or when it is preempted, the run saves and returns to the queue; the same command resumes it.
 #SBATCH --job-name=mjx_nero
 #SBATCH --nodes=1
 #SBATCH --ntasks-per-node=1
