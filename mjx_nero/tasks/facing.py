@@ -20,7 +20,6 @@ ALONG, HALF = 0.09, 0.13  # [m] from the bar's middle to a hand, and to its end
 SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the meeting
 YAW = 0.25  # [rad] greatest turn of the bar at the start, from straight away from the first arm
 WIDER = 2.0  # opening of the hands, in widths of the bar
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 AWAY = 0.05  # [m] a hand so far from the bar's axis has left it
 JOINTS = 6  # of an arm that can point its hand down anywhere around it
 
@@ -177,7 +176,7 @@ class Pair:
             "turns": tuple(side.turn for side in sides),
             "lowest": tuple(round(grasp.lowest(side.robot.pad), 4) for side in sides),
             "beyond": tuple(grasp.beyond(side.robot, edge) for side in sides),
-            "closing": tuple(round(max(CLOSING, grasp.closing_time(side.robot, edge)), 3) for side in sides),
+            "closing": tuple(grasp.closing(side.robot, edge) for side in sides),
             **ik,
         }
 

@@ -24,7 +24,6 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 OPEN = 0.06  # [m] the hand opens no further: what it grips is less than 2 cm wide
 NEAR = 0.04  # [m] the handle is in the hand
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 SPEED = 0.02  # [m/s] a handle that moves so fast is moved
 OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] of the fixture
 HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
@@ -111,7 +110,7 @@ class Task:
             **{f"handle.{name}": value for name, value in dataclasses.asdict(self.held).items()},
             "beyond": self.beyond,
             "follow": self.follow,
-            "closing": round(max(CLOSING, grasp.closing_time(self.builder, 0.0)), 3),
+            "closing": grasp.closing(self.builder, 0.0),
         }
         return {"follow_joint": {**fields, **regions.ik(self.robot, "ik.")}}
 

@@ -29,8 +29,6 @@ from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks import sim2real as sim2reals
 
-CLOSING = 0.3  # [s] least closing time of the script's fingers
-
 
 @dataclasses.dataclass(frozen=True)
 class LiftSetup:
@@ -63,7 +61,7 @@ class LiftSetup:
         fields = {
             "lowest": grasp.lowest(robot.pad),
             "beyond": grasp.beyond(robot, edge),
-            "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+            "closing": grasp.closing(robot, edge, grasp.QUICK),
         }
         return {"pick_up": {**fields, **regions.ik(robot, "ik.")}}
 

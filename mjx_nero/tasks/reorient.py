@@ -33,7 +33,6 @@ STILL = 0.005  # [m/s]
 LIFTED = 0.01  # [m] height of a held box above the highest that it has while it is tipped over an edge
 AWAY = 0.02  # [m] clearance of the pads beside a box that the hand has left
 YAW = (-0.3, 0.3)  # [rad] heading of the box at the start
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 JOINTS = 6  # of an arm whose hand may lean in any direction
 # The script's way with six joints. With seven, inverse kinematics that lifts a hand turns the other joints about as well.
 ROUND = {"clear": 0.02, "rises": 0.15}
@@ -81,7 +80,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "beyond": grasp.beyond(robot, edge),
         "lift": round(1.2 * edge, 4),
         "before": round(lying.clearance + LIFTED, 4),
-        "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+        "closing": grasp.closing(robot, edge),
         **(ROUND if len(robot.arm.joints) == JOINTS else {}),
         **regions.ik(robot, "ik."),
     }
