@@ -7,11 +7,9 @@ in every step and miss what happens between two control steps.
 
 import collections
 import copy
-import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -79,36 +77,6 @@ def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, readi
         **({"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": second} if second else {}),
         intprm=[data, strongest, 1],
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Reader:
-    """Computes the strongest contact's force [*b] [N] from sensor values [*b, nsensordata], in NumPy or JAX.
-
-    Attributes:
-        addresses: place of each contact's force, three numbers, among the sensor values.
-        pairs: geoms whose contacts count, booleans [ngeom, ngeom].
-    """
-
-    addresses: np.ndarray
-    pairs: np.ndarray
-
-    def __call__(self, values: Any) -> Any:
-        """Returns the force."""
-        return (values[..., self.addresses[:, None] + np.arange(3)] ** 2).sum(-1).max(-1) ** 0.5
-
-
-def readers(model: mujoco.MjModel) -> dict[str, Reader]:
-    """Makes the readers of a model's sensors, by name in ``Sim.readings``. Empty if the scene has no such sensor."""
-    found = {}
-    for name in (NAME, HAND):
-        ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(f"{name}:")]
-        pairs = np.zeros((model.ngeom, model.ngeom), bool)
-        for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
-            pairs[first, second if second >= 0 else slice(None)] = True
-        if ours:
-            found[name] = Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T)
-    return found
 
 
 @functools.cache

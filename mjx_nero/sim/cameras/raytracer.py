@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.cameras.look import nominal
 from mjx_nero.sim.physics import kernels, possible
-from mjx_nero.sim.physics.mujoco_warp import WARP, world_fields
+from mjx_nero.sim.physics.mujoco_warp import world_fields
 from mjx_nero.types import Picture
 
 _SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
@@ -33,7 +33,7 @@ class RayTracer:
         self._pixels = {
             kind: sum(math.prod(c.size) for c in cfg.values() if kind in c.kinds) for kind in ("rgb", "depth", "segmentation")
         }
-        self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any]] = {}  # by device and batch size
+        self._get = kernels.Programs(self._make)
         self._batched = self._as_jax()
         self._where_due = self._as_jax(sometimes=True)
 
@@ -62,12 +62,7 @@ class RayTracer:
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``cameras.Drawer``."""
-        import warp as wp
-
-        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
-            with WARP, wp.ScopedDevice(device):
-                self._get(num_envs)
-                wp.synchronize_device(device)
+        self._get.prepare(num_envs, num_devices)
 
     def bytes(self) -> int:
         """Returns the size of the pictures, of the poses, and of the tree of bounding boxes."""
@@ -104,7 +99,6 @@ class RayTracer:
         }
         call = kernels.as_jax(draw, outputs=3)
 
-        @jax.custom_batching.custom_vmap
         def batched(given, *due):
             lead, rows = given.shape[:-1], given.reshape(-1, given.shape[-1])
             sizes = {f"{kind}_out": (len(rows), max(1, count)) for kind, count in self._pixels.items()}
@@ -115,20 +109,7 @@ class RayTracer:
             found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: _zeros(shapes), rows)
             return tuple(x.reshape(lead + x.shape[1:]) for x in found)
 
-        @batched.def_vmap
-        def _(size, is_batched, *given):
-            wide = (x if own else jnp.broadcast_to(x, (size, *x.shape)) for x, own in zip(given, is_batched, strict=True))
-            return batched(*wide), (True,) * 3
-
-        return batched
-
-    def _get(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
-        import warp as wp
-
-        key = (str(wp.get_device()), n)
-        if key not in self._made:
-            self._made[key] = self._make(n)
-        return self._made[key]
+        return kernels.batched(batched, outputs=3)
 
     def _make(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
         """Makes what ``n`` worlds need on the current device.
@@ -171,9 +152,7 @@ class RayTracer:
             given = [np.ravel(nominal(self._model, name)).view(np.float32) for name in self._fields]
             drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
-        with wp.ScopedCapture() as capture:
-            run()
-        return data, drawn, seen, functools.partial(wp.capture_launch, capture.graph), (model, run)
+        return data, drawn, seen, kernels.captured(run), (model, run)
 
 
 def _zeros(shapes: Any) -> tuple:
