@@ -14,7 +14,8 @@ import mujoco
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.sim.cameras.cfg import CameraCfg
-from mjx_nero.sim.cameras.look import nominal, rows
+from mjx_nero.sim.cameras.look import rows
+from mjx_nero.sim.fields import nominal
 from mjx_nero.types import Picture, Scenery
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
@@ -62,7 +63,7 @@ class Cameras:
         model = copy.copy(model)
         model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
         self._model, self._names = model, tuple(cfg)
-        self._nominal = {name: nominal(model, name) for name in fields}
+        self._nominal = nominal(model, fields)
         module, kind = _DRAWERS[renderer]
         self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
 

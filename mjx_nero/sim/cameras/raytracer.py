@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
-from mjx_nero.sim.cameras.look import nominal
+from mjx_nero.sim.fields import nominal
 from mjx_nero.sim.physics import kernels, possible
 from mjx_nero.sim.physics.mujoco_warp import world_fields
 from mjx_nero.types import Picture
@@ -149,7 +149,7 @@ class RayTracer:
         if not wp.get_device().is_cuda:  # no graphs there
             return data, drawn, seen, run, model
         if drawn is not None:  # orientations that are zero would make no bounding boxes
-            given = [np.ravel(nominal(self._model, name)).view(np.float32) for name in self._fields]
+            given = [np.ravel(x).view(np.float32) for x in nominal(self._model, self._fields).values()]
             drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
         return data, drawn, seen, kernels.captured(run), (model, run)

@@ -98,17 +98,8 @@ class NativePhysics:
             if self._ramp:
                 left = 1 - np.arange(1, self.decimation + 1)[:, None] / self.decimation
                 ctrl -= left * (ctrl - given[:, None, nqvv : -self.model.nu])
-            self._rollout(
-                models,
-                self._data,
-                start,
-                ctrl,
-                nstep=self.decimation,
-                initial_warmstart=warmstart,
-                state=states,
-                sensordata=sensors,
-                skip_checks=True,
-            )
+            out: dict[str, Any] = {"initial_warmstart": warmstart, "state": states, "sensordata": sensors}
+            self._rollout(models, self._data, start, ctrl, nstep=self.decimation, skip_checks=True, **out)
             last, before = states[:, -1, 1:], states[:, -2, 1:] if self.decimation > 1 else start[:, 1:]
             after[:, :nqv] = last
             after[:, nqv:nqvv] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
