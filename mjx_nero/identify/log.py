@@ -55,8 +55,7 @@ def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[s
     head = ["time", *(f"target.{j}" for j in joints), *(f"position.{j}" for j in joints)]
     lines = [*(f"# {note}" for note in notes), ",".join(head)]
     lines += [",".join([f"{time:.6f}".rstrip("0").rstrip("."), *rows[time]]) for time in sorted(rows)]
-    with files.whole(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+    files.write(path, ("\n".join(lines) + "\n").encode())
 
 
 def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, fewest: int = FEWEST) -> Log:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero import math
 from mjx_nero.config.values import hint, short
-from mjx_nero.sim import linkage, model_file
+from mjx_nero.sim import linkage, model_file, quats
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.sim.robot import ASSETS
@@ -92,10 +92,9 @@ def at_rest(file: str, site: str) -> tuple[np.ndarray, np.ndarray]:
         KeyError: there is no such site.
     """
     model = read(file).compile()
-    data, quat = mujoco.MjData(model), np.zeros(4)
+    data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    mujoco.mju_mat2Quat(quat, data.site(site).xmat)
-    return data.site(site).xpos.copy(), quat
+    return data.site(site).xpos.copy(), quats.of_matrix(data.site(site).xmat)
 
 
 def add(spec: mujoco.MjSpec, fixtures: Mapping[str, FixtureCfg], visuals: bool = True) -> None:

@@ -4,12 +4,11 @@ import dataclasses
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjx_nero.envs import regions
 from mjx_nero.mdp.handover import Hands
-from mjx_nero.sim import grasp
+from mjx_nero.sim import grasp, quats
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks.building import working
@@ -67,8 +66,7 @@ def _side(robot: RobotCfg, edge: float, faces: float, aside: float) -> Side:
     quarter = round(float(np.arctan2(*pick.mean(1)[1::-1])) / SIDE)  # of a turn: its front
     front = np.sort(np.abs(pick[quarter % 2]))
     half = (faces - quarter * SIDE) / 2
-    quat = np.zeros(4)
-    mujoco.mju_mulQuat(quat, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array(robot.base_quat))
+    quat = quats.product([math.cos(half), 0.0, 0.0, math.sin(half)], robot.base_quat)
     w, x, y, z = (round(float(v), 6) for v in quat)
     robot = dataclasses.replace(working(grasp.opened(robot, WIDER * edge)), base_quat=(w, x, y, z))
     ahead = regions.turn_to(robot, math.cos(faces), math.sin(faces))

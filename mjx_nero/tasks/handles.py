@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import PositiveRange, Range
@@ -15,7 +14,7 @@ from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, SuccessCfg, 
 from mjx_nero.mdp import commands, fixtures, observations, randomization, rewards, terminations
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
-from mjx_nero.sim import contacts, grasp
+from mjx_nero.sim import contacts, grasp, quats
 from mjx_nero.sim import fixtures as models
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -81,12 +80,13 @@ class Task:
         """The handle with the grip of the robot's hand."""
         tilt = 0.0 if self.level else self.place.pitch
         # From pointing down with the fingers opening along y: forward, then down by the tilt.
-        forward = _turn((0.0, 1.0, 0.0), tilt - math.pi / 2)
+        forward = quats.about((0.0, 1.0, 0.0), tilt - math.pi / 2)
         _, site = models.at_rest(self.file, self.handle.site)
         # The bar is the site's z axis; where it lies across, the hand turns by a quarter about the way in.
         lies = abs(1 - 2 * (site[1] ** 2 + site[2] ** 2)) < 0.5
-        hand = _product(forward, _product(_turn((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0), self.robot.down))
-        grip = _product(site * [1, -1, -1, -1], hand)
+        about = quats.about((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0)
+        hand = quats.product(forward, quats.product(about, self.robot.down))
+        grip = quats.product(site * [1, -1, -1, -1], hand)
         w, x, y, z = (round(float(part), 6) + 0.0 for part in grip)
         return dataclasses.replace(self.handle, grip=(w, x, y, z))
 
@@ -186,15 +186,3 @@ class Task:
             training=CALM,
             budget=Budget(steps=60_000_000, steps_on_cpu=5_000_000),
         )
-
-
-def _turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(quat, np.array(axis), angle)
-    return quat
-
-
-def _product(a: Any, b: Any) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_mulQuat(quat, np.asarray(a, float), np.asarray(b, float))
-    return quat
