@@ -218,6 +218,4 @@ def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
     }
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default, "four": four}
+PRESETS: Presets = {"default": default, "four": four}

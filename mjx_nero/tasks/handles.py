@@ -23,30 +23,11 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 OPEN = 0.06  # [m] the hand opens no further: what it grips is less than 2 cm wide
 NEAR = 0.04  # [m] the handle is in the hand
+TILT = math.radians(15)  # of the hand from level, fingertips down
 SPEED = 0.02  # [m/s] a handle that moves so fast is moved
 OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] of the fixture
 HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
 LIMIT: PositiveRange = (0.9, 1.1)  # factor of the upper limit
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """A place where a robot can take hold of a handle in front of it and pull it by 16 cm.
-
-    Attributes:
-        at: the handle, ``x``, ``y`` and ``z`` in the robot's root frame [m].
-        pitch: tilt of the hand from level, fingertips down [rad].
-    """
-
-    at: tuple[float, float, float]
-    pitch: float = 0.0
-
-
-def place(robot: RobotCfg) -> Place:
-    """Derives the place from the robot's ``workspace``: beyond its middle, in its upper half."""
-    box = np.array(regions.box(robot, "workspace", "where it can work"))
-    (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
-    return Place((round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)), math.radians(15))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,17 +39,23 @@ class Task:
         handle: what to take hold of, without ``grip``, which ``held`` adds.
         middle: where the handle is to be beside ``place`` at the start, so that its path lies in front of the robot [m].
         follow, beyond: see ``FollowJointCfg``.
-        level: the hand stays level, whatever ``place`` says.
+        level: the hand stays level, in place of tilted by ``TILT``.
     """
 
     robot: RobotCfg
-    place: Place
     file: str
     handle: Handle
     middle: float = 0.0
     follow: float = 1.0
     beyond: float = 0.0
     level: bool = False
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Where the robot can take hold of a handle and pull it by 16 cm: beyond its workspace's middle, in the upper half [m]."""
+        box = np.array(regions.box(self.robot, "workspace", "where it can work"))
+        (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
+        return round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)
 
     @functools.cached_property
     def builder(self) -> RobotCfg:
@@ -78,7 +65,7 @@ class Task:
     @functools.cached_property
     def held(self) -> Handle:
         """The handle with the grip of the robot's hand."""
-        tilt = 0.0 if self.level else self.place.pitch
+        tilt = 0.0 if self.level else TILT
         # From pointing down with the fingers opening along y: forward, then down by the tilt.
         forward = quats.about((0.0, 1.0, 0.0), tilt - math.pi / 2)
         _, site = models.at_rest(self.file, self.handle.site)
@@ -94,7 +81,7 @@ class Task:
     def scene(self) -> SceneCfg:
         """The fixture, so that its handle is where the robot can move it."""
         at, _ = models.at_rest(self.file, self.handle.site)
-        wanted = np.array(self.robot.base_pos) + self.place.at + [0.0, self.middle, 0.0]
+        wanted = np.array(self.robot.base_pos) + self.place + [0.0, self.middle, 0.0]
         x, y, z = (round(float(v), 4) + 0.0 for v in wanted - at)
         scene = scenes.around(
             self.robot, SceneCfg(objects={}, fixtures={self.file: FixtureCfg(self.file, (x, y, z))}, goal="none")

@@ -15,9 +15,10 @@ from mjx_nero.envs.task import (
     SuccessCfg,
     arm_state,
     observed,
+    on_table,
     stays_on_table,
 )
-from mjx_nero.mdp import events, metrics, observations, rewards, sides, towers
+from mjx_nero.mdp import metrics, observations, rewards, sides, towers
 from mjx_nero.mdp.sides import Lying
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -99,9 +100,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         metrics=metrics.grasping(minimal_height=lying.minimal_height, grasp_radius=lying.grasp_radius, **one),
         observations=observed(state, **one),
         events={
-            "reset_object_position": Term(
-                events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}
-            ),
+            **on_table(*there.cube, **one),
             "reset_object_side": Term(sides.other_side_up, params={"base": robot.base_pos, "yaw": YAW, **one}),
         },
         rewards={
@@ -124,6 +123,4 @@ def default(robot: RobotCfg) -> EnvCfg:
     )
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}
