@@ -215,11 +215,9 @@ class Fixtures(Part):
 
     def _ranges(self, name: str, fields: Mapping[str, Array]) -> dict[str, Float[Array, "2"]]:
         """Ranges of a fixture's joints; a joint without limits has an infinite one."""
-        now, out = jnp.asarray(fields.get("jnt_range", self._nominal["jnt_range"])), {}
-        for joint, at in zip(self._chains[name].joints, self._joints[name], strict=True):
-            out[joint] = now[at.id] if self._limited(name, joint) else jnp.array([-jnp.inf, jnp.inf])
-        return out
-
-    def _limited(self, name: str, joint: str) -> bool:
-        found = self._chains[name]
-        return bool(np.isfinite(found.lower[found.joints.index(joint)]))
+        now, found = jnp.asarray(fields.get("jnt_range", self._nominal["jnt_range"])), self._chains[name]
+        ranges = [
+            now[at.id] if low > -np.inf else jnp.array([-np.inf, np.inf])
+            for at, low in zip(self._joints[name], found.lower, strict=True)
+        ]
+        return dict(zip(found.joints, ranges, strict=True))

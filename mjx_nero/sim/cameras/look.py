@@ -34,10 +34,11 @@ class Look:
 
     def __init__(self, model: mujoco.MjModel, terms: Terms):
         self._count = len(terms)
+        cameras = [model.camera(i).name for i in range(model.ncam)]
         index = {
             "material": {model.mat(i).name: i for i in range(model.nmat)},
             "robot": {str(i): int(i) for i in np.flatnonzero(model.geom_matid >= 0)},  # nothing else has a material of its own
-            "camera": {model.camera(i).name.removeprefix(MARK): i for i in range(model.ncam) if _ours(model, i)},
+            "camera": {name.removeprefix(MARK): i for i, name in enumerate(cameras) if name.startswith(MARK)},
             "geom": {model.geom(i).name: i for i in range(model.ngeom) if model.geom(i).name},
         }
         self._draws = Draws("look", terms, nominal(model, DRAWABLE), index)
@@ -57,7 +58,3 @@ def rows(model: mujoco.MjModel, scenery: Scenery) -> Iterator[tuple[str, int, An
     for name, box in scenery.obstacles.items():
         row = int(model.geom(name).id)
         yield from (("geom_pos", row, box.pos_w), ("geom_quat", row, box.quat_w), ("geom_size", row, box.size / 2))
-
-
-def _ours(model: mujoco.MjModel, camera: int) -> bool:
-    return model.camera(camera).name.startswith(MARK)

@@ -105,8 +105,8 @@ class RayTracer:
             drawn = functools.partial(call, output_dims=sizes)
             if not sometimes:
                 return tuple(x.reshape(lead + x.shape[1:]) for x in drawn(rows))
-            shapes = jax.eval_shape(drawn, rows)
-            found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: _zeros(shapes), rows)
+            shapes = tuple(jax.eval_shape(drawn, rows))
+            found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: jax.tree.map(jnp.zeros_like, shapes), rows)
             return tuple(x.reshape(lead + x.shape[1:]) for x in found)
 
         return kernels.batched(batched, outputs=3)
@@ -153,10 +153,6 @@ class RayTracer:
             drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
         return data, drawn, seen, kernels.captured(run), (model, run)
-
-
-def _zeros(shapes: Any) -> tuple:
-    return tuple(jnp.zeros(x.shape, x.dtype) for x in shapes)
 
 
 def _bits(values: Array) -> Array:

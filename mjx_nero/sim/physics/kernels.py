@@ -90,7 +90,8 @@ class Programs:
     """What batches need on a device, made at their first call by ``make(number of worlds)`` and then kept."""
 
     def __init__(self, make: Callable[[int], Any]):
-        self._make, self._made = make, {}  # type: tuple[Callable[[int], Any], dict[tuple[str, int], Any]]
+        self._make = make
+        self._made: dict[tuple[str, int], Any] = {}  # by device and number of worlds
 
     def __call__(self, n: int) -> Any:
         """Returns what ``n`` worlds need on Warp's current device."""
