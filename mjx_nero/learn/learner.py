@@ -85,6 +85,24 @@ class Learner(Protocol):
         ...
 
 
+class OfNetworks:
+    """Base of learners whose state has ``normalizer`` and ``params``, which make up the policy. They run on one device."""
+
+    held = {"[0]": ".normalizer", "[1]": ".params"}  # see ``Kind``
+
+    def place(self, state: Any) -> Any:
+        """Returns the state: there is only one device."""
+        return state
+
+    def policy(self, state: Any) -> Params:
+        """Returns normalizer and network parameters."""
+        return state.normalizer, state.params
+
+    def with_policy(self, state: Any, params: Params) -> Any:
+        """Returns a new state that starts from a policy."""
+        return dataclasses.replace(state, normalizer=params[0], params=params[1])
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
     """A registered learner.
