@@ -22,7 +22,8 @@ from mjx_nero.data import open_dataset
 from mjx_nero.data.episode import DONE_BY, SEEN, Dataset
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.clone.cfg import PRESETS, CloneCfg
-from mjx_nero.learn.learner import Kind, Observation, OfNetworks
+from mjx_nero.learn import learner
+from mjx_nero.learn.learner import HELD, Kind, Observation
 from mjx_nero.learn.ppo.cfg import differing
 from mjx_nero.learn.ppo.networks import ACTOR, from_meta, init_params, make_act, make_networks
 from mjx_nero.types import Bank, Key, Shown
@@ -40,7 +41,7 @@ class CloneState:
     slow: Array  # factor of the learning rate
 
 
-class Learner(OfNetworks):
+class Learner(learner.Learner):
     """A ``learner.Learner`` that learns from demonstrations.
 
     Args:
@@ -164,4 +165,4 @@ def _same(path: pathlib.Path, found: Dataset, what: str, name: str, size: int) -
         raise UserError(f"{path} holds no episode yet")
 
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, held=Learner.held, differing=differing)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, held=HELD, differing=differing)

@@ -28,8 +28,8 @@ from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import graph, teachers
 from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
 from mjx_nero.imitation.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
-from mjx_nero.learn import device_memory
-from mjx_nero.learn.learner import Kind, Observation, OfNetworks, repeated
+from mjx_nero.learn import device_memory, learner
+from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
@@ -57,7 +57,7 @@ class Batch:
     label: jax.Array
 
 
-class Learner(OfNetworks):
+class Learner(learner.Learner):
     """A student on a batch of environments.
 
     Args:
@@ -203,4 +203,4 @@ class Learner(OfNetworks):
 
 _PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=Learner.held, graph=graph)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=HELD, graph=graph)

@@ -42,8 +42,8 @@ from jaxtyping import Array, Float, Int
 from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import device_memory, machines
-from mjx_nero.learn.learner import Kind, Observation, OfNetworks, repeated
+from mjx_nero.learn import device_memory, learner, machines
+from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
@@ -91,7 +91,7 @@ class Batch:
     advantages: jax.Array
 
 
-class Learner(OfNetworks):
+class Learner(learner.Learner):
     """PPO on a batch of environments.
 
     Args:
@@ -371,4 +371,4 @@ def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any
     return {**policy, "params": {**layers, name: jax.tree.map(lambda x: jnp.clip(x, *bounds), layers[name])}}
 
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit, held=Learner.held, differing=differing)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit, held=HELD, differing=differing)

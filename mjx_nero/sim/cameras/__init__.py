@@ -35,15 +35,13 @@ class Drawer(Protocol):
             fields: fields of the drawn model that differ from world to world, by MuJoCo's names.
             due: False: nobody looks at that camera's picture, which may be anything. None: all are looked at.
         """
-        ...
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics.prepare``."""
-        ...
 
     def bytes(self) -> int:
         """Returns the memory that one world takes outside of JAX's."""
-        ...
+        return 0
 
 
 class Cameras:

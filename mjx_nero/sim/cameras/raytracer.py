@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool
 
+from mjx_nero.sim.cameras import Drawer
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.fields import nominal
 from mjx_nero.sim.physics import kernels, possible
@@ -24,7 +25,7 @@ from mjx_nero.types import Picture
 _SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
 
 
-class RayTracer:
+class RayTracer(Drawer):
     """See ``cameras.Drawer``. The first pictures of a batch size on a device make the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from mjx_nero.sim import readings
-from mjx_nero.sim.physics import Footprint, possible
+from mjx_nero.sim.physics import Footprint, Physics, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim, UserError
 
@@ -20,7 +20,7 @@ from mjx_nero.types import Sim, UserError
 LINE_SEARCH = 20
 
 
-class JaxPhysics:
+class JaxPhysics(Physics):
     """See ``physics.Physics``."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
@@ -61,9 +61,6 @@ class JaxPhysics:
     def compiler_options(self) -> dict[str, str | bool]:
         """Always None, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
         return {}
-
-    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Does nothing: the compiled program holds everything."""
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the memory of a step: a few times MJX's data."""

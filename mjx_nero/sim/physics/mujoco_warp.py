@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.sim import readings
-from mjx_nero.sim.physics import Footprint, dynamics, fusion, kernels, newton, possible, sensing
+from mjx_nero.sim.physics import Footprint, Physics, dynamics, kernels, newton, possible, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -28,7 +28,7 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 _OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
 
 
-class WarpPhysics:
+class WarpPhysics(Physics):
     """See ``physics.Physics``. The first step with a batch size on a device makes the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
@@ -92,11 +92,6 @@ class WarpPhysics:
             return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
 
         return kernels.batched(batched, outputs=5)
-
-    @property
-    def compiler_options(self) -> dict[str, str | bool]:
-        """See ``physics.fusion``."""
-        return fusion()
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the size of MuJoCo Warp's data, and the free memory."""

@@ -23,7 +23,7 @@ from mujoco import rollout
 
 from mjx_nero import cores
 from mjx_nero.sim import readings
-from mjx_nero.sim.physics import Footprint, fusion, host
+from mjx_nero.sim.physics import Footprint, Physics, host
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -34,7 +34,7 @@ _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDi
 _KEPT = 8
 
 
-class NativePhysics:
+class NativePhysics(Physics):
     """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept for a while.
 
     The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
@@ -118,14 +118,6 @@ class NativePhysics:
                 getattr(models[i], name)[:] = fields[i, at : at + size].reshape(shape)
                 at += size
         present[:] = fields
-
-    @property
-    def compiler_options(self) -> dict[str, str | bool]:
-        """See ``physics.fusion``."""
-        return fusion()
-
-    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Does nothing: the first step is as quick as any."""
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns what an environment takes of the host: a model of its own where fields are drawn, and the arrays of a step."""
