@@ -9,11 +9,11 @@ from typing import Any
 
 import mujoco
 
+from mjx_nero.sim import touch
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 WRIST, FINGERS = "wrist", "fingers"  # the readings, and the prefixes of their sensors' names
-_NET = 3  # of a contact sensor: one force for all contacts, in the world's axes
 
 
 def add(spec: mujoco.MjSpec, robot: RobotCfg, names: Collection[str]) -> None:
@@ -34,13 +34,7 @@ def add(spec: mujoco.MjSpec, robot: RobotCfg, names: Collection[str]) -> None:
     if not pads:
         raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, and {robot.name} has none")
     for geom in pads:
-        spec.add_sensor(
-            name=f"{FINGERS}:{geom.name}",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_GEOM,
-            objname=geom.name,
-            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), _NET, 1],
-        )
+        touch.add_sensor(spec, geom.name, reading=FINGERS, reduce=touch.NET)
 
 
 def _hand(spec: mujoco.MjSpec, robot: RobotCfg) -> Any:

@@ -21,6 +21,7 @@ from mjx_nero.types import UserError
 OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
 COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
 NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
+STRONGEST, NET = 2, 3  # what a contact sensor gives: the force of the strongest contact, or that of all, in the world's axes
 # Shapes that every backend can collide with a box.
 MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
 _SAMPLES = 1000  # postures in which links are tested
@@ -66,16 +67,15 @@ def collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     return geoms
 
 
-def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, reading: str = NAME) -> None:
-    """Adds a sensor of the strongest contact of a geom: with another one, or with anything."""
-    data, strongest = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2
+def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, reading: str = NAME, reduce: int = STRONGEST) -> None:
+    """Adds a sensor of the contact force of a geom: with another one, or with anything."""
     spec.add_sensor(
         name=":".join(filter(None, (reading, first, second))),
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_GEOM,
         objname=first,
         **({"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": second} if second else {}),
-        intprm=[data, strongest, 1],
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), reduce, 1],
     )
 
 
