@@ -1,8 +1,12 @@
-"""The pictures that are not a command's own: python docs/make_pictures.py
+"""Draws the pictures that no command draws: python docs/make_pictures.py [NAME ...]
 
-docs/lift.webp, one Nero that lifts with the policy that ships, docs/thousand.webp, a thousand of them in one batch, and more:
-docs/gallery/, an episode of every environment and, as "seeing", of the policies that see, docs/objects.png, the package's
-objects, and docs/failures/, three failures of tasks that fall short. A name makes one; gallery/nero_push is one film.
+A name draws one of them, no name all:
+    lift         docs/lift.webp: one Nero lifts with its bundled policy
+    thousand     docs/thousand.webp: a thousand of them in one batch
+    gallery      docs/gallery/: an episode of every environment; gallery/nero_push draws one film
+    seeing       docs/gallery/: episodes of the policies that see
+    objects.png  the package's objects
+    failures     docs/failures/: three failures of each task that falls short
 """
 
 import dataclasses
@@ -37,7 +41,7 @@ FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late
 
 
 def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
-    """Qpos [steps, num_envs, nq] and scenery [steps, num_envs, ...] of the shipped policy's episodes."""
+    """Returns qpos [steps, num_envs, nq] and scenery [steps, num_envs, ...] of the bundled policy's episodes."""
     shipped = policy.load_for(env, "nero_lift", None)
     run = rollout.runner(env, lambda params, obs, *_: shipped.act(obs), env.num_envs, record=env.num_envs)
     found = run(None, 1)
@@ -46,7 +50,7 @@ def play(env: mjx_nero.ManipulationEnv) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write(path: pathlib.Path, frames: list[Image.Image], seconds: float, quality: int) -> None:
-    """An animated WebP."""
+    """Writes an animated WebP."""
     frames[0].save(
         path, save_all=True, append_images=frames[1:], duration=round(1e3 * seconds), loop=0, quality=quality, method=4
     )
@@ -54,7 +58,7 @@ def write(path: pathlib.Path, frames: list[Image.Image], seconds: float, quality
 
 
 def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
-    """Low before the first row of a thousand robots, so that the near ones are seen to work and the far ones to be many."""
+    """Returns a camera low before the first row of a thousand robots: near ones show their work, far ones their number."""
     model.vis.map.zfar = model.vis.map.fogend = 100.0  # of the scene's extent: the last row is 50 m away
     model.vis.quality.numslices, model.vis.quality.numstacks = 12, 6  # of round shapes: robots of a few pixels need no more
     camera = mujoco.MjvCamera()
@@ -64,7 +68,7 @@ def amid(model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 
 def gallery(folder: pathlib.Path) -> None:
-    """A small moving picture of every environment that somebody is good at: its bundled policy, or a controller."""
+    """Films every environment that has a bundled policy or is only for controllers."""
     learnt = set(results.learnable())
     for name in filter(registry.robot_of, mjx_nero.list_envs()):
         if name not in learnt or policy.shipped(name).exists():
@@ -72,34 +76,34 @@ def gallery(folder: pathlib.Path) -> None:
 
 
 def episode(path: pathlib.Path) -> None:
-    """The first episode of an environment that succeeds, by who plays it by default."""
+    """Films the first successful episode of an environment, played by its bundled policy or its controller."""
     played = evaluation.play(evaluation.EvalCfg(path.stem, episodes=8, record=8, backend="mujoco"))
     film(path.with_suffix(".webp"), played, np.argmax(played.episodes.success, keepdims=True))
 
 
 def seeing(folder: pathlib.Path) -> None:
-    """The same of the policies that act on pictures, which are in the corner."""
+    """Films the policies that act on pictures, with these in the corner."""
     for name in SEEING:
         played = evaluation.play(evaluation.EvalCfg(name, preset="rgb", episodes=4, record=4, backend="mujoco"))
         film(folder.with_name("gallery") / f"{name}_rgb.webp", played, np.argmax(played.episodes.success, keepdims=True))
 
 
 def objects_sheet(path: pathlib.Path) -> None:
-    """The package's objects as they rest, and behind each its convex parts."""
+    """Draws the package's objects at rest, and behind each its convex parts."""
     each = [things.picture(things.of(name), 426, 240) for name in objects.names()]
     sheet = np.concatenate([np.concatenate(each[i : i + 3], axis=1) for i in range(0, len(each), 3)])
     Image.fromarray(sheet).save(path, optimize=True)
 
 
 def failures(folder: pathlib.Path) -> None:
-    """The first three of 200 episodes that fail, one after another, as ``eval.py --failures`` shows them."""
+    """Films the first three failures in 200 episodes, one after another, as ``eval.py --failures`` does."""
     for name in FALL_SHORT:
         played = evaluation.play(evaluation.EvalCfg(name, episodes=200, record=200, backend="mujoco"))
         film(folder / f"{name}.webp", played, np.flatnonzero(~played.episodes.success)[:3])
 
 
 def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> None:
-    """A small moving picture of the recorded episodes named, 40 frames each, as good as it may be large."""
+    """Films the recorded episodes ``which``, 40 frames each, in the best quality within ``LARGEST``."""
     path.parent.mkdir(exist_ok=True)
     shown, frames = played.episodes.recorded(which), []
     every = max(1, len(shown.qpos) // 40)
@@ -117,7 +121,7 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
 
 
 def main() -> None:
-    """All pictures, or those named."""
+    """Draws all pictures, or those named."""
     cli.setup_jax()
     folders = {"gallery": gallery, "seeing": seeing, "failures": failures, "objects.png": objects_sheet}
     for name in sys.argv[1:] or (*folders, *PICTURES):

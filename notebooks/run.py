@@ -1,6 +1,6 @@
 """Runs the notebooks and keeps their outputs: python notebooks/run.py [01_nero_lift ...], with the extra ``dev``.
 
-What differs from run to run, progress lines and times, is left out: a change of the outputs is a change of what they show.
+It drops what differs from run to run (progress lines, times), so a change of the outputs is a change of what they show.
 """
 
 import base64
@@ -32,7 +32,7 @@ def run(path: pathlib.Path) -> None:
 
 
 def kept(output: nbformat.NotebookNode) -> nbformat.NotebookNode | None:
-    """What is kept of an output: pictures, and what was printed; None: nothing."""
+    """Returns the part of an output to keep, pictures and printed text; None: nothing."""
     if output.output_type == "stream":
         output.text = _TIMES.sub("", output.text)
         return output if output.name == "stdout" and output.text.strip() else None
@@ -44,7 +44,7 @@ def kept(output: nbformat.NotebookNode) -> nbformat.NotebookNode | None:
 
 
 def small(png: str) -> str:
-    """The picture in 256 colours, which is a third of its bytes. Small things keep theirs."""
+    """Returns the picture in 256 colours, a third of its bytes. Small details keep their colours."""
     picture, out = Image.open(io.BytesIO(base64.b64decode(png))), io.BytesIO()
     picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4).save(out, "PNG", optimize=True)
     return base64.b64encode(out.getvalue()).decode()

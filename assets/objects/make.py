@@ -1,7 +1,7 @@
 """Makes the package's objects from convex parts: python assets/objects/make.py
 
-Every object is a list of convex parts, each the hull of a few points in metres, z up. NAME/parts.obj holds these, what touches;
-NAME/NAME.obj is their union, what is drawn and weighed; NAME/object.yaml says what both are called, and the density.
+Every object is a list of convex parts, each the hull of a few points in metres, z up. NAME/parts.obj has the parts, for contacts;
+NAME/NAME.obj is their union, for drawing and mass; NAME/object.yaml names both files and gives the density.
 """
 
 import math
@@ -31,7 +31,7 @@ def frustum(low: float, high: float, bottom: float, top: float, sides: int = 16)
 
 
 def wall(inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int) -> list[Points]:
-    """A hollow slice of a cone: convex pieces in a ring. Radii at the bottom and at the top."""
+    """A hollow slice of a cone, as a ring of convex pieces. Radii are at the bottom and at the top."""
     pieces = []
     for i in range(sides):
         ends = 2 * math.pi * np.array([i, i + 1]) / sides
@@ -50,7 +50,7 @@ def wall(inner: tuple[float, float], outer: tuple[float, float], bottom: float, 
 
 
 def along_x(points: Points, at: float = 0.0) -> Points:
-    """Lays what stands along z down along x, its foot at ``at``."""
+    """Lays points that stand along z down along x, with their foot at ``at``."""
     return points[:, [2, 1, 0]] * [1, 1, -1] + [at, 0, 0]
 
 
@@ -138,7 +138,7 @@ OBJECTS: dict[str, tuple[Callable[[], list[Points]], float, tuple[float, float, 
 
 
 def main() -> None:
-    """Writes every object into a folder of its name."""
+    """Writes every object into a folder named after it."""
     for name, (make, density, colour) in OBJECTS.items():
         parts = [trimesh.PointCloud(points).convex_hull for points in make()]
         whole = trimesh.boolean.union(parts, engine="manifold") if len(parts) > 1 else parts[0]

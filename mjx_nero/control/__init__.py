@@ -18,7 +18,7 @@ from mjx_nero.control.put_in import PutIn, PutInCfg, PutThing, PutThingCfg
 from mjx_nero.control.turn_over import TurnOver, TurnOverCfg
 from mjx_nero.sim.robot import RobotCfg
 
-# name -> (class, its config); the class takes (robot, dt, config), and in a scene of several robots the others by name
+# name -> (class, its config). The class takes (robot, dt, config), and in a scene of several robots also the others by name.
 CONTROLLERS: Registry[tuple[Any, Any]] = Registry(
     "controller",
     {

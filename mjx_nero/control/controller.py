@@ -9,7 +9,7 @@ from mjx_nero.types import View
 Memory = Any  # a pytree; the controller's state between control steps
 
 
-@runtime_checkable  # the tests' type checks ask
+@runtime_checkable  # for the tests' type checks
 class Controller(Protocol):
     """A controller of one environment. It is pure: ``jax.vmap`` makes thousands."""
 

@@ -1,4 +1,4 @@
-"""Detour: carries the grasp point over obstacles. The target runs up, across and down.
+"""Detour: carries the grasp point over obstacles. The target moves up, across and down.
 
 With RMPflow the whole arm keeps clear of the boxes. A robot without RMPflow's files follows the same path by inverse kinematics,
 which ignores the boxes.
@@ -24,15 +24,15 @@ Corners = Float[Array, "n 3"]
 
 @dataclasses.dataclass(frozen=True)
 class DetourCfg:
-    """The way and the arm's motion; lengths in m.
+    """Settings of the path and the arm's motion; lengths in m.
 
     Attributes:
         clearance: height of the end effector above the highest obstacle while it crosses.
-        speed: speed of the target along the way [m/s].
+        speed: speed of the target along the path [m/s].
         ramp: distance from a corner within which the target slows down, nearly to rest: a jerk would shake the object off.
-        lead: the target waits if it is further than this from the end effector.
+        lead: the target waits if it is farther than this from the end effector.
         motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
-        rmpflow, ik: of the arm's motion.
+        rmpflow, ik: settings of the arm's motion.
     """
 
     clearance: float = 0.12
@@ -46,7 +46,7 @@ class DetourCfg:
 
 @struct.dataclass
 class Way:
-    """Straight legs from corner to corner, how far along them the target is [m], and the set-point of an arm that keeps one."""
+    """A path of straight legs, the target's distance along it [m], and the set-point of an arm that keeps one."""
 
     corners: Corners
     travelled: Float[Array, ""]
@@ -54,17 +54,17 @@ class Way:
 
     @classmethod
     def through(cls, *corners: Float[Array, "3"]) -> "Way":
-        """Makes the way through these corners, with the target at its beginning."""
+        """Makes the path through these corners, with the target at its beginning."""
         return cls(jnp.stack(corners), jnp.zeros(()))
 
     @property
     def ends(self) -> Float[Array, " n"]:
-        """Places of the corners along the way [m]."""
+        """Distances of the corners along the path [m]."""
         return jnp.append(0.0, jnp.cumsum(jnp.linalg.norm(jnp.diff(self.corners, axis=0), axis=1)))
 
     @property
     def length(self) -> Float[Array, ""]:
-        """Length of the whole way [m]."""
+        """Length of the whole path [m]."""
         return self.ends[-1]
 
     def to_corner(self) -> Float[Array, ""]:
@@ -78,12 +78,12 @@ class Way:
         return self.corners[0] + jnp.sum((done / jnp.maximum(lengths, 1e-6))[:, None] * legs, axis=0)
 
     def on(self, by) -> "Way":
-        """Moves the target further along, up to the end [m]."""
+        """Moves the target ``by`` further along the path, at most to its end [m]."""
         return dataclasses.replace(self, travelled=jnp.minimum(self.travelled + by, self.length))
 
 
 def over(start: Float[Array, "3"], goal: Float[Array, "3"], view: View, clearance: float) -> Way:
-    """Makes a way from start to goal, ``clearance`` above the highest obstacle in between. Obstacles stand upright."""
+    """Makes a path from start to goal, ``clearance`` above the highest obstacle in between. Obstacles stand upright."""
     tops = [jnp.where(box.pos_w[2] > 0, box.pos_w[2] + box.size[2] / 2, -jnp.inf) for box in view.obstacles.values()]
     height = jnp.maximum(jnp.max(jnp.stack(tops)) + clearance, jnp.maximum(start[2], goal[2]))
     return Way.through(start, start.at[2].set(height), goal.at[2].set(height), goal)
@@ -98,7 +98,7 @@ class Detour:
         cfg: see ``DetourCfg``.
 
     Raises:
-        UserError: ``motion`` is another; the robot has no RMPflow files, or they do not fit it.
+        UserError: ``motion`` is neither rmpflow nor ik; or the robot has no RMPflow files, or they do not fit it.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: DetourCfg = DetourCfg()):
@@ -110,55 +110,55 @@ class Detour:
         self._down = np.array(robot.down, np.float32)
 
     def init(self, view: View) -> Way:
-        """Plans the way from the end effector's position."""
+        """Plans the path from the end effector's position."""
         return self._begin(over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance), view)
 
     def _begin(self, way: Way, view: View) -> Way:
-        """The way with the arm where it is."""
+        """Returns the path with the set-point where the arm is."""
         return dataclasses.replace(way, setpoint=view.joint_pos[: self._n]) if self._ik else way
 
     def step(self, memory: Way, view: View) -> tuple[Way, Float[Array, " nu"]]:
-        """Targets of the arm's drives; the gripper's stay."""
+        """Computes the targets of the arm's drives; the gripper's stay."""
         memory, targets = self._follow(memory, view, jnp.zeros(3), None)
         return memory, jnp.concatenate([targets, view.ctrl[self._n :]])
 
     def _follow(self, way: Way, view: View, offset, orientation, weight=None) -> tuple[Way, Float[Array, " nj"]]:
-        """Takes one step along a way; ``offset`` leads from the way to the end effector's place [m]."""
+        """Takes one step along a path; the end effector's place is ``offset`` from the path [m]."""
         position = way.target()
         goes = jnp.linalg.norm(position + offset - view.ee_pos_w) < self.cfg.lead
-        # Under a constant acceleration up to ``ramp``; at a corner a tenth of the speed, or it would stay there.
+        # Constant acceleration within ``ramp``. At a corner a tenth of the speed remains, or the target would stay there.
         speed = self.cfg.speed * jnp.clip(jnp.sqrt(way.to_corner() / self.cfg.ramp), 0.1, 1.0)
         after = way.on(jnp.where(goes, speed * self.dt, 0.0))
         target = Target(position + offset, orientation, (after.target() - position) / self.dt, weight)
         if self._rmpflow:
             return after, self._rmpflow.arm(view, target)
         assert self._ik is not None and way.setpoint is not None
-        # As far down as it goes: after its present orientation a hand would drift.
+        # The hand points down as far as it can. If it were to keep its present orientation, it would drift.
         setpoint, targets = self._ik.arm(way.setpoint, dataclasses.replace(target, orientation=jnp.asarray(self._down)))
         return dataclasses.replace(after, setpoint=setpoint), targets
 
     def warning(self, memory: Way) -> str:
-        """Says where the target never got to the goal."""
+        """Says in how many episodes the target did not reach the goal."""
         left = _lengths(memory) - np.asarray(memory.travelled)
         late = left > 1e-3
         return f"{late.sum()} of {late.size} episodes ended on the way" if late.any() else ""
 
 
 def _lengths(ways: Way) -> np.ndarray:
-    """Lengths of a batch of ways."""
+    """Lengths of a batch of paths."""
     return np.linalg.norm(np.diff(np.asarray(ways.corners), axis=-2), axis=-1).sum(-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class CarryPastCfg(DetourCfg):
-    """``DetourCfg`` and the grasp.
+    """``DetourCfg`` with the settings of the grasp.
 
     Attributes:
         approach: height above the object from which the gripper comes down [m].
         end_effector_offset: offset of the grasp point from the object's centre [m].
         near: distance from the grasp at which the end effector counts as arrived [m].
-        settling: wait before the gripper closes [s]: moving fingers would push the object out.
-        closing: time until the arm carries the object off [s]. The fingers take as long to close: quick ones would drive into the
+        settling: wait before the gripper closes [s]: moving fingers would push the object away.
+        closing: time until the arm carries the object off [s]. The fingers take as long to close: faster ones would dig into the
             object before contact stops them, and shoot it out.
         object: name of the object to carry.
     """
@@ -184,7 +184,7 @@ class CarryPast(Detour):
     """Picks the object up with the gripper straight down, and carries it to the goal over the obstacles.
 
     Args:
-        robot: robot that carries.
+        robot: the robot that carries.
         dt: control step [s].
         cfg: see ``CarryPastCfg``.
     """
@@ -201,21 +201,21 @@ class CarryPast(Detour):
         self._offset = np.array(cfg.end_effector_offset, np.float32)
 
     def init(self, view: View) -> CarryMemory:  # type: ignore[override]
-        """Plans the way to the object, from above."""
+        """Plans the path to the object, from above."""
         at = view.objects[self.cfg.object].pos_w + self._offset
         above = at + jnp.array([0.0, 0.0, self.cfg.approach])
-        way = self._begin(Way.through(view.ee_pos_w, above, above, at), view)  # as many corners as the way over obstacles
+        way = self._begin(Way.through(view.ee_pos_w, above, above, at), view)  # as many corners as the path over obstacles
         return CarryMemory(way, jnp.zeros((), jnp.int32), jnp.asarray(self._offset))
 
     def step(self, memory: CarryMemory, view: View) -> tuple[CarryMemory, Float[Array, " nu"]]:  # type: ignore[override]
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         at, holds = view.objects[self.cfg.object].pos_w, memory.there >= self._closed
         off = dataclasses.replace(over(at, view.goal_pos_w, view, self.cfg.clearance), setpoint=memory.way.setpoint)
         way = jax.tree.map(lambda new, old: jnp.where(memory.there == self._closed, new, old), off, memory.way)
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)
         grip = memory.grip + jnp.where(holds, GRIP_FILTER, 0.0) * (slip - memory.grip)
-        # A hand that holds may turn as it has to.
+        # A hand that holds the object may turn freely.
         way, targets = self._follow(way, view, jnp.where(holds, grip, 0.0), jnp.asarray(self._down), jnp.where(holds, 0.0, 1.0))
         there = memory.there + (arrived | (memory.there > 0))
         fingers = self._gripper.forward(
@@ -224,5 +224,5 @@ class CarryPast(Detour):
         return CarryMemory(way, there, grip), jnp.concatenate([targets, fingers])
 
     def warning(self, memory: CarryMemory) -> str:  # type: ignore[override]
-        """Says where the object never got to the goal."""
+        """Says in how many episodes the object did not reach the goal."""
         return super().warning(memory.way)

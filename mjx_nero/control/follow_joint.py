@@ -22,28 +22,28 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
 BEFORE, IN, CLOSE, MOVE = range(4)
-_SETTLING = 0.25  # [s] in about this time a handle that has slipped in the hand is brought the rest of its way
+_SETTLING = 0.25  # [s] time constant with which the set-point makes up for a handle that has slipped in the hand
 _STILL = 0.05  # [rad/s]
-_STIFF = UNREACHABLE / 2  # a hand that does not turn with the handle counts as so many radians to move
-_LOST = 0.04  # [m] further than this from the grasp point, the handle has been lost
+_STIFF = UNREACHABLE / 2  # cost of a hand that does not turn with the handle, in radians of joint motion
+_LOST = 0.04  # [m] distance from the grasp point beyond which the handle has been lost
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
 
 @dataclasses.dataclass(frozen=True)
 class FollowJointCfg:
-    """Settings of the hold and the motion.
+    """Settings of the grasp and the motion.
 
     Attributes:
-        file: the fixture's (``FixtureCfg.file``).
+        file: name of the fixture's file (``FixtureCfg.file``).
         handle: what to take hold of, how, and where its joint has to go.
-        beyond: how much farther than its target the joint is moved, as a share.
-        follow: share of the joint's turn that the hand makes; none if the arm cannot. A round bar turns between the pads.
+        beyond: how far past its target the joint is moved, as a share of the target.
+        follow: share of the joint's rotation that the hand follows; none if the arm cannot. A round bar turns between the pads.
         before: distance in front of the handle from which the hand comes [m].
         depth: how far the grasp point goes beyond the middle of the handle, in the hand's direction [m].
-        speed: of the grasp point [m/s].
-        ahead: the set-point is at most so far ahead of the handle [m]: what the hand pulls with.
-        closing: how long the fingers take [s].
-        ik: of the arm's motion.
+        speed: speed of the grasp point [m/s].
+        ahead: greatest lead of the set-point over the handle, with which the hand pulls [m].
+        closing: time that the fingers take to close [s].
+        ik: settings of the arm's motion.
     """
 
     file: str = "cabinet"
@@ -63,26 +63,26 @@ class FollowJointMemory(setpoint.Script):
     """The state of ``FollowJoint`` between two steps."""
 
     before: Float[Array, " nj"]  # the arm in front of the handle [rad]
-    flip: Float[Array, ""]  # turn of the hand about the way in: 0 or half a turn [rad]
-    follow: Float[Array, ""]  # share of the joint's turn that the hand makes
+    flip: Float[Array, ""]  # turn of the hand about its approach: 0 or half a turn [rad]
+    follow: Float[Array, ""]  # share of the joint's rotation that the hand follows
     out: Float[Array, ""]  # how far in front of the handle the set-point is [m]
     joint: Float[Array, ""]  # where the set-point is on the joint's path [rad or m]
-    slip: Float[Array, ""]  # how far it has to go beyond the target, so that the joint gets there [rad or m]
+    slip: Float[Array, ""]  # how far the set-point has to go beyond the target, so that the joint gets there [rad or m]
 
 
 class FollowJoint:
-    """Grasps the handle and moves it; if it slips out, once more.
+    """Grasps the handle and moves it. If the handle slips out, it tries again.
 
     | phase | before | in | close | move |
     | --- | --- | --- | --- | --- |
     | grasp point | in front of the handle | at the handle | stays | along the joint's path, to its target |
     | fingers | open | open | close | closed |
 
-    A phase ends when the arm is where it ought to be, or after a time in which it should be. The fixture's file says how the
-    handle moves with its joint, slide or hinge.
+    A phase ends when the arm has arrived, or when its time is up. The fixture's file says how the handle moves with its joint,
+    slide or hinge.
 
     Args:
-        robot: what pulls.
+        robot: the robot that pulls.
         dt: control step [s].
         cfg: see ``FollowJointCfg``.
 
@@ -102,16 +102,16 @@ class FollowJoint:
         self._lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
         travel = np.abs(self.gripper.opened - self.gripper.closed)
         self._finger_step = np.minimum(np.array(robot.gripper.speed), travel / cfg.closing).astype(np.float32) * dt
-        self._step = cfg.speed * dt / handle.lever  # of the joint
+        self._step = cfg.speed * dt / handle.lever  # of the joint [rad or m]
         self._grip, self._frame = np.array(robot.grip, np.float32), self._chain.frames.index(handle.site)
         # The direction in which the hand points, in its own frame.
         self._approach = np.array(math.rotate(math.quat_conj(jnp.array(robot.down)), jnp.array([0.0, 0.0, -1.0])), np.float32)
         self._lost = float(np.linalg.norm(robot.grip)) + _LOST
 
     def init(self, view: View) -> FollowJointMemory:
-        """Chooses how to take hold: of both ways to turn the hand, the one that reaches the whole path with the least motion.
+        """Chooses the grasp: of the two turns of the hand that fit, the one that reaches the whole path with the least motion.
 
-        If neither does, and the hand was to turn with the handle, it does not.
+        If neither reaches it while the hand follows the joint's rotation, the hand does not follow it.
         """
         zero, q = jnp.zeros((), jnp.int32), view.joint_pos[: self._n]
         now, follows = self._now(view), jnp.array([self.cfg.follow, self.cfg.follow, 0.0, 0.0])
@@ -129,7 +129,7 @@ class FollowJoint:
         return FollowJointMemory(zero, zero, q, still, zero, found[0].q[best], flips[best], follows[best], out, now, slip)
 
     def step(self, memory: FollowJointMemory, view: View) -> tuple[FollowJointMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         phase, now = memory.phase, self._now(view)
         holds = phase == MOVE
         step = self.cfg.speed * self.dt
@@ -171,10 +171,10 @@ class FollowJoint:
         return f"{(tries > 0).sum()} of {tries.size} episodes lost the handle and tried again" if tries.any() else ""
 
     def _ended(self, memory: FollowJointMemory, error: Float[Array, ""], out: Float[Array, ""]) -> Bool[Array, ""]:
-        """True if the phase is done, or has had enough time.
+        """True if the phase is done, or its time is up.
 
         Args:
-            error: of the grasp point [m].
+            error: position error of the grasp point [m].
             out: how far the set-point is in front of the handle [m].
         """
         time, still = (memory.count + 1) * self.dt, jnp.max(jnp.abs(memory.qd)) < 0.1
@@ -199,9 +199,9 @@ class FollowJoint:
         return jnp.clip(wanted, low, high)
 
     def _pose(self, view: View, flip: Float[Array, ""], follow: Float[Array, ""], joint: Array, out: float | Array) -> Pose:
-        """Pose of the hand that fits the handle where its joint is at ``joint``, from ``out`` in front of it [m].
+        """Pose of the hand ``out`` in front of the handle [m], if the handle's joint were at ``joint``.
 
-        The hand turns along with the joint, by the share ``follow``.
+        The hand follows the share ``follow`` of the joint's rotation.
         """
         (pos, _), (_, turn) = self._site(view, joint), self._site(view, follow * joint)
         site = math.quat_mul(turn, math.axis_angle(jnp.array([1.0, 0.0, 0.0]), flip))

@@ -41,9 +41,9 @@ class IkFollower:
     Without a solution the set-point stays where it is.
 
     Args:
-        robot: its ``ee_site`` follows.
+        robot: robot whose ``ee_site`` follows.
         dt: control step [s].
-        cfg: of the solver.
+        cfg: settings of the solver.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg | None = None):
@@ -58,7 +58,7 @@ class IkFollower:
         return IkMemory(q=view.joint_pos[: self._n], step=zero, failures=zero)
 
     def step(self, memory: IkMemory, view: View) -> tuple[IkMemory, Float[Array, " nu"]]:
-        """Targets of the arm's drives; the gripper's stay."""
+        """Computes the targets of the arm's drives; the gripper's stay."""
         key = jax.random.fold_in(jax.random.PRNGKey(0), memory.step)
         found = self.ik.solve(view.goal_pos_w, view.goal_quat_w, memory.q, key)
         goal = jnp.where(found.success, found.q, memory.q)
@@ -68,7 +68,7 @@ class IkFollower:
         return IkMemory(q, memory.step + 1, failures), jnp.concatenate([targets, view.ctrl[self._n :]])
 
     def warning(self, memory: IkMemory) -> str:
-        """Says where the solver failed."""
+        """Says in how many steps the solver failed."""
         failed = np.asarray(memory.failures)
         if not failed.any():
             return ""
@@ -79,14 +79,14 @@ class IkFollower:
 
 
 class IkArm:
-    """Keeps up with a slow target by inverse kinematics from the set-point on, without jumps, at the drives' speed limits.
+    """Follows a slow target by inverse kinematics from the set-point, without jumps, within the drives' speed limits.
 
     If the target is out of reach, the arm comes as near as it can.
 
     Args:
-        robot: its ``ee_site`` follows.
+        robot: robot whose ``ee_site`` follows.
         dt: control step [s].
-        cfg: of the solver.
+        cfg: settings of the solver.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: IkCfg):
@@ -105,7 +105,7 @@ class RmpFollower:
     """Follows the target by RMPflow, from the measured joint state at every step.
 
     Args:
-        robot: its ``ee_site`` follows.
+        robot: robot whose ``ee_site`` follows.
         dt: control step [s].
         cfg: files and integration.
         obstacles: obstacles to avoid; None: the scene's.
@@ -126,12 +126,12 @@ class RmpFollower:
         return ()
 
     def step(self, memory: Memory, view: View) -> tuple[Memory, Float[Array, " nu"]]:
-        """Targets of the arm's drives; the gripper's stay."""
+        """Computes the targets of the arm's drives; the gripper's stay."""
         target = Target(view.goal_pos_w, view.goal_quat_w, view.goal_linvel_w)
         return memory, jnp.concatenate([self.arm(view, target), view.ctrl[self._n :]])
 
     def arm(self, view: View, target: Target) -> Float[Array, " nj"]:
-        """Targets of the arm's drives on the way to ``target`` [rad]."""
+        """Computes the targets of the arm's drives on the way to ``target`` [rad]."""
         obstacles = Obstacles.seen(view) if self._obstacles is None else self._obstacles
         q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, obstacles, self.dt)
         return q + self._lead * qd

@@ -1,4 +1,4 @@
-"""Picks up a thing of a mesh by one of the grasps that fit the way it lies, and holds it at the goal."""
+"""Picks up a mesh object by one of the grasps that fit its resting pose, and holds it at the goal."""
 
 import dataclasses
 import functools
@@ -18,8 +18,8 @@ from mjx_nero.sim.objects import kept_grasps
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
-_GAPS = 9  # at which the place of the pads' middle is known
-_COST_COUNTS = 1.5  # [rad] a grasp that is dearer by 1 is worth so much motion of the joints
+_GAPS = 9  # number of gaps for which the place of the pads' middle is computed
+_COST_COUNTS = 1.5  # [rad] joint motion that one unit of a grasp's cost is worth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +27,8 @@ class GraspThingCfg(PickUpCfg):
     """Settings of the grasp and its speed; ``heading`` and ``turns`` are not used.
 
     Attributes:
-        files: of the object's shapes: its ``file`` and its ``bank``.
-        scale: of the meshes.
+        files: files of the object's shapes: its ``file`` and its ``bank``.
+        scale: factor of the meshes' lengths.
     """
 
     files: tuple[str, ...] = ()
@@ -40,25 +40,25 @@ class GraspThingMemory(PickUpMemory):
     """The state of ``GraspThing`` between two steps."""
 
     opened: Float[Array, " ng"]  # positions of the open fingers [rad or m]
-    middle: Float[Array, "3"]  # of the pads, in the thing's frame [m]
+    middle: Float[Array, "3"]  # middle of the pads, in the thing's frame [m]
 
 
 class GraspThing(PickUp):
-    """``PickUp`` for things of any shape: tables of grasps take the place of headings and turns.
+    """``PickUp`` for things of any shape: tables of grasps replace headings and turns.
 
     Args:
-        robot: what picks.
+        robot: the robot that picks.
         dt: control step [s].
         cfg: see ``GraspThingCfg``.
 
     Raises:
-        UserError: ``files`` is empty, or the hand can grasp none of the things in any way.
+        UserError: ``files`` is empty, or the hand cannot grasp any of the things.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: GraspThingCfg = GraspThingCfg()):
         super().__init__(robot, dt, cfg)
         if not cfg.files:
-            raise UserError("grasp_thing needs files: of the meshes that it is to pick up (control.files)")
+            raise UserError("grasp_thing needs files (control.files): those of the meshes to pick up")
         table = kept_grasps.table(cfg.files, cfg.scale, grasp.hand(robot))
         self._ups, self._middles, self._across, self._gaps, self._costs = (np.asarray(x, np.float32) for x in table)
         formulas = grasp.formulas(robot)
@@ -94,7 +94,7 @@ class GraspThing(PickUp):
         )
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         assert isinstance(memory, GraspThingMemory)
         after, targets = super().step(memory, view)
         ends = jnp.where(memory.phase >= CLOSE, jnp.asarray(self.gripper.closed), memory.opened)
@@ -120,7 +120,7 @@ class GraspThing(PickUp):
         return dataclasses.replace(memory, **{name: jnp.where(lost, new[name], getattr(memory, name)) for name in new})
 
     def _ways(self, view: View) -> tuple[Array, Array, Array, Array]:
-        """Middles of the pads in the world, turns of the hand, gaps and costs of all grasps that fit the way the thing lies."""
+        """Middles of the pads in the world, turns of the hand, gaps and costs of all grasps that fit the thing's resting pose."""
         seen = view.objects[self.cfg.object]
         index = jnp.zeros((), jnp.int32) if seen.shape is None else seen.shape.index
         up = math.rotation_matrix(seen.quat_w)[2]
@@ -139,7 +139,7 @@ class GraspThing(PickUp):
         )
 
     def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""], gap: Float[Array, ""]) -> Float[Array, "3"]:
-        """Computes the place of the grasp point with the pads' middle there, but not too near the table."""
+        """Computes the place of the grasp point for this middle of the pads, which is kept off the table."""
         height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
         aside = jnp.interp(gap, self._opened, self._aside)
         return middle.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
@@ -149,7 +149,7 @@ class GraspThing(PickUp):
         return math.rotate(math.quat_conj(seen.quat_w), place - seen.pos_w)
 
     def _open(self, gap: Float[Array, ""]) -> Float[Array, " ng"]:
-        """Positions of the fingers with this gap between the pads."""
+        """Positions of the fingers at which the pads are ``gap`` apart."""
         if self._positions is None:
             return jnp.asarray(self.gripper.opened)
         return self.gripper._clip(self._positions(gap))

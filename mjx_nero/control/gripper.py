@@ -13,28 +13,28 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 Positions = Float[Array, " n"]
-PRESS = 0.15  # [s] the fingers press so long before the hand moves
-GRIP_FILTER = 0.05  # of how far the object is off in the grip: the share of a new measurement, a control step
+PRESS = 0.15  # [s] how long the fingers press before the hand moves
+GRIP_FILTER = 0.05  # weight per control step of a new measurement of where the object is in the grip
 
 
 class ParallelGripper:
     """A robot's gripper, with the interface of Isaac Sim's class of this name.
 
     With ``action_deltas``, ``open`` and ``close`` lead the *measured* positions by a constant step (+ opens, - closes), which a
-    position drive turns into a roughly constant force. Without, they ask for the opened and the closed positions. All targets
-    keep to the joints' ranges.
+    position drive turns into a roughly constant force. Without ``action_deltas``, the targets are the opened and the closed
+    positions. All targets stay within the joints' ranges.
 
     Args:
         robot: robot with the gripper.
         opened, closed: joint positions [rad or m]; None: the robot's own.
-        action_deltas: [rad or m], one a joint, or None.
+        action_deltas: one step per joint [rad or m], or None.
 
     Attributes:
-        joints: names, in the order of all positions.
-        opened, closed: [n].
+        joints: joint names, in the order of all positions.
+        opened, closed: joint positions [n].
 
     Raises:
-        UserError: a list does not have one value a joint.
+        UserError: a list does not have one value per joint.
     """
 
     def __init__(
@@ -68,12 +68,12 @@ class ParallelGripper:
         return self._clip(positions + jnp.asarray(deltas, jnp.float32))
 
     def pace(self, closing: float, dt: float) -> tuple[float, Float[np.ndarray, " n"]]:
-        """Returns when a hand that closes without haste has closed and presses [s], and how far its fingers move in a step.
+        """Returns the time until a hand that closes gently has closed and presses [s], and its fingers' motion per step.
 
-        Drives that lag are slow to press, and their heavy rotors throw what they meet at speed.
+        Drives that lag press late, and at speed their heavy rotors throw what they hit.
 
         Args:
-            closing: how long the fingers take [s], beside the lag of their drives.
+            closing: time that the fingers take to close [s], besides the lag of their drives.
             dt: control step [s].
         """
         lag, travel = float(np.max(self._robot.gripper.lead, initial=0.0)), np.abs(self.opened - self.closed)

@@ -20,30 +20,31 @@ from mjx_nero.types import UserError, View
 
 OVER, DOWN, CLOSE, UP, MEET, NEAR, REACH, GRIP, LET, LEAVE, BRING, HOLD = range(12)
 _SLOW = 0.1  # [rad/s]
-_THERE = 0.05  # [rad] an arm so near to where it goes has arrived
-_LONGEST = 4.0  # [s] of a way across; and of a way up or down:
-_SHORT = 1.0
-_CLOSE = 0.005  # [m] a hand so near to its place on the object closes
-_WITHIN = 0.01  # [m] the taking hand comes down once it is so near to its place over the object
-_AHEAD = 0.03  # [m] the set-point corrects the object's place at the goal by so much at most
+_THERE = 0.05  # [rad] greatest joint error of an arm that has arrived
+_LONGEST = 4.0  # [s] time limit of a motion across
+_SHORT = 1.0  # [s] time limit of a motion up or down, beyond its usual duration
+_CLOSE = 0.005  # [m] distance from its place on the object at which a hand closes
+_WITHIN = 0.01  # [m] distance from its place over the object at which the taking hand comes down
+_AHEAD = 0.03  # [m] greatest correction of the set-point for the object's place at the goal
 
 
 @dataclasses.dataclass(frozen=True)
 class HandOverCfg:
-    """Settings of the way and its speed; lengths in m.
+    """Settings of the script; lengths in m.
 
     Attributes:
-        object: a long object, along its own x axis. The giving hand takes it before its middle, the taking hand behind.
+        object: an object that is long along its own x axis. The giver holds it on the negative side of its middle, the taker on
+            the positive side.
         taker: name of the robot that takes it over.
         along: distance of each hand from the object's middle.
-        meet: the object's middle, where it changes hands, from the giver's root; it then lies along x.
-        turns: how far the first joint of giver and taker turns from home to the meeting [rad].
-        lowest: height of the pads' middle above the table, at least, of giver and taker.
-        beyond: how much further down the pads' middle is than the grasp point, of giver and taker.
-        closing: how long the fingers take [s], beside the lag of their drives, of giver and taker.
-        above: hands come down from so high over the object, and lift it so high.
-        speed: of a grasp point on its way up or down [m/s].
-        ik: of the arms' motion.
+        meet: where the object's middle is when it changes hands, relative to the giver's root. The object then lies along x.
+        turns: how far the first joint of giver and taker turns from home to the meeting point [rad].
+        lowest: least height of the pads' middle above the table, of giver and taker.
+        beyond: how far the pads' middle is below the grasp point, of giver and taker.
+        closing: time that the fingers take to close [s], besides the lag of their drives, of giver and taker.
+        above: height over the object at which hands start their descent, and to which they lift it.
+        speed: speed of a grasp point on its way up or down [m/s].
+        ik: settings of the arms' motion.
     """
 
     object: str = "bar"
@@ -65,10 +66,10 @@ class ArmMemory:
 
     q: Float[Array, " nj"]  # [rad]
     qd: Float[Array, " nj"]  # [rad/s]
-    pos: Float[Array, "3"]  # of the grasp point [m]
-    yaw: Float[Array, ""]  # of the hand about the vertical [rad]
+    pos: Float[Array, "3"]  # the grasp point [m]
+    yaw: Float[Array, ""]  # the hand's turn about the vertical [rad]
     first: Float[Array, " nj"]  # the arm over the object [rad]
-    second: Float[Array, " nj"]  # and where it brings it
+    second: Float[Array, " nj"]  # the arm where it brings the object [rad]
 
 
 @struct.dataclass
@@ -79,11 +80,11 @@ class HandOverMemory:
     count: Int[Array, ""]  # steps made in this stage
     giver: ArmMemory
     taker: ArmMemory
-    grip: Float[Array, "3"]  # from where the object belongs to the set-point, at the goal [m]
+    grip: Float[Array, "3"]  # correction of the set-point at the goal [m]
 
 
 class _Arm:
-    """One robot, as the script knows it. ``faces``: the turn of its mount about the vertical [rad]."""
+    """One robot of the script. ``faces`` is the turn of its mount about the vertical [rad]."""
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: HandOverCfg, place: int):
         self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik)
@@ -95,14 +96,14 @@ class _Arm:
         self.gentle = setpoint.gentle(robot.arm.lead)
         self.closed, self.finger_step = self.gripper.pace(cfg.closing[place], dt)
         self.lowest, self.beyond = cfg.lowest[place], cfg.beyond[place]
-        self.side = np.float32(cfg.along * (2 * place - 1))  # of its end of the object
+        self.side = np.float32(cfg.along * (2 * place - 1))  # place of the hand along the object's x axis [m]
 
     def hand(self, yaw: Float[Array, ""]) -> Float[Array, "4"]:
-        """The hand's orientation, pointing down, for an object's heading."""
+        """The orientation of a hand that points down on an object with this heading."""
         return math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw + self.faces), jnp.asarray(self.down))
 
     def place(self, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]) -> Float[Array, "3"]:
-        """Place of the grasp point for an object whose middle is at ``pos``, which lies along ``yaw`` and rises by ``pitch``."""
+        """Place of the grasp point for an object with its middle at ``pos``, its heading ``yaw`` and its slope ``pitch``."""
         along = jnp.stack([jnp.cos(yaw) * jnp.cos(pitch), jnp.sin(yaw) * jnp.cos(pitch), jnp.sin(pitch)])
         end = pos + self.side * along
         height = jnp.maximum(end[2], self.lowest) + self.beyond
@@ -116,7 +117,7 @@ class _Arm:
     def step(
         self, arm: ArmMemory, across: Bool[Array, ""], to: Float[Array, " nj"], pos: Float[Array, "3"], held: Bool[Array, ""]
     ) -> ArmMemory:
-        """Moves the set-point: across, to the joint positions ``to``; otherwise straight, as far as ``pos``."""
+        """Moves the set-point: to the joint positions ``to`` if ``across``, otherwise straight to ``pos``."""
         found = self.ik.local(pos, self.hand(arm.yaw), arm.q).q
         fastest = jnp.where(held, self.gentle, setpoint.FASTEST)
         wanted = jnp.where(across, to, found)
@@ -126,28 +127,28 @@ class _Arm:
 
 
 def _there(view: View, arm: ArmMemory, end: Float[Array, " nj"]) -> Bool[Array, ""]:
-    """True if the arm is where it goes to, and its set-point rests."""
+    """True if the arm is at ``end``, and its set-point rests."""
     return (jnp.max(jnp.abs(end - view.joint_pos[: len(end)])) < _THERE) & (jnp.max(jnp.abs(arm.qd)) < _SLOW)
 
 
 class HandOver:
-    """Takes, holds out, takes over, lets go, brings.
+    """The giver picks the object up and holds it out. The taker takes it over and brings it to the goal.
 
     | stage | over, down, close, up | meet | near, reach, grip | let, leave | bring, hold |
     | --- | --- | --- | --- | --- | --- |
     | giver | picks the object up | holds it out | holds it out | opens, goes up | goes home |
     | taker | goes over the meeting point | is there | comes down at the other end, closes | holds | brings it to the goal |
 
-    A stage ends when the arms are where they ought to be, or after a time in which they should be.
+    A stage ends when the arms have arrived, or when its time is up.
 
     Args:
-        robot: what gives.
+        robot: the robot that gives.
         dt: control step [s].
         cfg: see ``HandOverCfg``.
         others: the scene's further robots by name.
 
     Raises:
-        UserError: ``taker`` is none of them.
+        UserError: ``taker`` is not one of them.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ class HandOver:
     ):
         if cfg.taker not in (others or {}):
             there = ", ".join(others or {}) or "none but the first"
-            raise UserError(f"hand_over: taker is {cfg.taker!r}, and the scene's further robots are: {there}")
+            raise UserError(f"hand_over: taker is {cfg.taker!r}, but the scene's further robots are: {there}")
         self.dt, self.cfg, self._root = dt, cfg, np.array(robot.base_pos, np.float32)
         taker = (others or {})[cfg.taker]
         self._giver, self._taker = _Arm(robot, dt, cfg, 0), _Arm(taker, dt, cfg, 1)
@@ -175,7 +176,7 @@ class HandOver:
         return HandOverMemory(start, start, giver, taker, jnp.zeros(3))
 
     def _plan(self, arm: _Arm, view: View, ways: list) -> ArmMemory:
-        """Finds the arm's two places; each is the object's middle, its heading, where to look from, and whether it is over it."""
+        """Finds the arm at two places; each is the object's middle, its heading, a first guess, and whether to stay above."""
         zero = jnp.zeros(())
         places = [arm.place(pos, yaw, zero) + over * self._up for pos, yaw, _, over in ways]
         quats, starts = [arm.hand(yaw) for _, yaw, _, _ in ways], [jnp.asarray(q) for _, _, q, _ in ways]
@@ -184,7 +185,7 @@ class HandOver:
         return ArmMemory(q, jnp.zeros_like(q), view.ee_pos_w, ways[0][1], found[0], found[1])
 
     def step(self, memory: HandOverMemory, view: View) -> tuple[HandOverMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         stage, first, second = memory.stage, view.of(), view.of(self.cfg.taker)
         pos, yaw, pitch = self._seen(view)
         giver, low = self._give(memory, pos, yaw, pitch)
@@ -228,7 +229,7 @@ class HandOver:
     def _take(
         self, memory: HandOverMemory, view: View, pos: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
     ) -> tuple[ArmMemory, Float[Array, "3"]]:
-        """The taker's next set-point, and where its grasp point is to be."""
+        """The taker's next set-point, and where its grasp point has to be."""
         stage, arm, mine = memory.stage, memory.taker, self._taker
         goal_yaw = math.yaw(view.goal_quat_w)
         low, goal = mine.place(pos, yaw, pitch), mine.place(view.goal_pos_w, goal_yaw, jnp.zeros(())) + memory.grip
@@ -242,11 +243,11 @@ class HandOver:
         return mine.step(arm, across, to, next, stage > GRIP), end
 
     def _ended(self, memory: HandOverMemory, reached: list, off: list) -> Bool[Array, ""]:
-        """True if the stage is done, or has had enough time.
+        """True if the stage is done, or its time is up.
 
         Args:
-            reached: of giver and taker, whether the arm is at its first and at its second place.
-            off: of giver and taker, how far the hand is from where it takes the object, or over it [m].
+            reached: for giver and taker, whether the arm is at its first and at its second place.
+            off: for giver and taker, how far the hand is from where it takes the object, or from over it [m].
         """
         time, way = (memory.count + 1) * self.dt, self.cfg.above / self.cfg.speed
         (over, meets), (waits, brought) = reached
@@ -268,7 +269,7 @@ class HandOver:
         )[memory.stage]
 
     def _towards(self, pos: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A step of the way from ``pos`` to ``end``."""
+        """One step of the way from ``pos`` to ``end``."""
         way = end - pos
         return pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (jnp.linalg.norm(way) + 1e-6))
 

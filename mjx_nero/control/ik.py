@@ -24,17 +24,17 @@ class IkCfg:
     """Tolerances and budget.
 
     Attributes:
-        position_tolerance: [m]; a descent ends where both tolerances are met, so tighten them for more than that.
-        orientation_tolerance: angle between the frames [rad].
-        orientation_weight: a radian counts as so many metres [m/rad].
-        damping: of a step, as a share of the squared residual: large steps far away, quadratic convergence close by.
-        max_distance: a target further away than this pulls no harder [m].
-        iterations: most steps of one descent.
-        restarts: rounds of descents from random starts, if the warm start fails; each ends as soon as all poses are solved.
-        starts: descents in a round, or the number of poses where that is larger. The unsolved poses share them evenly.
-        candidates: random configurations from which each start is chosen: the one closest to the target.
-        free_turn: turns about the vertical do not count: for arms of few joints, whose hand is turned as it points down.
-        spread: share of the joint ranges, about their centres, that candidates are drawn from. Starts near a limit often get
+        position_tolerance: greatest position error [m]. A descent ends once both tolerances are met; tighten them for accuracy.
+        orientation_tolerance: greatest angle between the frames [rad].
+        orientation_weight: how many metres one radian of error counts as [m/rad].
+        damping: damping of a step, as a share of the squared residual: large steps far away, quadratic convergence close by.
+        max_distance: distance beyond which a target pulls no harder [m].
+        iterations: greatest number of steps of one descent.
+        restarts: rounds of descents from random starts, if the warm start fails. A round ends as soon as all poses are solved.
+        starts: descents in a round, or the number of poses if that is larger. The unsolved poses share them evenly.
+        candidates: random configurations per start; the one closest to the target is used.
+        free_turn: ignores turns about the vertical: for arms with too few joints to choose them while the hand points down.
+        spread: share of the joint ranges, about their centres, from which candidates are drawn. Starts near a limit often get
             stuck there.
     """
 
@@ -77,22 +77,22 @@ class _Poses:
 
 
 class InverseKinematics:
-    """Joint positions that bring a frame of a robot to a pose in the world. Collisions are not looked at.
+    """Finds joint positions that bring a frame of a robot to a pose in the world. It ignores collisions.
 
     Levenberg-Marquardt steps with the geometric Jacobian, damped in proportion to the squared residual (Sugihara, "Solvability-
     unconcerned inverse kinematics by the Levenberg-Marquardt method", 2011) and projected onto the joint limits: a joint that
-    a step would push through its limit stays there and the others do the work. Whole turns away from ``q0`` are taken back where
-    the limits allow it.
+    a step would push through its limit stays there and the others do the work. Whole turns away from ``q0`` are undone where the
+    limits allow it.
 
     The methods are pure; compile them with ``jax.jit``. A target that is not finite, or a zero quaternion, gives ``q0`` (within
     the limits), no success and infinite errors.
 
     Args:
-        robot: its arm is what moves.
-        frame: site or body to place; the grasp point unless given.
+        robot: robot whose arm moves.
+        frame: site or body to place; None: the grasp point.
         cfg: tolerances and budget.
-        point: of the frame, in its own axes [m]: this is what has to be where the pose puts it. It tells only where the
-            orientation cannot be met: a hand that leans then still has an object between its fingers.
+        point: the point of the frame, in its own axes [m], that has to be where the pose puts it. It matters only if the
+            orientation cannot be met: a hand that leans then still has the object between its fingers.
 
     Attributes:
         chain: poses and Jacobians of ``frame`` as a function of the arm joints.
@@ -113,38 +113,38 @@ class InverseKinematics:
         self.cfg = cfg
         self.chain = Chain(model, robot.arm.joints, [frame or robot.ee_site])
         self._hinge = np.array([model.joint(j).type[0] == mujoco.mjtJoint.mjJNT_HINGE for j in robot.arm.joints])
-        # Where candidates come from; a joint without limits gets one turn, or a metre each way.
+        # Range of the candidates; a joint without limits gets one turn, or a metre each way.
         unlimited = np.where(self._hinge, np.pi, 1.0).astype(np.float32)
         lower = np.where(np.isfinite(self.chain.lower), self.chain.lower, -unlimited)
         upper = np.where(np.isfinite(self.chain.upper), self.chain.upper, unlimited)
         self._center, self._half = (lower + upper) / 2, cfg.spread * (upper - lower) / 2
-        # A controller solves at several places of a step: Python traces it once for all of them.
+        # A controller solves at several places in a step. This way, Python traces the solver once for all of them.
         self._solve = jax.jit(self._solved, static_argnums=4)
 
     def solve(self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"], key: Key) -> Solution:
-        """One pose, from ``q0`` first, then from random starts; of several solutions in a round the one closest to ``q0``.
+        """Solves one pose, first from ``q0``, then from random starts. Of a round's solutions, the closest to ``q0`` counts.
 
         Args:
             pos: position of the frame in the world [m].
             quat: its orientation, wxyz.
             q0: warm start [rad or m].
-            key: of the random starts; the result is a function of the arguments.
+            key: random key of the starts; equal arguments give equal results.
         """
         return jax.tree.map(lambda x: x[0], self.solve_batch(pos[None], quat[None], q0[None], key))
 
     def local(
         self, pos: Float[Array, "3"], quat: Float[Array, "4"], q0: Float[Array, " nj"], weight: float | Array | None = None
     ) -> Solution:
-        """One pose from ``q0`` alone: for control loops, whose targets are near and where a jump to another solution harms.
+        """Solves one pose from ``q0`` alone: for control loops, where targets are near and a jump to another solution harms.
 
         Args:
-            weight: of the orientation [m/rad]; None: the config's.
+            weight: orientation weight [m/rad]; None: the config's.
         """
         weight = self.cfg.orientation_weight if weight is None else weight
         return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], jax.random.PRNGKey(0), 0, weight))
 
     def solve_batch(self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key) -> Solution:
-        """``solve`` for many poses at once. Quicker than ``vmap``: the starts go to the poses that are still unsolved."""
+        """``solve`` for many poses at once. Faster than ``vmap``: the starts go to the poses that are still unsolved."""
         return self._solve(pos, quat, q0, key, self.cfg.restarts, self.cfg.orientation_weight)
 
     def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int, weight: Array) -> Solution:
@@ -206,7 +206,7 @@ class InverseKinematics:
         n, q0 = len(target), poses.q0
         trial = Solution(start, jnp.zeros(n, bool), jnp.full(n, jnp.inf), jnp.full(n, jnp.inf))
         _, trial, _ = jax.lax.while_loop(going, step, (0, trial, start))
-        # The same pose, with each joint as close to the warm start as whole turns bring it
+        # The same pose, with each joint as close to the warm start as whole turns bring it.
         q = trial.q - 2 * jnp.pi * self._hinge * jnp.round((trial.q - q0[target]) / (2 * jnp.pi))
         trial = dataclasses.replace(trial, q=jnp.where(q == self._within(q), q, trial.q))
 
@@ -216,7 +216,7 @@ class InverseKinematics:
         return jax.tree.map(lambda old, x: old.at[at].set(x, mode="drop"), found, trial)
 
     def _rating(self, found: Solution, q0: Float[Array, "n nj"]) -> Float[Array, " n"]:
-        """The less, the better: successes by their distance from the warm start, then failures by their error."""
+        """Rates solutions, lower is better: successes by distance from the warm start, then failures by error."""
         error = found.position_error + self.cfg.orientation_weight * found.orientation_error
         return jnp.where(found.success, jnp.linalg.norm(found.q - q0, axis=1), _FAR + error)
 

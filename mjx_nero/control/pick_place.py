@@ -1,4 +1,4 @@
-"""Pick and place in ten phases, as Isaac Sim's controller of this name: purely by time, without any planning."""
+"""Pick and place in ten phases, like Isaac Sim's controller of this name: by time alone, without planning."""
 
 import dataclasses
 
@@ -17,8 +17,7 @@ from mjx_nero.mdp.towers import GOAL
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
-_FASTEST = 1.0  # [m/s]: a target that moves on faster has jumped
-# Share of a new measurement in the place in the grip: unfiltered, the arm would follow its own tremor.
+_FASTEST = 1.0  # [m/s] a target that moves faster than this has jumped
 PHASES = ("above pick", "down", "settle", "close", "up", "across", "down", "open", "up", "away")
 _CLOSE, _OPEN = PHASES.index("close"), PHASES.index("open")
 
@@ -29,17 +28,17 @@ class PickPlaceCfg:
 
     Attributes:
         events_dt: the share of each phase that one control step takes; a phase has ceil(1 / share) steps.
-        wait: how much longer the fingers take than the phases in which they close and open [s].
-        end_effector_initial_height: of the grasp point above the cube's table, while it travels.
-        end_effector_offset: of the grasp point from the cube's centre. The tutorial's 0.25 m counts from the flange and would
-            press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
+        wait: extra time of the fingers in the phases in which they close and open [s].
+        end_effector_initial_height: height above the robot's root at which the grasp point travels.
+        end_effector_offset: offset of the grasp point from the cube's centre. The tutorial's 0.25 m is measured from the flange,
+            and would press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
         arc: travel from pick to place about the robot's axis; False: on a straight line.
         motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
-        rmpflow, ik: of the arm's motion.
-        tower: what to pick, one after another, and where each goes: onto the one before, the first of which stays where it is or
-            is the goal (see ``mdp.towers``).
-        rise: from the centre of an object to that of the one on it.
-        turn: the hand is turned as the object is, and then as the goal is.
+        rmpflow, ik: settings of the arm's motion.
+        tower: the objects from the bottom up. Each is put onto the one before it. The first one stays where it is, or is the goal
+            (see ``mdp.towers``).
+        rise: height from the centre of an object to that of the one on it.
+        turn: turns the hand as the object is turned, and then as the goal is.
     """
 
     # The tutorial's shares work, too, but take 96 s at 50 Hz. These take 17 s: the arc to the tutorial's goal turns the base by
@@ -52,7 +51,7 @@ class PickPlaceCfg:
     arc: bool = True
     motion: str = "rmpflow"
     rmpflow: RmpCfg = RmpCfg()
-    # Tight: what the solver leaves out it makes up for at once in a later step, and the drives' lead makes a kick of that.
+    # Tight: the solver corrects at once, in a later step, what it leaves out now, and the drives' lead turns that into a kick.
     ik: IkCfg = IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-4)
     tower: tuple[str, ...] = (GOAL, "cube")
     rise: float = 0.0
@@ -69,12 +68,12 @@ class PickPlaceMemory:
     move: Int[Array, ""]  # which object, from 0
     phase: Int[Array, ""]  # 0 to 9; 10: done
     count: Int[Array, ""]  # steps made in this phase
-    start: Pose  # of the grasp point, where the way to this object began
-    tilt: Float[Array, "3"]  # of the hand there, from pointing straight down: a rotation vector in its frame [rad]
+    start: Pose  # the grasp point where the way to this object began
+    tilt: Float[Array, "3"]  # tilt of the hand there from pointing straight down: a rotation vector in its frame [rad]
     pick: Pose  # where the object was when the fingers last went for it
     grip: Float[Array, "3"]  # from the object to the grasp point, while it is carried, as if the hand were not turned
-    target: Pose  # of the grasp point
-    setpoint: Float[Array, " nj"]  # of the arm [rad]
+    target: Pose  # set-point of the grasp point
+    setpoint: Float[Array, " nj"]  # set-point of the arm [rad]
 
 
 class PickPlace:
@@ -86,17 +85,17 @@ class PickPlace:
     | height | start to travel | down | stays | stays | up | travel | down | stays | up | travel |
     | fingers | open | open | open | close | closed | closed | closed | open | open | open |
 
-    Time alone changes phase. Not as in the tutorial: the height of the travel (0.6 m is out of reach over its goal), the arc, a
-    smooth start, a velocity target beside the position, and that the object's own place in the grip is seen and made up for while
-    it is carried, since it slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
+    Time alone ends a phase. Differences from the tutorial: the travel height (0.6 m is out of reach over its goal), the arc, a
+    smooth start, and a velocity target besides the position. The controller also observes where the object is in the grip and
+    corrects for it, because the object slides by some millimetres in a turn (assets/cobotta_pro_900/README.md).
 
     Args:
-        robot: what picks, gripper straight down.
+        robot: the robot that picks, with its gripper straight down.
         dt: control step [s].
         cfg: see ``PickPlaceCfg``.
 
     Raises:
-        UserError: ``events_dt`` has not ten shares in 0 to 1, ``motion`` is another, or ``tower`` has nothing to move.
+        UserError: ``events_dt`` is not ten shares in 0 to 1, ``motion`` is unknown, or ``tower`` has nothing to move.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: PickPlaceCfg = PickPlaceCfg()):
@@ -105,9 +104,9 @@ class PickPlace:
         if cfg.motion not in ("rmpflow", "ik"):
             raise UserError(f"motion must be rmpflow or ik, got {cfg.motion!r}")
         if len(cfg.tower) < 2:
-            raise UserError(f"tower names what stays or {GOAL!r}, then one object or more to move there, got {cfg.tower}")
+            raise UserError(f"tower names what stays or {GOAL!r}, then one or more objects to put there, got {cfg.tower}")
         self.dt, self.cfg = dt, cfg
-        # Integers: adding up shares in float32 gives other counts. The small part forgives 1 / 0.05 = 20.000000000000004.
+        # Integers: adding up shares in float32 gives other counts. The small term absorbs 1 / 0.05 = 20.000000000000004.
         self.steps = np.array([int(np.ceil(1 / share - 1e-6)) for share in cfg.events_dt], np.int32)
         self.steps[[_CLOSE, _OPEN]] += round(cfg.wait / dt)
         self.gripper = ParallelGripper(robot)
@@ -133,18 +132,18 @@ class PickPlace:
         )
 
     def is_done(self, memory: PickPlaceMemory) -> Bool[Array, ""]:
-        """All ten phases are over for all objects; the arm then stays where it is."""
+        """True once all ten phases are over for all objects; the arm then stays where it is."""
         return memory.phase >= len(PHASES)
 
     def step(self, memory: PickPlaceMemory, view: View) -> tuple[PickPlaceMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         phase = jnp.minimum(memory.phase, len(PHASES) - 1)
         steps = jnp.asarray(self.steps)[phase]
         seen = jnp.stack([self._pose(view, name) for name in self.cfg.tower[1:]])[memory.move]
         place = jnp.stack([self._place(view, below) for below in self.cfg.tower[:-1]])[memory.move]
         memory = dataclasses.replace(memory, pick=jnp.where(phase <= 1, seen, memory.pick))
-        # Only while it is carried, and only what can still be a grip. Across, from the target: an arm that yields to its load
-        # takes the object aside by more than the hand's own error.
+        # Measured only while the object is carried, and limited to what can still be a grip. Horizontally it counts from the
+        # target: an arm that yields to its load moves the object aside by more than the hand's own error.
         carried = (phase >= 4) & (phase <= 6)
         slip = _turned(memory.target[:3].at[2].set(view.ee_pos_w[2]) - seen[:3], -memory.target[3])
         slip = jnp.clip(slip, self._offset - 0.03, self._offset + 0.03)

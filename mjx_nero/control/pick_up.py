@@ -19,10 +19,10 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
 ABOVE, DOWN, CLOSE, UP, CARRY = range(5)
-_CHOICES = 8  # ways to turn the hand that are looked at
-UNREACHABLE = 100.0  # counts as so many radians to move
-_ROOM_COUNTS = 60.0  # [rad/m] a metre of room is worth so much motion of the joints
-_LOST = 0.05  # [m] further than this from where it is in a good grasp, the object has been lost
+_CHOICES = 8  # number of turns of the hand to consider
+UNREACHABLE = 100.0  # cost of a pose out of reach, in radians of joint motion
+_ROOM_COUNTS = 60.0  # [rad/m] joint motion that a metre of room for the fingers is worth
+_LOST = 0.05  # [m] distance from its place in a good grasp beyond which the object has been lost
 _SLOW = 0.2  # [rad/s]
 # [m/rad] weight of the hand's orientation at the goal. Where the hand has to lean, 0.03 leaves it centimetres beside the goal.
 _HELD = 0.003
@@ -34,16 +34,16 @@ class PickUpCfg:
 
     Attributes:
         object: what to pick up.
-        heading: of each object that may be it (``View.target``), which of its axes lies across the opening of the hand when the
-            fingers fit: 0, 1 or 2.
-        turns: likewise, how many turns about the vertical in a full one look the same; 0: it is round.
-        aside: likewise, how far the pads' middle is from its usual place along the opening (``grasp.aside``); empty: not at all.
-        lowest: height of the pads' middle above the robot's table, at least.
-        beyond: the grasp point: from there the pads' middle is so much further down.
-        above: the hand comes down from so high over the object, and lifts it so high before it carries it away.
-        speed: of the grasp point [m/s].
-        closing: how long the fingers take [s], beside the lag of their drives.
-        ik: of the arm's motion. At the goal orientation weighs hardly anything: where the hand cannot point down, it tilts.
+        heading: for each object that may be commanded (``View.target``), the axis that lies across the opening of the hand when
+            the fingers fit: 0, 1 or 2.
+        turns: for each of them, how many turns about the vertical look the same; 0: it is round.
+        aside: for each of them, offset of the pads' middle from its usual place along the opening (``grasp.aside``); empty: none.
+        lowest: least height of the pads' middle above the robot's root.
+        beyond: how far the pads' middle is below the grasp point.
+        above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away.
+        speed: speed of the grasp point [m/s].
+        closing: time that the fingers take to close [s], besides the lag of their drives.
+        ik: settings of the arm's motion. At the goal, orientation has little weight: a hand that cannot point down leans.
     """
 
     object: str = "cube"
@@ -63,34 +63,34 @@ class PickUpMemory(setpoint.Script):
     """The state of ``PickUp`` between two steps."""
 
     above: Float[Array, " nj"]  # the arm over the object [rad]
-    pos: Float[Array, "3"]  # where the grasp point is on its way from there
-    pick: Float[Array, "3"]  # and has to be to grasp
-    yaw: Float[Array, ""]  # how the hand is turned about the vertical [rad]
-    grip: Float[Array, "3"]  # from the object to the set-point, while it is carried
+    pos: Float[Array, "3"]  # set-point of the grasp point [m]
+    pick: Float[Array, "3"]  # where the grasp point has to be to grasp [m]
+    yaw: Float[Array, ""]  # the hand's turn about the vertical [rad]
+    grip: Float[Array, "3"]  # from the object to the set-point, while it is carried [m]
 
 
 class PickUp:
-    """Grasps the object from above and holds it at the goal; if it slips out, once more.
+    """Grasps the object from above and holds it at the goal. If the object slips out, it tries again.
 
     | phase | above | down | close | up | to the goal |
     | --- | --- | --- | --- | --- | --- |
-    | grasp point | over the object | at the object | stays | over where that lay | carries it to the goal |
+    | grasp point | over the object | at the object | stays | over where the object lay | carries it to the goal |
     | fingers | open | open | close | closed | closed |
 
-    A phase ends when the arm is where it ought to be, or after a time in which it should be. Of the ways to turn the hand that
-    fit the object and that the arm can reach, it takes one with much room for the fingers beside others and little way to go.
+    A phase ends when the arm has arrived, or when its time is up. Of the turns of the hand that fit the object and that the arm
+    can reach, it takes one with much room for the fingers beside other objects, and with little way to go.
 
     Args:
-        robot: what picks.
+        robot: the robot that picks.
         dt: control step [s].
         cfg: see ``PickUpCfg``.
 
     Attributes:
         gripper, ik: the hand's fingers, and the arm's kinematics.
-        lead: how far the arm's targets go ahead of its set-point, by joint [s].
+        lead: how far the arm's targets lead its set-point, by joint [s].
         gentle: greatest acceleration of the arm with the object in its hand [rad/s2].
-        closed, finger_step: when the fingers have closed [s], and how far they move in a step.
-        lost: distance of the object from its place in the hand from which on it counts as lost [m].
+        closed, finger_step: time after which the fingers have closed [s], and how far they move in a step.
+        lost: distance of the object from its place in the hand beyond which it counts as lost [m].
 
     Raises:
         UserError: ``heading``, ``turns`` or ``aside`` differ in length, or name no axis.
@@ -98,9 +98,9 @@ class PickUp:
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: PickUpCfg = PickUpCfg()):
         if len(cfg.heading) != len(cfg.turns) or not set(cfg.heading) <= {0, 1, 2} or min(cfg.turns, default=-1) < 0:
-            raise UserError(f"heading and turns are an axis (0, 1, 2) and a number an object, got {cfg.heading} and {cfg.turns}")
+            raise UserError(f"heading and turns take an axis (0 to 2) and a number per object, got {cfg.heading} and {cfg.turns}")
         if cfg.aside and len(cfg.aside) != len(cfg.turns):
-            raise UserError(f"aside takes one value an object, got {cfg.aside} for {len(cfg.turns)}")
+            raise UserError(f"aside takes one value per object, got {cfg.aside} for {len(cfg.turns)}")
         self.dt, self.cfg = dt, cfg
         self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik, point=robot.grip)
         self._n = len(robot.arm.joints)
@@ -110,8 +110,8 @@ class PickUp:
         self.gentle = setpoint.gentle(robot.arm.lead)
         self.closed, self.finger_step = self.gripper.pace(cfg.closing, dt)
         self.lost = float(np.linalg.norm(robot.grip)) + _LOST
-        self._reach = robot.opening / 2  # of a finger from the grasp point
-        # From an object's heading; a round one has none.
+        self._reach = robot.opening / 2  # distance of a finger from the grasp point
+        # Relative to an object's heading; a round object has none.
         angles = [np.arange(_CHOICES) * 2 * np.pi / (turns or _CHOICES) for turns in cfg.turns]
         self._choices = np.array(angles, np.float32)
 
@@ -130,9 +130,9 @@ class PickUp:
         return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         phase, seen = memory.phase, view.objects[self.cfg.object].pos_w
-        # From the set-point, while the arm hardly moves: what it is off is made up for as well.
+        # Measured from the set-point, while the arm hardly moves, so that the arm's own error is corrected as well.
         off, slow = memory.pos - seen, jnp.max(jnp.abs(memory.qd)) < _SLOW
         grip = jnp.where(phase == CLOSE, off, memory.grip)
         grip += jnp.where((phase == CARRY) & slow, GRIP_FILTER, 0.0) * (off - grip)
@@ -151,10 +151,11 @@ class PickUp:
         fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
 
         lost = (phase >= UP) & (self.off(memory, view) > self.lost)
+        falls = (phase == ABOVE) & (memory.tries > 0)
         held, meant = (math.rotate(quat, jnp.asarray(self._grip)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), far < 1e-3)
         memory = dataclasses.replace(
-            self.again(memory, view, lost),
+            self.again(memory, view, lost | falls),
             phase=jnp.where(lost, ABOVE, phase + ended),
             count=jnp.where(lost | ended, 0, memory.count + 1),
             q=q,
@@ -170,11 +171,11 @@ class PickUp:
         return jnp.linalg.norm(view.ee_pos_w - view.objects[self.cfg.object].pos_w)
 
     def _ended(self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""]) -> Bool[Array, ""]:
-        """True if the phase is done, or has had enough time.
+        """True if the phase is done, or its time is up.
 
         Args:
-            error: of the grasp point [m].
-            arrived: the set-point has.
+            error: position error of the grasp point [m].
+            arrived: the set-point has arrived.
         """
         time = (memory.count + 1) * self.dt
         still = jnp.max(jnp.abs(memory.qd)) < 0.1
@@ -212,13 +213,14 @@ class PickUp:
 
     def _pick(self, view: View, yaw: Float[Array, ""]) -> Float[Array, "3"]:
         """Computes where the grasp point must be."""
-        seen = view.objects[self.cfg.object].pos_w
-        height = jnp.maximum(seen[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
+        seen, table = view.objects[self.cfg.object].pos_w, view.root_pos_w[2]
+        low = jnp.maximum(0.0, grasp.CLEAR - (seen[2] - table) / 2)  # a low object must not be at the pads' lower edges
+        height = jnp.maximum(seen[2], table + self.cfg.lowest - low) + self.cfg.beyond
         aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
         return seen.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Distance from the open fingers to the nearest of the other objects' centres [m], at most the hand's width."""
+        """Distance from the open fingers to the nearest of the other objects' centres [m], at most half the hand's opening."""
         middle = view.objects[self.cfg.object].pos_w[:2]
         tips = self._reach * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=1)  # the fingers open along the hand's y
         others = jnp.stack([other.pos_w for other in view.objects.values()])[:, :2] - middle

@@ -1,4 +1,4 @@
-"""Picks an object up and puts it into a hole or over a post, from above; searches where the hole is not where it should be."""
+"""Picks an object up and puts it into a hole or over a post, from above. It searches if the hole is not where it should be."""
 
 import dataclasses
 from typing import Any
@@ -22,15 +22,15 @@ from mjx_nero.types import View
 PICK, OVER, IN, OPEN, AWAY = range(5)
 _SLOW = 0.1  # [rad/s]
 _UP, _STILL = np.array([0.0, 0.0, 1.0], np.float32), np.array([1.0, 0.0, 0.0, 0.0], np.float32)
-_TURN, _TURN_SHARE = 1.0, 0.1  # [rad/s] the hand turns so fast at most; share of what the object's turn lacks, a control step
-_STANDS = 0.25  # of the speed down: what is slower than this stands on something
-_SHARE, _AHEAD = 0.06, 0.004  # of an error along the table, a control step; what it adds up to at most [m]
-# The same share while the object rubs on the rim, and the search's greatest speed about the goal [rad/s]: a set-point that turns
-# faster than it is made up for goes round, and the object sticks where it is.
+_TURN, _TURN_SHARE = 1.0, 0.1  # [rad/s] greatest speed of the hand's turn; share of a missing turn made per step
+_STANDS = 0.25  # share of the speed down: an object that is slower than this stands on something
+_SHARE, _AHEAD = 0.06, 0.004  # share of an error along the table corrected per control step; their greatest sum [m]
+# The same share while the object rubs on the rim, and the greatest speed of the search [rad/s]: a set-point that circles
+# faster than errors are corrected leaves the object stuck where it is.
 _RUBS, _ROUND = 0.2, 5.0
-_CLEARS = 0.003  # [m] that the object is above the rim before it goes across
-_STROKE = 0.005  # [m] an object that has gone so far down is in
-_CLOSE, _ALIGNED = 1.5e-3, 0.03  # [m, rad] the object is over its place
+_CLEARS = 0.003  # [m] height of the object above the rim before it moves across
+_STROKE = 0.005  # [m] depth below the rim at which an object is in
+_CLOSE, _ALIGNED = 1.5e-3, 0.03  # [m, rad] greatest errors of an object that is over its place
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,18 +38,18 @@ class PutInCfg:
     """Settings of the motion once the object is held; lengths in m.
 
     Attributes:
-        pick: of the grasp.
-        foot: how far the object's end is below its centre; this end has to be over the hole.
-        over: the object comes down from so high over the goal.
-        top: the object meets what it goes into, if it misses, at this height over the goal.
-        turns: how many turns of the object about the vertical in a full one look the same; 0: it is round.
-        speed: on the way down [m/s].
-        press, push: the set-point is at most so far below the hand, on the rim and in the hole.
+        pick: settings of the grasp.
+        foot: distance of the object's end below its centre; this end has to be over the hole.
+        over: height over the goal from which the object comes down.
+        top: height over the goal at which the object, if it misses, meets what it should go into.
+        turns: how many turns of the object about the vertical look the same; 0: it is round.
+        speed: speed on the way down [m/s].
+        press, push: greatest depth of the set-point below the hand, on the rim and in the hole.
         reach: greatest radius of the search, a spiral about the goal; 0: none.
-        pitch: of the spiral.
-        sweep: along the spiral [m/s].
-        done: the object is in where it is no higher than this over the goal.
-        patience: of the way down, before the hand begins again above the goal [s].
+        pitch: pitch of the spiral.
+        sweep: speed along the spiral [m/s].
+        done: height over the goal at or below which the object is in.
+        patience: time for the way down, after which the hand begins again above the goal [s].
         away: how far the hand rises once it has let go.
     """
 
@@ -71,7 +71,7 @@ class PutInCfg:
 
 @dataclasses.dataclass(frozen=True)
 class PutThingCfg(PutInCfg):
-    """The same of a thing of a mesh, which is picked up by its grasps."""
+    """``PutInCfg`` for a mesh object, which is picked up by its own grasps."""
 
     pick: GraspThingCfg = GraspThingCfg()
 
@@ -85,7 +85,7 @@ class PutInMemory:
     count: Int[Array, ""]  # steps made in this stage
     grip: Float[Array, "3"]  # from the object to the set-point of the grasp point [m]
     turned: Float[Array, ""]  # how far the search has gone along its spiral [rad]
-    upright: Float[Array, "4"]  # what turns a hand that points down so that the object is upright
+    upright: Float[Array, "4"]  # turns a hand that points down so that the object is as upright as at the goal
 
 
 class PutIn:
@@ -95,10 +95,10 @@ class PutIn:
     | --- | --- | --- | --- | --- | --- |
     | hand | ``PickUp`` | over the goal, the object turned to fit | down, searching if it stands on something | stays | up |
 
-    Where the object presses on the rim, the hand moves it along a spiral until it drops; from there on the arm yields sideways.
+    If the object presses on the rim, the hand moves it along a spiral until it drops. In the hole, the arm yields sideways.
 
     Args:
-        robot: what picks.
+        robot: the robot that picks.
         dt: control step [s].
         cfg: see ``PutInCfg``.
     """
@@ -112,12 +112,12 @@ class PutIn:
         self._object = cfg.pick.object
 
     def init(self, view: View) -> PutInMemory:
-        """Starts to pick."""
+        """Starts the grasp."""
         zero = jnp.zeros((), jnp.int32)
         return PutInMemory(self._pick.init(view), zero, zero, jnp.zeros(3), jnp.zeros(()), jnp.asarray(_STILL))
 
     def step(self, memory: PutInMemory, view: View) -> tuple[PutInMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         picked, targets = self._pick.step(memory.pick, view)
         put, arm = self._put(memory, view)
         picking = memory.stage == PICK
@@ -135,17 +135,17 @@ class PutIn:
         return memory, jnp.where(picking, targets, arm)
 
     def _put(self, memory: PutInMemory, view: View) -> tuple[PutInMemory, Float[Array, " nu"]]:
-        """Makes a step of the stages after the grasp."""
+        """Makes one step of the stages after the grasp."""
         stage, pick, seen = memory.stage, memory.pick, view.objects[self._object]
         slow = jnp.max(jnp.abs(pick.qd)) < _SLOW
-        # Above the goal, turns are made up for from where the hand is told to be: it is on its way there, and lags.
+        # Above the goal, turns are corrected relative to the commanded hand, because the hand lags on its way there.
         told = math.quat_mul(math.quat_mul(memory.upright, self._pick.hand(pick.yaw)), math.quat_conj(view.ee_quat_w))
         turned = jnp.where(stage == OVER, math.quat_mul(told, seen.quat_w), seen.quat_w)
         off, lacks = self._off(view, seen.quat_w), self._off(view, turned)
         end = self._end(view)
         way = view.goal_pos_w - end
         steers = (stage == OVER) | (stage == IN) & (-way[2] > self.cfg.top - _STROKE)
-        leans = jnp.cross(math.rotate(turned, jnp.asarray(_UP)), jnp.asarray(_UP))
+        leans = jnp.cross(math.rotate(turned, self._own_up(view)), jnp.asarray(_UP))
         upright = math.quat_mul(math.quat_exp(jnp.where(steers, _SHARE, 0.0) * leans), memory.upright)
         share = jnp.where((stage == OVER) & slow, GRIP_FILTER, 0.0)
         grip = memory.grip + share * (pick.pos - end - memory.grip)
@@ -184,7 +184,7 @@ class PutIn:
         """Returns the set-point of the grasp point and how far the search has gone."""
         cfg, stage, pos = self.cfg, memory.stage, memory.pick.pos
         goal, step, falls = view.goal_pos_w, cfg.speed * self.dt, -view.objects[self._object].linvel_w[2]
-        # Up, and once it is above the rim across, at the grasp's speed.
+        # Up, and once above the rim across, at the grasp's speed.
         way = goal + jnp.array([0.0, 0.0, cfg.over]) + grip - pos
         way = jnp.where(seen[2] - goal[2] > cfg.top + _CLEARS, way, way * jnp.asarray(_UP))
         far = jnp.linalg.norm(way)
@@ -200,7 +200,7 @@ class PutIn:
         turned = memory.turned + jnp.where(stands & (cfg.reach > 0), speed * self.dt, 0.0)
         turned = jnp.where(radius > cfg.reach, 0.0, turned)
         aside = jnp.minimum(radius, cfg.reach) * jnp.stack([jnp.cos(turned), jnp.sin(turned)])
-        # Above the rim the set-point goes on until the object does, however it sticks; below, the arm yields to the walls.
+        # Above the rim the set-point moves on until the object follows, however it sticks; below, the arm yields to the walls.
         sought = pos[:2] + jnp.where(stands, _RUBS, _SHARE) * (goal[:2] + aside - seen[:2])
         sought = jnp.clip(sought, goal[:2] + grip[:2] - _AHEAD, goal[:2] + grip[:2] + _AHEAD)
         beside = jnp.where(entered, pos[:2] + _SHARE * (view.ee_pos_w[:2] - pos[:2]), sought)
@@ -212,10 +212,15 @@ class PutIn:
     def _end(self, view: View) -> Float[Array, "3"]:
         """The place of the object's centre if it stood upright on the same end [m]."""
         seen = view.objects[self._object]
-        return seen.pos_w + self.cfg.foot * (jnp.asarray(_UP) - math.rotate(seen.quat_w, jnp.asarray(_UP)))
+        return seen.pos_w + self.cfg.foot * (jnp.asarray(_UP) - math.rotate(seen.quat_w, self._own_up(view)))
+
+    @staticmethod
+    def _own_up(view: View) -> Float[Array, "3"]:
+        """What is up in the object's frame when it lies as it does at the goal: a thing may belong there on any of its sides."""
+        return math.rotate(math.quat_conj(view.goal_quat_w), jnp.asarray(_UP))
 
     def _ended(self, memory: PutInMemory, way: Float[Array, "3"], off: Float[Array, ""]) -> Bool[Array, ""]:
-        """True if the stage is done, or has had enough time."""
+        """True if the stage is done, or its time is up."""
         time = (memory.count + 1) * self.dt
         there = (jnp.linalg.norm(way[:2]) < _CLOSE) & (jnp.abs(off) < _ALIGNED)
         return jnp.select(
@@ -225,7 +230,7 @@ class PutIn:
         )
 
     def _off(self, view: View, quat: Float[Array, "4"]) -> Float[Array, ""]:
-        """Angle about the vertical that the object lacks, the shortest of those that look the same [rad]."""
+        """Angle about the vertical from the object to the goal, the shortest of those that look the same [rad]."""
         if not self.cfg.turns:
             return jnp.zeros(())
         most = jnp.pi / self.cfg.turns
@@ -238,12 +243,12 @@ class PutIn:
         return rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._pick.finger_step))
 
     def warning(self, memory: PutInMemory) -> str:
-        """Says how many objects were lost, or did not go in at once."""
+        """Says how many objects were lost, or did not go in at the first try."""
         tries = np.asarray(memory.pick.tries)
         return f"{(tries > 0).sum()} of {tries.size} episodes lost the object, or began again" if tries.any() else ""
 
 
 class PutThing(PutIn):
-    """``PutIn`` for a thing of a mesh."""
+    """``PutIn`` for a mesh object."""
 
     picker = GraspThing

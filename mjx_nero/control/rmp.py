@@ -1,6 +1,6 @@
 """Riemannian motion policies: the leaves of RMPflow's tree, and the algebra that sums them at its root (see ``rmpflow``).
 
-A leaf has the name of its group in the parameter file, whose keys it reads.
+A leaf is named after its group in the parameter file, and reads that group's keys.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ def cspace_target_rmp(p: cfg.CspaceTargetCfg, q, qd, default_q) -> Rmp:
 
 
 def joint_limit_rmp(p: cfg.JointLimitCfg, x, xd) -> Rmp:
-    """Push away from a limit at distance ``x``, in parts of the joint's range; a damper that only acts on the way there."""
+    """Push away from a limit at distance ``x``, a share of the joint's range; the damper acts only towards the limit."""
     x = jnp.maximum(x, 0.0)
     accel = p.accel_potential_gain / ((x / p.accel_potential_exploder_length_scale) ** 2 + p.accel_potential_exploder_eps)
     accel = accel - p.accel_damper_gain * xd
@@ -51,7 +51,7 @@ def joint_velocity_cap_rmp(p: cfg.JointVelocityCapCfg, qd) -> Rmp:
 def target_rmp(p: cfg.TargetCfg, error: Float[Array, "3"], vel: Float[Array, "3"]) -> Rmp:
     """Pull along ``error`` = target - position [m], damping of ``vel``, the velocity relative to the target [m/s].
 
-    From afar mainly the direction of the error matters, close to the target all directions, and close by more.
+    Far away, mainly the direction of the error matters. Close to the target all directions do, and they matter more.
     """
     length = norm(error)
     direction = error / length
@@ -74,7 +74,7 @@ def damping_rmp(p: cfg.DampingCfg, xd) -> Rmp:
 
 
 def collision_rmp(p: cfg.CollisionCfg, x, xd) -> Rmp:
-    """Push away from a surface at distance ``x`` [m]; metric and damper only count on the way there."""
+    """Push away from a surface at distance ``x`` [m]; metric and damper act only towards the surface."""
     x = jnp.maximum(x, 0.0)
     gate = 1.0 - jax.nn.sigmoid(xd / p.damping_velocity_gate_length_scale)
     damper = p.damping_gain * gate * xd / (x / p.damping_std_dev + p.damping_robustness_eps)
@@ -85,7 +85,7 @@ def collision_rmp(p: cfg.CollisionCfg, x, xd) -> Rmp:
 
 
 def along(direction: Float[Array, "*n 3"], curvature: Float[Array, "*n"], leaf: Rmp) -> Rmp:
-    """Pulls scalar leaves back to points, whose coordinate they see changes along ``direction``, its gradient.
+    """Pulls scalar leaves back to points. ``direction`` is the gradient of the coordinate that a leaf sees.
 
     ``curvature``: the coordinate's second derivative in time while the point moves straight on.
     """
@@ -102,15 +102,15 @@ def clearance(point, vel, pt1, pt2) -> tuple[Array, Array, Array, Array]:
     distance = norm(offset)
     direction = offset / distance
     rate = dot(direction, vel)
-    slide = jnp.where((share > 0) & (share < 1), dot(axis, vel) ** 2 / square, 0.0)  # along a cylinder nothing turns
+    slide = jnp.where((share > 0) & (share < 1), dot(axis, vel) ** 2 / square, 0.0)  # motion along a cylinder turns nothing
     return distance, direction, rate, jnp.maximum(dot(vel, vel) - rate**2 - slide, 0.0) / distance
 
 
 def box_clearance(point, vel, center, turn: Float[Array, "3 3"], size) -> tuple[Array, Array, Array, Array]:
-    """``clearance`` of a point from a box: of edges ``size`` [m] along the columns of ``turn``.
+    """``clearance`` of a point from a box with edges ``size`` [m] along the columns of ``turn``.
 
-    Over a face the nearest point slides along in two directions, along an edge in one: what is left is the distance of a plane,
-    a cylinder or a sphere. Within the box it is negative, and leads out by the nearest face.
+    Over a face the nearest point slides in two directions, over an edge in one: the distance is that of a plane, a cylinder or a
+    sphere. Inside the box it is negative, and its gradient leads out through the nearest face.
     """
     local, speed = jnp.sum(turn * (point - center)[:, None], axis=0), jnp.sum(turn * vel[:, None], axis=0)
     beyond = jnp.abs(local) - size / 2
@@ -121,22 +121,22 @@ def box_clearance(point, vel, center, turn: Float[Array, "3 3"], size) -> tuple[
     distance = jnp.where(outside, length, jnp.max(beyond))
     direction = offset / length
     rate = dot(direction, speed)
-    turning = jnp.where(outside & (beyond > 0), speed, 0.0)  # across the offset, of the coordinates that make it up
+    turning = jnp.where(outside & (beyond > 0), speed, 0.0)  # velocity in the coordinates that make up the offset
     curvature = jnp.maximum(dot(turning, turning) - rate**2, 0.0) / length
     return distance, jnp.sum(turn * direction, axis=1), rate, jnp.where(outside, curvature, 0.0)
 
 
 def pull_back(jac: Float[Array, "n 3 nj"], curvature: Float[Array, "n 3"], node: Rmp) -> Rmp:
-    """The sum at the root of policies on ``n`` points; ``curvature`` = Jdot qd."""
+    """Sums policies on ``n`` points at the root; ``curvature`` = Jdot qd."""
     weighted = jnp.einsum("nab,nbj->naj", node.metric, jac, precision="highest")
     force = node.force - jnp.sum(node.metric * curvature[:, None, :], axis=-1)
     return Rmp(jnp.sum(jac * force[..., None], axis=(0, 1)), jnp.einsum("nai,naj->ij", jac, weighted, precision="highest"))
 
 
 def resolve(p: cfg.ResolveCfg, root: Rmp) -> Float[Array, " nj"]:
-    """The acceleration that the root asks for [rad/s^2], scaled down to the largest norm allowed (assumed: nothing says how)."""
+    """The acceleration that the root asks for [rad/s^2], scaled down to the greatest norm (an assumption: no source says how)."""
     metric = root.metric
-    # As large as the metric's rounding: keeps the root solvable where no leaf cares.
+    # As large as the metric's rounding error: keeps the root solvable where no leaf acts.
     ridge = 1e-6 + float(jnp.finfo(metric.dtype).eps) * jnp.trace(metric)
     accel = solve_spd(metric + ridge * jnp.eye(len(root.force)), root.force)
     return accel * jnp.minimum(1.0, p.max_acceleration_norm / norm(accel))

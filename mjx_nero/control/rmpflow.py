@@ -1,10 +1,11 @@
 """RMPflow: reactive motion generation by a tree of Riemannian motion policies.
 
 A leaf of the tree sees the arm through a task map x = phi(q), and asks for an acceleration a there, with a metric M that says how
-much each direction matters. They are summed at the root: (sum J^T M J) qdd = sum J^T M (a - c), with the curvature c = Jdot qd.
+much each direction matters. The root sums the leaves: (sum J^T M J) qdd = sum J^T M (a - c), with the curvature c = Jdot qd.
 
 Algebra: Cheng et al. 2018 (arXiv 1811.07049). Leaves and their parameters: Isaac Sim 5.x, "RMPflow" concept and tuning pages;
-where these leave something open, the docstring says what is assumed. All is pure, for one robot; ``jax.vmap`` makes it many.
+where these leave something open, the docstring states the assumption. All functions are pure, for one robot; ``jax.vmap`` them
+for many.
 
 A reactive policy has no plan: a target on the other side of the base, or behind a wall, can leave the arm stuck on the way.
 """
@@ -134,7 +135,7 @@ class RmpFlow:
         if arm.root_link not in ("world", robot.base_link):
             raise UserError(f"{descriptor}: root_link: {unknown('root', arm.root_link, ('world', robot.base_link))}")
 
-        # Spheres: those of the controllers, which also the base repels, then the descriptor's, which only obstacles do.
+        # Spheres: first those of the controllers, which the base repels too, then the descriptor's, which only obstacles repel.
         controllers = self.config.body_collision_controllers
         spheres = [
             (c.name, (0.0, 0.0, 0.0), c.radius, f"{config}: body_collision_controllers[{i}].name")
@@ -181,7 +182,7 @@ class RmpFlow:
         self, q: Float[Array, " nj"], qd: Float[Array, " nj"], target: Target, obstacles: Obstacles
     ) -> Float[Array, " nj"]:
         """Computes joint accelerations [rad/s^2] at positions [rad] and velocities [rad/s]."""
-        # Without obstacles the spheres beyond the controllers' meet nothing.
+        # Without obstacles, only the controllers' spheres can meet anything.
         count = 4 + (len(self._radius) if len(obstacles) else self._controllers)
         x, xd, curvature, jac = self._nodes(q, qd, count)
         frame = self._frame_leaves(target, x[:4], xd[:4])
@@ -209,7 +210,7 @@ class RmpFlow:
             if target.position is not None and target.velocity is not None:
                 goal = dataclasses.replace(target, position=target.position + i * h * target.velocity)
             accel = self.acceleration(q, qd, goal, obstacles)
-            # The cap's leaf is one of many: what a substep still carries beyond it is cut off.
+            # The cap's leaf is one of many, so the speed may still exceed the cap after a substep.
             return q + h * qd, jnp.clip(qd + h * accel, -cap, cap)
 
         return jax.lax.fori_loop(0, n, substep, (q, qd))
@@ -241,7 +242,7 @@ class RmpFlow:
             distance = rmp.norm(error)
             away = -error / distance
             rate = rmp.dot(away, vel)
-            # Closer than a millimetre the line to the target has no direction worth the name.
+            # Closer than a millimetre, the line to the target has no meaningful direction.
             bend = jnp.maximum(rmp.dot(vel, vel) - rate**2, 0.0) / jnp.maximum(distance, 1e-3)
             pull, drag = rmp.target_rmp(p.target_rmp, error, vel), rmp.along(away, bend, rmp.damping_rmp(p.damping_rmp, rate))
             nodes[0] = jax.tree.map(lambda a, b: (a + b)[None], pull, drag)
@@ -252,7 +253,7 @@ class RmpFlow:
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *nodes)
 
     def _sphere_leaves(self, obstacles: Obstacles, x: Float[Array, "n 3"], xd: Float[Array, "n 3"]) -> rmp.Rmp:
-        """Leaves on the spheres' centres: all with all obstacles, the controllers' with the base, too."""
+        """Leaves on the spheres' centres: all spheres with all obstacles, the controllers' spheres also with the base."""
         pt1 = jnp.concatenate([self._cylinders[:, 0], obstacles.pt1])
         pt2 = jnp.concatenate([self._cylinders[:, 1], obstacles.pt2])
         radius = jnp.concatenate([self._cylinder_radius, obstacles.radius])

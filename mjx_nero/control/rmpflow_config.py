@@ -130,7 +130,7 @@ class DampingCfg:
 
 @dataclasses.dataclass(frozen=True)
 class RmpParams:
-    """One group a kind of leaf."""
+    """One group per kind of leaf."""
 
     cspace_target_rmp: CspaceTargetCfg
     cspace_trajectory_rmp: CspaceTrajectoryCfg
@@ -172,7 +172,7 @@ class ControllerCfg:
 
 @dataclasses.dataclass(frozen=True)
 class RmpFlowCfg:
-    """The parameter file. ``joint_limit_buffers`` [rad] run along the descriptor's ``cspace``."""
+    """The parameter file. ``joint_limit_buffers`` [rad] have the order of the descriptor's ``cspace``."""
 
     joint_limit_buffers: tuple[Gain, ...]
     rmp_params: RmpParams
@@ -196,7 +196,7 @@ class DescriptorCfg:
     Attributes:
         cspace: joints that the policy moves.
         default_q: their preferred posture [rad].
-        cspace_to_urdf_rules: joints that are held elsewhere than at their zero; must be empty here.
+        cspace_to_urdf_rules: joints that are held away from their zero; must be empty here.
         composite_task_spaces, api_version, acceleration_limits, jerk_limits: read, without effect.
         collision_spheres: (link, its spheres); they keep clear of obstacles.
     """
@@ -236,13 +236,13 @@ def _completed(node: Any, name: str) -> Any:
 
 
 def load_pair(descriptor: pathlib.Path, config: pathlib.Path, arm: Iterable[str]) -> tuple[DescriptorCfg, RmpFlowCfg]:
-    """Reads both files and checks that they fit each other and the arm. Values a joint have the order of ``arm``.
+    """Reads both files and checks that they fit each other and the arm. Values per joint have the order of ``arm``.
 
     Args:
         arm: names of the joints to control.
 
     Raises:
-        UserError: see ``load``; or the joints are not the arm's, or a list has another length.
+        UserError: see ``load``; or the joints are not the arm's, or a list has the wrong length.
     """
     arm = tuple(arm)
     robot, cfg = load(DescriptorCfg, descriptor), load(RmpFlowCfg, config)

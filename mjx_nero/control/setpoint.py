@@ -1,4 +1,4 @@
-"""The set-point of an arm: it follows joint positions that jump, without jumps of its own. And what a script of phases keeps."""
+"""The set-point of an arm, which follows jumping joint positions smoothly; and the state of a script of phases."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from mjx_nero.mdp.actions import rate_limit
 
 _SMOOTH = 0.15  # [s] the set-point comes to rest in about this time
-# [rad/s2] What it is accelerated by at most. Targets lead by the drives' lag, so that they jump with the speed; strong damping is
-# integrated after contacts are solved for, and such a jump kicks what the hand holds (at 10 rad/s2 and a lag of half a second by
-# 0.1 m/s a control step).
+# [rad/s2] Greatest acceleration of the set-point. Targets lead by the drives' lag, so they jump when the speed changes. Strong
+# damping is integrated after the contacts are solved, and such a jump kicks the object in the hand: at 10 rad/s2 and a lag of
+# half a second by 0.1 m/s per control step.
 FASTEST = 6.0
 _GENTLE = 1.5
-_JUMP = 0.75  # [rad/s] of a target, by a second's acceleration
+_JUMP = 0.75  # [rad/s] acceleration times lag of an arm that holds something
 
 
 @struct.dataclass
@@ -25,12 +25,12 @@ class Script:
     phase: Int[Array, ""]
     count: Int[Array, ""]  # steps made in this phase
     q: Float[Array, " nj"]  # the arm's set-point [rad]
-    qd: Float[Array, " nj"]  # and how fast it moves [rad/s]
-    tries: Int[Array, ""]  # how often the script has begun anew
+    qd: Float[Array, " nj"]  # velocity of the set-point [rad/s]
+    tries: Int[Array, ""]  # how often the script has started again
 
 
 def gentle(lead: Sequence[float]) -> float:
-    """Greatest acceleration of an arm that holds something, whose drives lag by ``lead`` [s]: [rad/s2 or m/s2]."""
+    """Greatest acceleration [rad/s2 or m/s2] of an arm that holds something, with drives that lag by ``lead`` [s]."""
     return float(np.clip(_JUMP / max([*lead, 1e-6]), _GENTLE, FASTEST))
 
 
@@ -43,16 +43,16 @@ def follow(
     fastest: float | Float[Array, ""] = _GENTLE,
     straight: bool | Bool[Array, ""] = False,
 ) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-    """Moves the set-point ``q``, which moves at ``qd``, for a step on its way to ``wanted``.
+    """Moves the set-point ``q``, whose velocity is ``qd``, by one step towards ``wanted``.
 
     Args:
         speed: greatest speeds [rad/s or m/s].
         dt: the step [s].
         fastest: greatest acceleration [rad/s2 or m/s2].
-        straight: all joints are on their way for as long. Otherwise those with less to go are there sooner.
+        straight: all joints arrive at the same time. Otherwise those with less to go arrive sooner.
 
     Returns:
-        the set-point and its speed.
+        The set-point and its velocity.
     """
     way = wanted - q
     far = jnp.abs(way)

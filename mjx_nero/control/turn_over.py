@@ -19,9 +19,9 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
 
 ABOVE, DOWN, CLOSE, UP, TURN, SET, OPEN, BACK, REST = range(9)
-_LOST = 0.05  # [m] further than this from the grasp point, the cube has been lost
-_UNDER = 0.01  # [m] the cube is at most so far below the height to which it is lifted, when the hand begins to turn
-_LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] a phase has so much time
+_LOST = 0.05  # [m] distance from the grasp point beyond which the cube has been lost
+_UNDER = 0.01  # [m] greatest distance of the cube below its lifting height when the hand begins to turn
+_LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] time limits of the phases
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,16 +32,16 @@ class TurnOverCfg:
         object: the cube.
         rest: height of its centre when it rests.
         spot: where it is set down, x and y in the world.
-        lean: of the hand from straight down, to one side at first [rad].
-        beyond: the grasp point: from there the pads' middle is so much further along the hand's direction.
-        before: the hand comes from so far in front of the cube, and leaves so far.
+        lean: angle of the hand from straight down: to one side when it grasps, to the other when it lets go [rad].
+        beyond: distance from the grasp point to the pads' middle, along the hand's direction.
+        before: distance in front of the cube from which the hand comes, and to which it leaves.
         lift: height to which the cube is lifted to be turned.
-        speed: of the grasp point [m/s].
-        closing: how long the fingers take [s], beside the lag of their drives.
-        clear: of a cube's edge above the table while it is turned. A quick hand is lower than its set-point.
-        rises: on its way to a grasp the hand is at least so high over the end of it, for what is left to go [m/rad], so that it
-            passes over the cube; 0: it goes as straight as its joints do.
-        ik: of the arm's motion.
+        speed: speed of the grasp point [m/s].
+        closing: time that the fingers take to close [s], besides the lag of their drives.
+        clear: clearance of the cube's edge above the table while it is turned. A fast hand is lower than its set-point.
+        rises: least height of the hand over the end of its way to a grasp, per radian of joint motion left [m/rad], so that it
+            passes over the cube; 0: the joints move straight.
+        ik: settings of the arm's motion.
     """
 
     object: str = "box"
@@ -62,7 +62,7 @@ class TurnOverCfg:
 class TurnOverMemory(setpoint.Script):
     """The state of ``TurnOver`` between two steps."""
 
-    pos: Float[Array, "3"]  # where the grasp point is on a straight way
+    pos: Float[Array, "3"]  # set-point of the grasp point on a straight way [m]
     plan: Plan
     table: Table
 
@@ -74,10 +74,10 @@ class TurnOver:
     | --- | --- | --- | --- | --- | --- | --- | --- | --- |
     | hand | before the cube | at it | stays | up | over the spot, turned | down | stays | away |
 
-    The first turn may only bring the cube to the spot, and turn it about the vertical to suit: see ``Turns``.
+    The first turn may just bring the cube to the spot, turned about the vertical as needed: see ``Turns``.
 
     Args:
-        robot: what turns.
+        robot: the robot that turns.
         dt: control step [s].
         cfg: see ``TurnOverCfg``.
     """
@@ -100,7 +100,7 @@ class TurnOver:
         return TurnOverMemory(zero, zero, q, jnp.zeros_like(q), zero, view.ee_pos_w, plan, table)
 
     def step(self, memory: TurnOverMemory, view: View) -> tuple[TurnOverMemory, Float[Array, " nu"]]:
-        """Targets of all drives."""
+        """Computes the targets of all drives."""
         phase, plan, seen = memory.phase, memory.plan, view.objects[self.cfg.object].pos_w
         quat = jnp.where(phase <= UP, plan.grasp, plan.end)
         wanted = self._wanted(memory, seen)
@@ -142,9 +142,9 @@ class TurnOver:
     def _above(
         self, memory: TurnOverMemory, q: Float[Array, " nj"], end: Float[Array, " nj"], wanted: Float[Array, "3"]
     ) -> Float[Array, " nj"]:
-        """Lifts the hand where a cube in it would strike the table with an edge, or where it would strike the cube itself.
+        """Lifts the hand where the cube in it would hit the table with an edge, or where the hand would hit the cube.
 
-        Straight ways of joints may dip.
+        Straight motion of the joints may dip.
         """
         pos, quat = (x[0] for x in self._ik.chain.poses(q))
         turns = np.sqrt(2) * self.cfg.rest + self.cfg.clear - self._turns.held(pos, quat)[2]
@@ -174,7 +174,7 @@ class TurnOver:
         return jnp.select([phase == each for each in cases], list(cases.values()), pos)
 
     def _ended(self, memory: TurnOverMemory, arrived: Bool[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
-        """True if the phase is done, or has had enough time."""
+        """True if the phase is done, or its time is up."""
         phase, time = memory.phase, (memory.count + 1) * self.dt
         still = jnp.max(jnp.abs(memory.qd)) < 0.2
         careful = (phase == ABOVE) | (phase == TURN) | (phase == DOWN) | (phase == SET)

@@ -11,20 +11,20 @@ from mjx_nero.control.ik import InverseKinematics
 from mjx_nero.control.pick_up import UNREACHABLE
 from mjx_nero.sim.robot import RobotCfg
 
-TOP = 0.7  # cosine from which a side is up
+TOP = 0.7  # least cosine between the vertical and a side that counts as up
 _Z = np.array([0.0, 0.0, 1.0], np.float32)
-_EACH = 8.0  # [rad] what a turn that is still to come is worth, in motion of the joints
+_EACH = 8.0  # [rad] cost of a turn that is still to come, in joint motion
 _WAYS = 8  # directions in which the hand leans: multiples of an eighth of a turn from straight away from the robot
 
 
 @struct.dataclass
 class Table:
-    """Table of what the arm can do at the spot, by where the hand leans and to which side its fingers open."""
+    """What the arm can do at the spot, by the direction in which the hand leans and the side to which its fingers open."""
 
     fails: Float[Array, "ways 2"]  # 0 if the arm gets there
     q: Float[Array, "ways 2 nj"]  # over the spot [rad]
     down: Float[Array, " ways"]  # 0 if the hand can point straight down, turned that way
-    go: Float[Array, " ways"]  # what remains to be done if the wanted side looks there [rad]
+    go: Float[Array, " ways"]  # remaining cost if the wanted side faces there [rad]
 
 
 @struct.dataclass
@@ -40,14 +40,14 @@ class Plan:
 class Turns:
     """The turns that a hand can make at a spot of the table.
 
-    A quarter turn about a level axis needs a hand that leans by an eighth to either side, and any turn about the vertical may be
-    added. Where the arm can lean at the spot is found once.
+    A quarter turn about a level axis needs a hand that leans by an eighth of a turn to either side. Any turn about the vertical
+    can be added. The directions in which the arm can lean at the spot are found once.
 
     Args:
-        robot: what turns.
-        ik: of its arm.
+        robot: the robot that turns.
+        ik: inverse kinematics of its arm.
         spot: where the cube's centre is when it is set down [m].
-        lean: of the hand from straight down [rad].
+        lean: angle of the hand from straight down [rad].
         beyond, before, lift: see ``TurnOverCfg``.
     """
 
@@ -87,7 +87,7 @@ class Turns:
         return math.quat_mul(math.axis_angle(axis, jnp.array(lean)), down)
 
     def leaning(self, cube: Float[Array, "3"], lean: float) -> tuple[Float[Array, "ways 2 nj"], Float[Array, "ways 2"]]:
-        """Finds out in which directions the hand can lean around a cube: the arm over it, and 0 where it can [rad]."""
+        """Finds in which directions the hand can lean around a cube: the arm over it [rad], and 0 where the hand can."""
         angles, flips = (x.reshape(-1) for x in jnp.meshgrid(jnp.asarray(self._angles), jnp.arange(2), indexing="ij"))
         quats = jax.vmap(lambda angle, flip: self._hand(angle, flip, lean))(angles, flips)
         low = jax.vmap(self.hold, (None, 0))(cube, quats)
@@ -99,10 +99,10 @@ class Turns:
         return over.q.reshape(_WAYS, 2, -1), fails.reshape(_WAYS, 2)
 
     def table(self) -> Table:
-        """Finds out where the hand can lean at the spot. It does not depend on an episode."""
+        """Finds in which directions the hand can lean at the spot. The result does not depend on the episode."""
         q, fails = self.leaning(jnp.asarray(self.spot), self._lean)
         _, down = self.leaning(jnp.asarray(self.spot), 0.0)
-        # A side that looks one way is turned up by a hand that leans the other way at first.
+        # To turn a side up, the hand first leans away from where that side faces.
         go = _EACH + UNREACHABLE * jnp.min(jnp.roll(fails, _WAYS // 2, axis=0), axis=1)
         return Table(fails, q, down[:, 0], go)
 
@@ -118,8 +118,8 @@ class Turns:
 
         Args:
             cube: orientation of the cube, wxyz.
-            wanted: where the side looks that has to be up.
-            q: of the arm [rad].
+            wanted: direction that the side to be turned up faces.
+            q: joint positions of the arm [rad].
             here: ``leaning`` where the cube lies; None: it lies at the spot.
         """
         starts, first_fails = here or (table.q, table.fails)
@@ -127,13 +127,13 @@ class Turns:
         level = axes[jnp.argsort(jnp.abs(axes[:, 2]))[0]]
         angle = jnp.arctan2(level[1], level[0])
         face, flip, to = (x.reshape(-1) for x in jnp.meshgrid(jnp.arange(4), jnp.arange(2), jnp.arange(_WAYS), indexing="ij"))
-        toward = angle + face * jnp.pi / 2  # where the side looks that is turned up
+        toward = angle + face * jnp.pi / 2  # direction of the side that is turned up
         ends = jnp.asarray(self._angles)[to]
         first = jnp.mod(jnp.round((toward + jnp.pi - self._out) / (2 * jnp.pi / _WAYS)).astype(jnp.int32), _WAYS)
         lean = jax.vmap(lambda at, flip, lean: self._hand(at, flip, lean), (0, 0, None))
         before, after = lean(toward + jnp.pi, flip, self._lean), lean(ends, 1 - flip, self._lean)
         over, fails = table.q[to, 1 - flip], first_fails[first, flip] + table.fails[to, 1 - flip]
-        # The side that was up then looks back; one that looked down looks where the hand leans.
+        # The side that was up then faces back; one that faced down faces where the hand leans.
         along = jnp.cos(toward) * wanted[0] + jnp.sin(toward) * wanted[1]
         across = jnp.cos(toward) * wanted[1] - jnp.sin(toward) * wanted[0]
         then = jnp.where(
@@ -161,5 +161,5 @@ class Turns:
         return Plan(lean(start), lean(ends), home, home), _EACH / 2 + turned + UNREACHABLE * table.down[to] + left
 
     def _remains(self, table: Table, angle: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Computes what remains to be done if the wanted side looks in a level direction [rad]."""
+        """Computes the remaining cost if the wanted side faces a level direction [rad]."""
         return table.go[jnp.mod(jnp.round((angle - self._out) / (2 * jnp.pi / _WAYS)).astype(jnp.int32), _WAYS)]

@@ -50,14 +50,14 @@ from mjx_nero.types import (
 
 MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
-# Folded into an episode's key, so that one part's draws leave all others unchanged.
+# Folded into an episode's key, so that a draw of one part does not change those of the others.
 _FIELDS, _MEMORY, _SENSORS, _FOLLOWING, _VISITED, _LOOK = 0xF1E1D5, 0x3E3087, 0x5E4504, 0xF0110E, 0x715173D, 0x1004
 
 Starts = tuple[Bank, Float[Array, " phases"]]  # visited states, and the probabilities of their phases
 
 
 def _precise(method: Callable) -> Callable:
-    """Forces full float32 products, whatever the program has set: TF32 in the physics costs success."""
+    """Forces full float32 products, whatever the program has set: TF32 in the physics lowers the success rate."""
 
     @functools.wraps(method)
     def precise(*args, **kwargs):
@@ -145,7 +145,7 @@ class ManipulationEnv(Env):
         return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
 
     def draw_by(self, own: Mapping[str, CameraCfg], renderer: str) -> cameras.Cameras:
-        """Cameras of the scene, perhaps with other sizes and kinds, and one of the renderers, ``mujoco`` or ``warp``."""
+        """Makes the cameras ``own``, such as the scene's with other sizes and kinds; ``renderer`` is ``mujoco`` or ``warp``."""
         with jax.ensure_compile_time_eval():
             seen = (*self._parts.seen, *self._look.names)
             return cameras.Cameras(self.mj_model, own, renderer, tuple(dict.fromkeys(seen)))
@@ -200,7 +200,7 @@ class ManipulationEnv(Env):
         Args:
             rng: the environment's random key.
             level: share of all episode-to-episode differences to apply; None: all.
-            starts: states that an expert has visited, and how likely to start there (``events.visited``).
+            starts: states that an expert has visited, and the probabilities of starting there (``events.visited``).
         """
         k_sample, k_obs = jax.random.split(rng)
         sim, carry = self.sample(k_sample, None if level is None else jnp.asarray(level, jnp.float32), starts)
@@ -265,7 +265,7 @@ class ManipulationEnv(Env):
         return Bank(Start(joint_pos=home, pull=jnp.zeros(len(home)), **self._parts.blank()), jnp.zeros((), bool))
 
     def start(self, state: State) -> Start:
-        """Returns the start of an episode that begins where a state is, at rest: the fingers press as they do there."""
+        """Returns the start of an episode that begins in this state, at rest, with the fingers pressing as they do now."""
         view = self.view(state)
         arms = [name not in robot.gripper.joints for robot in self.team.values() for name in robot.joints]
         return Start(
@@ -331,7 +331,7 @@ class ManipulationEnv(Env):
         return self.cameras(sim.qpos, self._scenery(sim, carry), *due)
 
     def _due(self, carry: Carry) -> dict[str, Bool[Array, ""]]:
-        """Says which cameras' pictures the sensors look at now; empty where all are, always."""
+        """Says for each camera whose sensor skips pictures whether it reads the current one. Empty: none skips any."""
         lenses = {f"sensors.{name}": term.made for name, term in self.cfg.sensors.items()}
         rare = {name: lens for name, lens in lenses.items() if isinstance(lens, Lens) and lens.every > 1}
         return {lens.camera: lens.due(carry.memory[name]) for name, lens in rare.items()}
@@ -341,7 +341,7 @@ class ManipulationEnv(Env):
         """Computes the observation groups and their new memory; ``key`` draws their noise."""
         cfg, recall = self.cfg, terms.Recall(carry.memory)
         view = sensed = self._viewer(sim, carry, carry.action)
-        if due := self._due(carry):  # what reads ``view`` sees every step's pictures
+        if due := self._due(carry):  # terms that read ``view`` see the pictures of every step
             sensed = dataclasses.replace(view, cameras=self._pictures(sim, carry, due))
         for name, term in cfg.sensors.items():
             sensed = recall.through(f"sensors.{name}", term.made, sensed)
@@ -367,7 +367,7 @@ class ManipulationEnv(Env):
 
     @_precise
     def following(self, state: State, starts: Starts | None = None) -> tuple[Sim, Carry]:
-        """Draws the start of the episode after the present one, before any observation. ``starts``: see ``reset``."""
+        """Draws the start of the episode after the current one, before any observation. ``starts``: see ``reset``."""
         carry = state.info["carry"]
         return self.sample(jax.random.fold_in(carry.rng, _FOLLOWING), carry.memory.get(LEVEL), starts)
 

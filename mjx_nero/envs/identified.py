@@ -1,4 +1,4 @@
-"""Applies drives that ``identify`` measured on a real arm to a task: gains, ranges to draw from, and a delay."""
+"""Applies what ``identify`` measured on a real arm to a task: drive gains, ranges for randomization, and a delay."""
 
 import dataclasses
 import math
@@ -47,7 +47,7 @@ class Identified:
 
 
 def read(path: pathlib.Path) -> Identified:
-    """Reads an identification file, which may come from a stranger.
+    """Reads an identification file. The file may be untrusted.
 
     Raises:
         UserError: the file is missing or malformed.
@@ -74,7 +74,7 @@ def _numbers(found: Identified) -> dict[str, Any]:
 def applied(cfg: EnvCfg) -> EnvCfg:
     """Returns the task with the drives of its identification file.
 
-    Centres become the robot's gains. 95% intervals become ranges, drawn before all other randomization. The delay is rounded to
+    Estimates become the robot's gains. 95% intervals become ranges, drawn before all other randomization. The delay is rounded to
     whole control steps. Encoder offsets are not applied: the real arm subtracts them.
 
     Raises:
@@ -86,7 +86,7 @@ def applied(cfg: EnvCfg) -> EnvCfg:
     found, arm = read(path), cfg.robot.arm
     if found.robot != cfg.robot.name or set(found.joints) != set(arm.joints):
         raise UserError(
-            f"{path} is of {found.robot} with joints {', '.join(found.joints)}: this task's robot is {cfg.robot.name}"
+            f"{path} is for {found.robot} with joints {', '.join(found.joints)}, but this task's robot is {cfg.robot.name}"
         )
     joints = [found.joints[name] for name in arm.joints]
     late = dataclasses.replace(cfg, actions=_late(cfg, found.delay))

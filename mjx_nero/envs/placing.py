@@ -1,4 +1,4 @@
-"""Things of meshes in tasks that place: where they belong, when they count as standing and as left, and the script."""
+"""Mesh objects in tasks that place: where they belong, when they count as standing and as left, and the script."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.objects import rests, shapes
 from mjx_nero.sim.scene import ObjectCfg
 
-LONGER = 3.0  # [s] that the script takes longer than with a box: it lowers what it holds slowly
-OVER, DONE = 0.03, 0.004  # [m] heights over its place: from where a thing comes straight down, and where the hand opens
-STEP = 0.005  # [s] physics steps: with ones of 10 ms, flat things that lie on many corners tremble too fast to be at rest
+LONGER = 3.0  # [s] extra time of the script compared with a box: it lowers the thing slowly
+OVER, DONE = 0.03, 0.004  # [m] heights over the place: where the straight descent begins, and where the hand opens
+STEP = 0.005  # [s] physics step: at 10 ms, flat things that lie on many corners tremble too fast to count as at rest
 AWAY = 0.02  # [m] clearance of the pads beside or above an object that the hand has left
-MEETS = 0.01  # [m] below half of it the hand yields to what the thing stands on
+MEETS = 0.01  # [m] below half this height, the hand yields to what the thing stands on
 T = TypeVar("T", bound=Term)
 
 
@@ -31,22 +31,22 @@ def places(condition: Term) -> bool:
 
 
 def tilt(up: np.ndarray) -> tuple[float, float]:
-    """Roll and pitch of a thing that is not turned about the vertical, by where up is in its own frame [rad]."""
+    """Roll and pitch [rad] of a thing without yaw; ``up`` is the world's vertical in the thing's own frame."""
     x, y, z = up
     level = np.hypot(y, z)
-    roll = np.arctan2(y, z) if level > 1e-3 else 0.0  # on its nose any roll is a turn about the vertical
+    roll = np.arctan2(y, z) if level > 1e-3 else 0.0  # with a vertical x axis, any roll is a turn about the vertical
     return round(float(roll), 6), round(float(np.arctan2(-x, level)), 6)
 
 
 def tilted(roll: float, pitch: float) -> tuple[float, float, float, float]:
-    """The orientation of such a thing (wxyz)."""
+    """Orientation (wxyz) of a thing with this roll and pitch and without yaw."""
     w, x = np.cos(roll / 2), np.sin(roll / 2)
     c, s = np.cos(pitch / 2), np.sin(pitch / 2)
     return float(c * w), float(c * x), float(s * w), float(-s * x)
 
 
 def applied(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
-    """Returns the task with the thing at the goal as it lies at the start, but for its heading."""
+    """Returns the task for the thing: the goal has the thing's resting height, roll and pitch; only its heading varies."""
     (solid,), (roll, pitch) = item.solids, tilt(rests.up(np.array(item.quat)))
     height = round(item.rest_height - cfg.robot.base_pos[2], 4)
     still = {"z": (height,) * 2, "roll": (roll, roll), "pitch": (pitch, pitch)}

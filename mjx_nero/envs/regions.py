@@ -12,8 +12,8 @@ from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.types import UserError
 
-HELD = 0.03  # [m] how far a cube may be off its place in a good grasp and still count as held
-TURNS = 5  # least joints of an arm that can turn its hand freely while the hand points down
+HELD = 0.03  # [m] greatest offset of a held cube from its place in a good grasp
+TURNS = 5  # fewest joints of an arm that can turn its hand freely while the hand points down
 TRAVEL = 0.1  # [m] height of a carried cube above the table, if the hand can still point down there
 UPRIGHT = 0.005  # [m/rad] weight that keeps a leaning hand as upright as its position allows
 LEFT = 0.06  # [m] least height of a leaving grasp point above the middle of a cube on the table
@@ -23,12 +23,12 @@ def box(robot: RobotCfg, name: str, what: str) -> Box:
     """Returns one of the robot's boxes [m], in its root frame.
 
     Raises:
-        UserError: the robot does not state it.
+        UserError: the robot's config lacks it.
     """
     found: Box | None = getattr(robot, name)
     if found is None:
         where = "its robot.yaml" if robot.folder else "its config"
-        raise UserError(f"{robot.name} has no {name}, {what}: give it in {where} as ranges of x, y and z [m], or import it anew")
+        raise UserError(f"{robot.name} has no {name}, {what}: give it in {where} as ranges of x, y and z [m], or import it again")
     return found
 
 
@@ -55,7 +55,7 @@ def of(robot: RobotCfg) -> Regions:
     """Derives the regions from the robot's ``pick``, ``hold`` and ``grip``.
 
     Raises:
-        UserError: the robot has no gripper, or does not state one of these.
+        UserError: the robot has no gripper, or lacks one of these fields.
     """
     rest = grasp.cube_for(robot).rest_height
     pick = box(robot, "pick", "where on the table it can grasp")
@@ -78,7 +78,7 @@ def turns(robot: RobotCfg) -> bool:
 
 
 def ik(robot: RobotCfg, prefix: str = "") -> dict[str, bool | float]:
-    """Returns settings of inverse kinematics for an arm with few joints, or a hand that cannot point straight down."""
+    """Returns inverse-kinematics settings for an arm with few joints, or for a hand that cannot point straight down."""
     few = {} if turns(robot) else {"free_turn": True}
     leaning = {"orientation_weight": UPRIGHT} if robot.lean else {}
     return {f"{prefix}{name}": value for name, value in {**few, **leaning}.items()}
@@ -101,7 +101,7 @@ def near(there: Regions) -> float:
 
 
 def turn_to(robot: RobotCfg, x: float, y: float) -> float:
-    """Turn of the first joint from home that points the arm at ``x, y`` of the robot's root frame [rad].
+    """Angle from home of the first joint that points the arm at ``x, y`` in the robot's root frame [rad].
 
     0 if that joint does not turn the arm about the vertical.
     """

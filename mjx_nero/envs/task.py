@@ -40,8 +40,8 @@ def joint_actions(scale: float = 0.5, gripper: bool = True) -> dict[str, Term]:
 def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: NonNegative = 0.0) -> dict[str, Term]:
     """Lists action terms: one entry per arm joint (its velocity; +-1 is the drive's limit), and one for the gripper, if any.
 
-    Actions come late by a number of control steps that each episode draws from ``late``, as on a real arm. ``hysteresis`` is the
-    gripper's (``mdp.actions.BinaryGripper``).
+    Actions are late by a number of control steps that each episode draws from ``late``, as on a real arm. ``hysteresis`` is that
+    of the gripper (``mdp.actions.BinaryGripper``).
     """
     grip = Term(actions.BinaryGripper, params={"hysteresis": hysteresis})
     hand = {"gripper": grip, "speed_limit": Term(actions.SpeedLimit, params={"group": "gripper"})}
@@ -53,12 +53,12 @@ def velocity_actions(gripper: bool = True, late: Steps = (0, 1), hysteresis: Non
 
 
 def step_weights(num_steps: int, **to: float) -> dict[str, Term]:
-    """Lists curriculum terms that give rewards new weights after ``num_steps`` control steps (``mdp.curriculum.step_weight``)."""
+    """Lists curriculum terms that set weights of rewards after ``num_steps`` control steps (``mdp.curriculum.step_weight``)."""
     return {name: Term(curriculum.step_weight, params={"to": weight, "num_steps": num_steps}) for name, weight in to.items()}
 
 
 def nearer(name: str, func: Callable, **params: Any) -> dict[str, RewardTerm]:
-    """Lists three rewards of one distance, the nearer the steeper: over 0.3, 0.1 and 0.03 m.
+    """Lists three rewards of one distance, on scales of 0.3, 0.1 and 0.03 m: the closer, the steeper.
 
     Args:
         func: a term that takes ``std``, and ``params``.
@@ -80,7 +80,7 @@ def on_table(x: Range, y: Range, **object: str) -> dict[str, Term]:
 
 
 def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:
-    """Lists the ends of an episode: its time is over, or the object has left the table."""
+    """Lists the terminations: the time is up, or the object has left the table."""
     table = {"center": scene.table_center, "size": scene.table_size, **object}
     return {
         "time_out": DoneTerm(terminations.time_out, time_out=True),
@@ -88,9 +88,9 @@ def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:
     }
 
 
-# Learner settings. Calm, for velocities: noise of at most half an action, and changing the action costs.
+# Learner settings for velocity actions: noise of at most half an action, and a cost on changes of the action.
 CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
-# The policy begins as a clone of the task's scripted expert, and waits for its critic before it goes its own way.
+# The policy starts as a clone of the task's scripted expert. At first only its critic learns.
 SHOWN = {**CALM, "imitation": 1.0, "critic_first": 20}
 
 
@@ -111,11 +111,11 @@ def arm_state() -> dict[str, ObservationTerm]:
 
 @dataclasses.dataclass(frozen=True)
 class SuccessCfg:
-    """Success: ``condition`` held at the end of the episode. ``distance`` is the length that it judges [m].
+    """What counts as success: ``condition`` holds at the end of the episode. ``distance`` is the length that it judges [m].
 
     Attributes:
-        hold_s: how long it must have held [s].
-        follows: the distance is an error to keep small once there. Otherwise it is a distance to cover once.
+        hold_s: how long the condition must have held by then [s].
+        follows: the task is to keep the distance small, as when tracking. Otherwise it is to cover the distance once.
     """
 
     condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
@@ -125,7 +125,7 @@ class SuccessCfg:
 
 
 def object_at_goal(**object: str) -> SuccessCfg:
-    """Success of carrying: the object is within 2 cm of the goal."""
+    """Makes the success of carrying: the object is within 2 cm of the goal."""
     condition = Term(success.object_at_goal, params={"threshold": 0.02, **object})
     return SuccessCfg(condition=condition, distance=Term(success.object_distance, params=object))
 
@@ -147,7 +147,7 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumCfg:
-    """Everything that grows harder during training.
+    """Everything that makes the task harder during training.
 
     Attributes:
         weights: terms that change the weight of the reward of the same name (``mdp.curriculum``).
@@ -167,12 +167,12 @@ class CurriculumCfg:
 
 @dataclasses.dataclass(frozen=True)
 class ThingCfg:
-    """A thing of a mesh that takes the place of a task's object (``envs.things``).
+    """A mesh that replaces a task's object (``envs.things``).
 
     Attributes:
         file: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name. Empty: none.
-        scale: of its lengths.
-        density: [kg/m3]; 0: what its ``object.yaml`` says, or else 500.
+        scale: factor of its lengths.
+        density: density [kg/m3]; 0: that of its ``object.yaml``, or else 500.
     """
 
     file: str = ""
@@ -187,14 +187,14 @@ class EnvCfg:
     Attributes:
         actions: terms from the policy's output to the drives' targets, in this order.
         action_clip: bound of every action entry; 0: none.
-        randomization: draws of model fields, anew in every episode (``mdp.randomization``).
+        randomization: random model fields, drawn anew in every episode (``mdp.randomization``).
         sensors: errors between the true state and the ``sensed`` observation groups, in this order (``mdp.sensors``). Unlike
             observation noise, they are always on.
-        look: draws of what the scene's cameras see, anew in every episode (``mdp.looks``). They move nothing.
-        obstacles: draws where the scene's obstacles stand, after each episode's start and goal (``mdp.obstacles``).
+        look: random appearance in the cameras' pictures, drawn anew in every episode (``mdp.looks``). Physics is not affected.
+        obstacles: places the scene's obstacles once each episode's start and goal are drawn (``mdp.obstacles``).
         pushes: sudden velocities added to objects (``mdp.pushes``).
         identified: a file of ``python -m mjx_nero identify`` whose drives and delay replace the robot's own.
-        object: a thing of a mesh that takes the place of the task's object, as ``--object FILE`` says.
+        object: a mesh that replaces the task's object, as set by ``--object FILE``.
         controllers: controllers of ``mjx_nero.control`` that can do the task, the usual one first, each with fields of its config
             by dotted name.
         learner: the learner that trains the task by default.
@@ -242,9 +242,9 @@ class EnvCfg:
             if unknown := [name for name in names if name not in valid]:
                 raise UserError(f"{what} names {', '.join(unknown)}: not one of {', '.join(valid)}")
         if self.look and not self.scene.cameras:
-            raise UserError(f"look.{next(iter(self.look))} changes what cameras see, and the scene has none (scene.cameras)")
+            raise UserError(f"look.{next(iter(self.look))} changes what cameras see, but the scene has none (scene.cameras)")
         if targets and TARGET in self.scene.objects:
-            raise UserError(f"scene.objects.{TARGET} needs another name: terms call the commanded one of targets so")
+            raise UserError(f"scene.objects.{TARGET} needs another name: terms use this one for the commanded object")
         for name, term in self.terms().items():
             self._check_objects(name, term)
             self._check_robot(name, term)
@@ -256,22 +256,22 @@ class EnvCfg:
         listed = ", ".join(there) or "none"
         wanted = term.params.get("object")
         if wanted is not None and wanted not in there:
-            raise UserError(f"{name}.params.object is {wanted!r}, and the scene's objects are: {listed}")
+            raise UserError(f"{name}.params.object is {wanted!r}, but the scene's objects are: {listed}")
         if unknown := [each for each in term.params.get("objects", ()) if each not in there]:
-            raise UserError(f"{name}.params.objects names {', '.join(unknown)}, and the scene's objects are: {listed}")
+            raise UserError(f"{name}.params.objects names {', '.join(unknown)}, but the scene's objects are: {listed}")
         heights = term.params.get("minimal_height")
         if isinstance(heights, tuple) and len(heights) != len(targets):
             raise UserError(f"{name}.params.minimal_height is one height, or one for each of {len(targets)} targets")
 
     def _check_robot(self, name: str, term: Term) -> None:
-        """Checks that the robot that the term called ``name`` sees exists, and that it reads a view."""
+        """Checks that the robot in the parameters of the term called ``name`` exists, and that the term reads a view."""
         if (robot := term.params.get(ROBOT)) is None:
             return
         if robot and robot not in self.scene.robots:
             there = ", ".join(self.scene.robots) or "none but the first"
-            raise UserError(f"{name}.params.robot is {robot!r}, and the scene's further robots are: {there}")
+            raise UserError(f"{name}.params.robot is {robot!r}, but the scene's further robots are: {there}")
         if not name.startswith(tuple(f"{group}." for group in self.view_terms())):
-            raise UserError(f"{name}.params.robot means nothing: only terms that read a view see a robot")
+            raise UserError(f"{name}.params.robot has no effect: only terms that read a view see a robot")
 
     def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Translates fields of version 0.5.0 to their present names: see ``envs.old_names``."""
@@ -279,7 +279,7 @@ class EnvCfg:
 
     @property
     def goal_is_tied(self) -> bool:
-        """True if an event places a thing by the goal: a start that keeps the one keeps the other."""
+        """True if an event places a fixture by the goal. A start that keeps one of them must keep the other."""
         return any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in self.events.values())
 
     def uncorrupted(self) -> "EnvCfg":
@@ -312,7 +312,7 @@ class EnvCfg:
 
 
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task as controllers act in it.
+    """Returns the task for controllers.
 
     Drive targets replace the actions that policies learn, and the arm carries its own weight, as real arms' controllers do.
     """
@@ -322,7 +322,7 @@ def for_controllers(cfg: EnvCfg) -> EnvCfg:
 
 
 def compensated(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with robots whose drives carry their weight."""
+    """Returns the task with gravity compensation in all robots."""
     robot, *others = (dataclasses.replace(each, gravity_compensation=True) for each in (cfg.robot, *cfg.scene.robots.values()))
     scene = dataclasses.replace(cfg.scene, robots=dict(zip(cfg.scene.robots, others, strict=True)))
     return dataclasses.replace(cfg, robot=robot, scene=scene)

@@ -1,4 +1,4 @@
-"""Puts a thing of a mesh in the place of a task's object: it lies as such a thing rests, and its own size counts."""
+"""Replaces a task's object with a mesh, which lies in its own resting poses. Terms then use the mesh's own size."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from mjx_nero.sim.objects import body, events, rests
 from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.types import UserError
 
-LONGER = 2.0  # [s] that the script takes longer than with a cube: it looks for a grasp, and lifts slowly what it may lose
-STEP = 0.005  # [s] physics steps: with ones of 10 ms, what is held at a rim slips out
+LONGER = 2.0  # [s] extra time of the script compared with a cube: it searches for a grasp, and lifts loose grasps slowly
+STEP = 0.005  # [s] physics step: at 10 ms, things held at their rim slip out
 _UPRIGHT = np.cos(np.radians(3.0))
 SCRIPTS = ("pick_up", "grasp_thing")  # of tasks that lift one object
 LIFTS, PUSHES, PLACES = "lifts", "pushes", "places"
@@ -27,7 +27,7 @@ T = TypeVar("T", bound=Term)
 
 
 def overridden(cfg: EnvCfg, fields: Mapping[str, Any]) -> EnvCfg:
-    """Returns the task with fields by dotted name. Those of ``object`` come first, so that the others hold with that object.
+    """Returns the task with fields replaced by dotted name. Those of ``object`` come first; the others apply to the result.
 
     Raises:
         UserError: a name or value is wrong, or the object does not suit the task.
@@ -38,14 +38,14 @@ def overridden(cfg: EnvCfg, fields: Mapping[str, Any]) -> EnvCfg:
 
 
 def applied(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with ``cfg.object`` in the place of its one object.
+    """Returns the task with ``cfg.object`` in place of its one object.
 
-    A lifted thing lies in any of its ways of resting; one that is pushed or placed stands as its file does, and one that does
-    not stand so is placed as it mostly rests. Terms about heights and grasps then count from its surface, and the script that
-    picks up uses its grasps.
+    A thing to lift starts in any of its resting poses. A thing to push stands in the orientation of its file. So does a thing to
+    place, if it can; otherwise it lies in its most frequent resting pose. Terms measure heights and grasps from the thing's
+    surface, and the script uses its grasps.
 
     Raises:
-        UserError: the task has not one object that is lifted, pushed or placed, the thing cannot be used, or does not stand.
+        UserError: the task does not have exactly one object to lift, push or place, or the thing is unusable or cannot stand.
     """
     if not cfg.object.file:
         return cfg
@@ -66,30 +66,30 @@ def applied(cfg: EnvCfg) -> EnvCfg:
 
 
 def _part(cfg: EnvCfg) -> tuple[str, str]:
-    """The task's one object, and what is done with it."""
+    """The name of the task's one object, and what the task does with it."""
     names, script, judged = tuple(cfg.scene.objects), next(iter(cfg.controllers), ""), cfg.success.condition
     what = PUSHES if bounds.unwrapped(judged.func) is success.object_at_pose else LIFTS if script in SCRIPTS else ""
     what = PLACES if placing.places(judged) else what
     if len(names) != 1 or not what:
         several = "several objects of their own shapes" if len(names) > 1 else "none"
         raise UserError(
-            f"object takes the place of the one object that a task lifts, pushes or places, and this task has {several}: there, "
-            "write scene.objects.NAME.shape=mesh and scene.objects.NAME.file=FILE"
+            f"object replaces the one object that a task lifts, pushes or places, but this task has {several}: set "
+            "scene.objects.NAME.shape=mesh and scene.objects.NAME.file=FILE instead"
         )
     return names[0], what
 
 
 def _stands(item: ObjectCfg, what: str) -> tuple[float, float, float, float]:
-    """Returns the orientation of a thing: as its file has it if it stands so, or else as it rests most often, but not turned.
+    """Returns the orientation of a thing: its file's, if it stands so, or else its most frequent resting pose without yaw.
 
     Raises:
-        UserError: it does not stand, and is pushed.
+        UserError: the thing is to be pushed, but cannot stand.
     """
     (solid,) = item.solids
     if any(rests.up(quat)[2] > _UPRIGHT for quat in solid.rest_quat):
         return item.quat
     if what == PUSHES:
-        raise UserError(f"{item.file} does not stand as its file has it, and what is pushed has to: turn it in the file")
+        raise UserError(f"{item.file} cannot stand in its orientation, but an object to push must: turn it in the file")
     return placing.tilted(*placing.tilt(rests.up(solid.rest_quat[int(np.argmax(solid.rest_share))])))
 
 
@@ -112,7 +112,7 @@ def _pushed(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
 
 
 def _sizes(cfg: EnvCfg, name: str) -> EnvCfg:
-    """The task with terms that count from the thing's surface."""
+    """Returns the task with terms that measure from the thing's surface."""
     groups: dict[str, Any] = {each: _own_size(getattr(cfg, each), name) for each in ("rewards", "terminations", "metrics")}
     groups["success"] = dataclasses.replace(
         cfg.success, condition=_sized(cfg.success.condition, name), distance=_sized(cfg.success.distance, name)
@@ -122,7 +122,7 @@ def _sizes(cfg: EnvCfg, name: str) -> EnvCfg:
 
 
 def laid(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with events that know all shapes of what they lay down, in the scene's order.
+    """Returns the task with ``at_rest`` events that know all shapes of their object, in the scene's order.
 
     Raises:
         UserError: an event names a file that its object does not have.
@@ -137,7 +137,7 @@ def laid(cfg: EnvCfg) -> EnvCfg:
         if unknown := [file for file in files if file not in bank]:
             name = event.params["object"]
             has = f"file and bank of scene.objects.{name} are {', '.join(bank)}"
-            raise UserError(f"events.{key}.params.files names {', '.join(unknown)}, and {has}")
+            raise UserError(f"events.{key}.params.files names {', '.join(unknown)}, but {has}")
         if files != bank:
             found[key] = dataclasses.replace(event, params={**event.params, "bank": bank})
     return cfg if found == cfg.events else dataclasses.replace(cfg, events=found)
@@ -152,7 +152,7 @@ def _own_size(terms: Mapping[str, T], name: str) -> dict[str, T]:
 
 
 def _sized(term: T, name: str) -> T:
-    """The term with heights and distances that count from the surface of a mesh; a thing looks the same once in a turn."""
+    """The term, measured from the surface of a mesh. A thing without symmetry looks the same only after a full turn."""
     if term.params.get("object") != name:
         return term
     own = {"minimal_height": LIFTED, "grasp_radius": NEAR, "fold": 1}
@@ -160,7 +160,7 @@ def _sized(term: T, name: str) -> T:
 
 
 def _kept(terms: Mapping[str, Term], name: str, item: ObjectCfg) -> dict[str, Term]:
-    """Randomization without another size, which a mesh cannot have, and with the friction of all its parts."""
+    """Randomization without the size, which a mesh cannot change, and with the friction of all parts of the mesh."""
     out = {}
     for key, term in terms.items():
         if bounds.unwrapped(term.func) is randomization.size and term.params["object"] == name:

@@ -79,7 +79,7 @@ class Viewer:
         )
 
     def _robots(self, sim: Sim, first: kinematics.Pose) -> dict[str, RobotView]:
-        """Reads each of several robots; ``first`` is the first one's hand."""
+        """Reads each of several robots; ``first`` is the pose of the first robot's hand."""
         found, begin = {}, 0
         for name, robot in self._team.items():
             pos, quat = self._ends[name](sim.qpos) if name else first

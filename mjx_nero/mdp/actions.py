@@ -22,7 +22,7 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.types import LEVEL, Key, UserError
 
 Memory = Any
-_STAYS = 0.01  # targets of fingers that move less in a step, on the scale of a ``ContinuousGripper``, stay where they are
+_STAYS = 0.01  # finger targets that change by less than this in a step, as a ``ContinuousGripper`` entry, count as unchanged
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Drives:
 
     @property
     def step(self) -> np.ndarray:
-        """The farthest that targets move in one control step [rad or m]."""
+        """Greatest change of the targets in one control step [rad or m]."""
         return self.speed * np.float32(self.dt)
 
 
@@ -106,11 +106,11 @@ class Plain:
         return None
 
     def bounds(self) -> Bounds:
-        """Returns the entries beyond which nothing more happens: +-1."""
+        """Returns the bounds of the entries, +-1; larger entries have no further effect."""
         return -np.ones(len(self.home), np.float32), np.ones(len(self.home), np.float32)
 
     def invert(self, act: Act, late: int) -> Float[Array, "... n"]:
-        """Computes the entries whose targets come nearest to ``act.targets``. Actions act up to ``late`` control steps late."""
+        """Computes the entries whose targets come nearest to ``act.targets`` if actions act up to ``late`` control steps late."""
         return jnp.zeros((*next(iter(act.targets.values())).shape[:-1], 0))
 
 
@@ -184,7 +184,7 @@ class JointVelocity(Joints):
     Attributes:
         time: time constant with which velocities follow the action [s].
         ahead: a set-point leads its joint by at most the distance covered in this time at full speed [s]. Without this limit, a
-            hand that leans on a table winds the set-point up until no action has an effect.
+            hand that leans on a table winds up the set-point until no action has an effect.
     """
 
     time: Positive = dataclasses.field(default=0.15, kw_only=True)
@@ -326,7 +326,7 @@ class ContinuousGripper(Gripper):
 
 @dataclasses.dataclass(frozen=True)
 class AntiWindup(Plain):
-    """Lets targets that turn back start at most ``ahead`` [s] of full speed from their joints. Place it before a speed limit.
+    """Limits how far a target that reverses can be from its joint: ``ahead`` [s] of full speed. Place it before a speed limit.
 
     Fingers press with a target far behind the surface of what they hold. To let go, the target would first have to travel back at
     the drives' speed, so nothing would happen for half a second. With ``ahead`` zero, however, noise opens the hand.
@@ -336,7 +336,7 @@ class AntiWindup(Plain):
     ahead: NonNegative = dataclasses.field(default=0.1, kw_only=True)
 
     def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]:
-        """Moves the current targets nearer to the joints, if the way to the new targets leads there."""
+        """Moves the current targets towards the joints, if the new targets lie in that direction."""
         to, now, joints = act.targets[self.group], act.ctrl[self.group], act.joint_pos[self.group]
         most = jnp.asarray(self.groups[self.group].speed * np.float32(self.ahead))
         start = jnp.clip(now, joints - most, joints + most)
@@ -344,7 +344,7 @@ class AntiWindup(Plain):
         return memory, dataclasses.replace(act, ctrl={**act.ctrl, self.group: start})
 
     def describe(self) -> Description:
-        """Names the joints whose targets turn back, as ``of``."""
+        """Lists the joints of the group as ``of``."""
         return {"type": "anti_windup", "of": list(self.groups[self.group].joints), "ahead": self.ahead}
 
 
@@ -362,7 +362,7 @@ class SpeedLimit(Plain):
         return memory, act
 
     def describe(self) -> Description:
-        """Names the joints whose targets are limited, as ``of``."""
+        """Lists the joints whose targets are limited as ``of``."""
         limited = (self.group,) if self.group else self.groups
         return {"type": "speed_limit", "of": [name for group in limited for name in self.groups[group].joints]}
 
@@ -470,10 +470,10 @@ class Chain:
         self.kinds = [type(term).__name__ for term in self.terms.values() if len(term.home)]
 
     def init(self, key: Key, joint_pos: Float[Array, " nj"], action: Float[Array, " na"] | None = None) -> dict[str, Memory]:
-        """Collects what the terms remember at the start, by their dotted names in the task. Terms without memory are left out.
+        """Builds the terms' initial memory, by dotted name in the task. Terms without memory are left out.
 
         Args:
-            action: the action that was in force until now. None: the home action.
+            action: the previous action. None: the home action.
         """
         act = self._act(jnp.asarray(self.home) if action is None else action, joint_pos, joint_pos)
         memory = {f"actions.{n}": term.init(jax.random.fold_in(key, i), act) for i, (n, term) in enumerate(self.terms.items())}
@@ -502,13 +502,13 @@ class Chain:
             what = getattr(term, "describe", lambda: None)()  # a guest's term may not have it
             if what is None:
                 kind = type(term).__name__
-                raise UserError(f"the action term {name} ({kind}) does not describe itself, so only this package knows it")
+                raise UserError(f"the action term {name} ({kind}) does not describe itself, so only this package can run it")
             if what.get("joints", True):  # a gripper term does nothing on a robot without a gripper
                 out.append({"name": name, **what})
         return out
 
     def bounds(self) -> Bounds:
-        """Returns the actions that take each joint to its limits; beyond them nothing more happens."""
+        """Returns the bounds of the action, which take each joint to its limits. Larger entries have no further effect."""
         low, high = zip(*(term.bounds() for term in self.terms.values()), strict=True)
         return np.concatenate(low).astype(np.float32), np.concatenate(high).astype(np.float32)
 

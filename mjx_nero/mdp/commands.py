@@ -23,7 +23,7 @@ def nothing(key: Key) -> Float[Array, "3"]:
 
 
 def either_side(key: Key, *, size: Range) -> Float[Array, "3"]:
-    """Draws a joint's position, the first of three numbers: its size uniform, its sign either [rad or m]."""
+    """Draws a joint position of uniform magnitude and random sign [rad or m]. It is the first of the three numbers."""
     k_size, k_sign = jax.random.split(key)
     drawn = jax.random.uniform(k_size, minval=size[0], maxval=size[1])
     return jnp.array([1.0, 0.0, 0.0]) * jnp.where(jax.random.bernoulli(k_sign), drawn, -drawn)
@@ -42,6 +42,6 @@ def uniform_pose(key: Key, *, x: Range, y: Range, z: Range, roll: Range, pitch: 
 
 
 def circle(position: Float[Array, "3"], time: Float[Array, ""], *, radius: float, frequency: float) -> Float[Array, "3"]:
-    """Moves the goal on a vertical circle about ``position`` in the world's yz plane [m], at ``frequency`` turns a second."""
+    """Moves the goal on a vertical circle about ``position`` in the world's yz plane [m], at ``frequency`` turns per second."""
     phase = 2 * jnp.pi * frequency * time
     return position + radius * jnp.stack([jnp.zeros_like(phase), jnp.cos(phase), jnp.sin(phase)])

@@ -1,7 +1,7 @@
 """Curriculum terms: (step count, level, weight, *, params) -> weight of a reward term; and levels of difficulty.
 
-A level is the share of all episode-to-episode differences that an episode gets (``types.LEVEL``). None, outside of training: all
-of them.
+A level, from 0 to 1, scales everything that differs from episode to episode (``types.LEVEL``). None means the full difference; it
+is used outside training.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ Level = Float[Array, ""] | None
 
 
 def step_weight(count: Int[Array, ""], level: Level, weight: float, *, to: float, num_steps: int) -> Float[Array, ""]:
-    """Changes the weight at once, after ``num_steps`` control steps of every environment.
+    """Switches the weight to ``to`` after ``num_steps`` control steps of each environment.
 
     Isaac Lab's ``modify_reward_weight``.
     """
@@ -28,7 +28,7 @@ def step_weight(count: Int[Array, ""], level: Level, weight: float, *, to: float
 def level_weight(count: Int[Array, ""], level: Level, weight: float, *, start: float) -> Float[Array, ""]:
     """Moves the weight from ``start`` at level 0 to its full value at level 1.
 
-    Costs that would keep a beginner from trying come in as it succeeds.
+    Use it for costs that would keep an untrained policy from trying: they grow as it succeeds.
     """
     return jnp.asarray(toward(level, start, weight))
 
@@ -64,8 +64,8 @@ def chances(last: Int[Array, " n"], won: Float[Array, " n"], share: Float[Array,
 
         chance_k = share * max(0, 1 - 2 p_0) * w_k / sum(w),  w_k = p_k (1 - p_k) + 0.05
 
-    Most expert starts are thus where the policy succeeds now and then. As it learns, they move back from the end of the task to
-    its beginning. They stop once half of the usual starts succeed.
+    Most expert starts thus lie in phases where the policy succeeds sometimes. As it learns, they move back from the end of the
+    task to its beginning. They stop once half of the usual starts succeed.
 
     Args:
         last: the phase in which each environment's last episode began; -1 if none has ended.
@@ -80,7 +80,7 @@ def chances(last: Int[Array, " n"], won: Float[Array, " n"], share: Float[Array,
 
 
 def toward(level: Level, plain: Tree, drawn: Tree) -> Tree:
-    """Blends from ``plain`` to ``drawn`` by the level; None: fully drawn. Integers are always the drawn ones."""
+    """Blends from ``plain`` to ``drawn`` by the level; None: fully drawn. Integers always come from ``drawn``."""
 
     def blend(a, b):
         return a + level * (b - a) if jnp.issubdtype(jnp.result_type(b), jnp.floating) else b

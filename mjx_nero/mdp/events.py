@@ -27,7 +27,7 @@ def object_apart_from_goal(key: Key, start: Start, *, x: Range, y: Range, apart:
     low, high = jnp.array([x, y]).T
     places = jax.random.uniform(key, (16, 2), minval=low, maxval=high)
     away = jnp.linalg.norm(places - start.goal_pos_w[:2], axis=1)
-    place = places[jnp.argmax(jnp.minimum(away, apart))]  # the first that is far enough: they tie
+    place = places[jnp.argmax(jnp.minimum(away, apart))]  # all that are far enough tie, and argmax takes the first
     pos = jnp.append(place, start.object_pos_w[object][2])
     return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
 
@@ -46,8 +46,8 @@ def scatter(
 ) -> Start:
     """Puts some of the objects on the table, picks the commanded one, and parks the others far away.
 
-    The commanded object lies anywhere in a box of the world. The others lie in the eight cells of a grid around it. All are
-    turned about the vertical at random. Every choice of objects, cells and command is equally likely.
+    The commanded object lies at a uniform point of the box ``x``, ``y`` in the world. The others lie in the eight cells of a grid
+    around it. All are turned about the vertical at random. Every choice of objects, cells and command is equally likely.
 
     Args:
         objects: up to nine; ``start.target`` is the index of the commanded one.
@@ -98,7 +98,7 @@ def objects_apart(key: Key, start: Start, *, objects: tuple[str, ...], x: Range,
     along = int(y[1] - y[0] > x[1] - x[0])
     free = sides[along][1] - sides[along][0] - (n - 1) * apart
     if free < 0:
-        raise UserError(f"{n} objects {apart:g} m apart take {(n - 1) * apart:g} m, and x {x} and y {y} are shorter")
+        raise UserError(f"{n} objects {apart:g} m apart need {(n - 1) * apart:g} m, but x {x} and y {y} are shorter")
     k_along, k_aside, k_order = jax.random.split(key, 3)
     place = sides[along][0] + free * jnp.sort(jax.random.uniform(k_along, (n,))) + apart * jnp.arange(n)
     aside = jax.random.uniform(k_aside, (n,), minval=sides[1 - along][0], maxval=sides[1 - along][1])
@@ -138,7 +138,7 @@ def visited(key: Key, start: Start, *, bank: Bank, chances: Float[Array, " phase
     """Replaces the start by a state that an expert has visited, with the given probabilities.
 
     Args:
-        bank: visited states, one a row.
+        bank: visited states, one per row.
         chances: probabilities of the usual start and of each of the expert's phases (``curriculum.chances``).
     """
     phases, n = len(chances) - 1, len(bank.arrived)

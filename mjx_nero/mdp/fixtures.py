@@ -1,6 +1,6 @@
 """Terms about the joints of fixtures, such as drawers and doors: reset events, observations, rewards, success and a metric.
 
-A way is a distance that the handle has to go: in metres for slides and hinges alike.
+A way is the distance that the handle still has to travel, in metres for slides and hinges alike.
 """
 
 import dataclasses
@@ -24,10 +24,10 @@ class Handle:
     Attributes:
         fixture: name in ``SceneCfg.fixtures``.
         joint: name of the joint in the fixture's file.
-        site: name of the site in the middle of the handle: its x axis points as a hand comes, its z axis lies along the bar.
-        grip: orientation of the hand in the site's frame, wxyz. Half a turn about the site's x axis fits as well.
-        target: where the joint has to go [rad or m]; None: where the command's first number says.
-        share: the target is a share of the joint's upper limit.
+        site: name of the site in the middle of the handle. Its x axis is the hand's approach, its z axis lies along the bar.
+        grip: orientation of the hand in the site's frame, wxyz. Half a turn about the site's x axis also fits.
+        target: position that the joint has to reach [rad or m]; None: the command's first number.
+        share: read the target as a share of the joint's upper limit.
         lever: how far the handle moves when the joint moves by one: 1 for slides, the radius for hinges [m/rad].
     """
 
@@ -56,11 +56,11 @@ def stand_uniform(key: Key, start: Start, *, fixture: str, x: Range, y: Range, y
 
 
 def stand_at_goal(key: Key, start: Start, *, fixture: str, off: NonNegative = 0.0, turn: NonNegative = 0.0) -> Start:
-    """Puts a fixture below the goal, turned as the goal is: the goal says where somebody takes the fixture to be.
+    """Puts a fixture below the goal, with the goal's yaw. The goal is an imperfect estimate of where the fixture is.
 
     Args:
-        off: by how much the goal is wrong, at most, along x and y [m].
-        turn: and about the vertical [rad].
+        off: greatest error of the estimate along x and y [m].
+        turn: greatest error about the vertical [rad].
     """
     wrong = jnp.array([off, off, turn]) * jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)
     seen = start.fixtures[fixture]
@@ -80,7 +80,7 @@ def _with(start: Start, name: str, fixture: FixtureStart) -> Start:
     return dataclasses.replace(start, fixtures={**start.fixtures, name: fixture})
 
 
-# What other terms are made of.
+# Building blocks of the terms.
 
 
 def _fixture(view: View, handle: Handle) -> FixtureView:
@@ -131,11 +131,11 @@ def joint_velocity(view: View, *, handle: Handle) -> Float[Array, "1"]:
     return _fixture(view, handle).joint_vel[handle.joint][None]
 
 
-# Success, and the ways that it judges.
+# Success, and the remaining ways that it judges.
 
 
 def opening_way(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Distance that the handle has still to go to the target, 0 beyond it: ``lever * max(0, target - position)`` [m]."""
+    """Distance that the handle still has to travel to the target, 0 beyond it: ``lever * max(0, target - position)`` [m]."""
     return handle.lever * jnp.maximum(0.0, target(view, handle) - _fixture(view, handle).joint_pos[handle.joint])
 
 
@@ -145,7 +145,7 @@ def turning_way(view: View, *, handle: Handle) -> Float[Array, ""]:
 
 
 def opened(view: View, *, handle: Handle) -> Bool[Array, ""]:
-    """True if the joint is as far as its target, or farther."""
+    """True if the joint is at its target or beyond."""
     return opening_way(view, handle=handle) <= 0.0
 
 
@@ -170,12 +170,10 @@ def handle_turn(view: View, *, handle: Handle, std: Positive) -> Float[Array, ""
 def gripping(
     view: View, *, handle: Handle, near: Positive, open: tuple[float, ...], close: tuple[float, ...]
 ) -> Float[Array, ""]:
-    """Share of the way from open to closed that the fingers' targets have gone, while the handle is ``near`` the grasp point [m].
-
-    Away from the handle it is 0.
+    """How far the fingers' targets are closed, from 0 to 1, while the handle is within ``near`` [m] of the grasp point; else 0.
 
     Args:
-        open, close: the fingers' targets [rad or m], the last of ``View.ctrl``.
+        open, close: targets of open and of closed fingers [rad or m]. The fingers come last in ``View.ctrl``.
     """
     first, last = jnp.array(open), jnp.array(close)
     way = last - first
@@ -184,7 +182,7 @@ def gripping(
 
 
 def opening(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """Share of the way to the target that the joint has gone from zero, at most 1."""
+    """Position of the joint as a share of its target, from 0 to 1."""
     return jnp.clip(_fixture(view, handle).joint_pos[handle.joint] / target(view, handle), 0.0, 1.0)
 
 
@@ -194,7 +192,7 @@ def turning(view: View, *, handle: Handle, std: Positive) -> Float[Array, ""]:
 
 
 def is_opened(view: View, *, handle: Handle) -> Float[Array, ""]:
-    """1 while the joint is as far as its target, or farther."""
+    """1 while the joint is at its target or beyond."""
     return opened(view, handle=handle).astype(jnp.float32)
 
 
@@ -205,14 +203,14 @@ def is_turned(view: View, *, handle: Handle, within: Positive) -> Float[Array, "
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Moved(Latch):
-    """1 if the joint has moved in the hand since the start: faster than ``speed`` [rad/s or m/s], the handle ``near`` it [m]."""
+    """1 once the joint has moved faster than ``speed`` [rad/s or m/s] with the handle within ``near`` [m] of the grasp point."""
 
     handle: Handle
     speed: Positive
     near: Positive
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Becomes true when the joint moves."""
+        """Becomes true when the hand moves the joint."""
         fast = jnp.abs(_fixture(view, self.handle).joint_vel[self.handle.joint]) > self.speed
         memory = memory | fast & (distance(view, self.handle) < self.near)
         return memory, memory

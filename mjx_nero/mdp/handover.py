@@ -1,6 +1,6 @@
-"""Terms of a long object that goes from the first robot's hand to another's. They share ``Hands``.
+"""Terms for handing a long object from the first robot to another. They share ``Hands``.
 
-The object's x axis leads from the giver's end to the taker's. Rewards of earlier stages stay once the taker holds it.
+The object's x axis points from the giver's end to the taker's. The rewards of earlier stages remain once the taker holds it.
 """
 
 import dataclasses
@@ -28,10 +28,10 @@ class Hands:
         object: the object's name.
         taker: name of the robot that takes it over from the first.
         along: distance of each hand's place from the object's middle [m].
-        half: half of its length [m].
-        radius: a hand so near to its place may hold the object [m].
-        minimal_height: least height of the middle of an object that is held [m].
-        clearance: a hand so far from the object's axis has left it [m].
+        half: half the object's length [m].
+        radius: greatest distance from its place of a hand that holds the object [m].
+        minimal_height: least height of the middle of a held object [m].
+        clearance: distance from the object's axis beyond which a hand has left it [m].
         giving, taking: targets of open and of closed fingers, of the giver and of the taker [rad or m].
     """
 
@@ -80,13 +80,13 @@ class Hands:
         return self.near(view, False) & self.lifted(view)
 
     def told(self, view: View, taker: bool) -> Scalar:
-        """Opening that a hand's fingers are told: 0 closed, 1 open."""
+        """Commanded opening of a hand's fingers: 0 closed, 1 open."""
         open, close = (np.array(ends, np.float32) for ends in (self.taking if taker else self.giving))
         targets = self.hand(view, taker).ctrl[-len(open) :]
         return jnp.clip(0.5 + 0.5 * opening(targets, open, close), 0.0, 1.0)
 
     def takes(self, view: View) -> Bool[Array, ""]:
-        """True if the object is in the taker's hand, which is told to close, above the table."""
+        """True if the object is above the table in the taker's hand, and that hand is commanded to close."""
         return self.near(view, True) & self.lifted(view) & (self.told(view, True) < 0.5)
 
     def alone(self, view: View) -> Bool[Array, ""]:
@@ -94,7 +94,7 @@ class Hands:
         return self.near(view, True) & self.lifted(view) & (self.gap(view, False) > self.clearance)
 
     def passed(self, view: View) -> Bool[Array, ""]:
-        """True if the taker holds the object, alone or not. Then a hand that leaves forfeits nothing."""
+        """True if the taker holds the object, alone or not. A hand that leaves after that loses no reward."""
         return self.takes(view) | self.alone(view)
 
 
@@ -109,17 +109,17 @@ def axis(view: View, *, hands: Hands) -> Float[Array, "3"]:
 
 
 def fingers(view: View, *, hands: Hands) -> Float[Array, "2"]:
-    """Opening that the fingers of giver and taker are told: 0 closed, 1 open."""
+    """Commanded opening of the giver's and the taker's fingers: 0 closed, 1 open."""
     return jnp.stack([hands.told(view, False), hands.told(view, True)])
 
 
 def holders(view: View, *, hands: Hands) -> Float[Array, "3"]:
-    """1 where the giver holds the object, the taker does, the taker alone does."""
+    """Three flags, each 0 or 1: the giver holds the object, the taker does, the taker alone does."""
     return jnp.stack([hands.gives(view), hands.takes(view), hands.alone(view)]).astype(jnp.float32)
 
 
 def to_meeting(view: View, *, hands: Hands, meet: tuple[float, float, float]) -> Float[Array, "3"]:
-    """Vector from the object's middle to the place where it changes hands, given from the giver's root [m]."""
+    """Vector from the object's middle to the meeting point [m]. ``meet`` gives that point relative to the giver's root."""
     return view.root_pos_w + jnp.array(meet) - view.objects[hands.object].pos_w
 
 
@@ -130,24 +130,27 @@ def reached(view: View, *, hands: Hands, std: Positive) -> Scalar:
 
 
 def held(view: View, *, hands: Hands) -> Scalar:
-    """1 while somebody holds the object."""
+    """1 while either robot holds the object."""
     return (hands.gives(view) | hands.passed(view)).astype(jnp.float32)
 
 
 def presented(view: View, *, hands: Hands, meet: tuple[float, float, float], std: Positive) -> Scalar:
-    """1 - tanh(d / std) while the giver holds the object, where d is its way to the meeting; 1 once the taker does."""
+    """1 - tanh(d / std) while the giver holds the object, where d is its way to the meeting point; 1 once the taker does."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(to_meeting(view, hands=hands, meet=meet)) / std)
     return jnp.where(hands.passed(view), 1.0, hands.gives(view) * near)
 
 
 def pointed(view: View, *, hands: Hands, std: Positive) -> Scalar:
-    """1 - tanh(angle / std) while the giver holds the object, where angle is from its axis to x [rad]; 1 as in ``presented``."""
+    """1 - tanh(angle / std) while the giver holds the object; 1 once the taker does.
+
+    The angle is from the object's axis to the world's x axis [rad].
+    """
     angle = jnp.arccos(jnp.clip(hands.axis(view)[0], -0.9999, 0.9999))
     return jnp.where(hands.passed(view), 1.0, hands.gives(view) * (1.0 - jnp.tanh(angle / std)))
 
 
 def met(view: View, *, hands: Hands, std: Positive) -> Scalar:
-    """1 - tanh(d / std) while somebody holds the object, where d is the distance of the taker's hand from its place."""
+    """1 - tanh(d / std) while either robot holds the object, where d is the distance of the taker's hand from its place."""
     near = 1.0 - jnp.tanh(jnp.linalg.norm(hands.way(view, True)) / std)
     return (hands.gives(view) | hands.passed(view)) * near
 
@@ -158,7 +161,7 @@ def taken(view: View, *, hands: Hands) -> Scalar:
 
 
 def released(view: View, *, hands: Hands) -> Scalar:
-    """Opening that the giver's fingers are told, from 0 to 1, while the taker holds the object; 1 once that alone does."""
+    """Commanded opening of the giver's fingers, from 0 to 1, while the taker holds the object; 1 once the taker alone does."""
     return jnp.where(hands.alone(view), 1.0, hands.takes(view) * hands.told(view, False))
 
 
@@ -173,26 +176,26 @@ def brought(view: View, *, hands: Hands, std: Positive) -> Scalar:
 
 
 def hands_clash(view: View, *, taker: str, apart: Positive) -> Bool[Array, ""]:
-    """True if the two grasp points are nearer than ``apart`` [m]: the hands would run into one another."""
+    """True if the two grasp points are closer than ``apart`` [m], where the hands would collide."""
     return jnp.linalg.norm(view.of().ee_pos_w - view.of(taker).ee_pos_w) < apart
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HandedOver:
-    """1 if the taker alone has held the object, after the giver had.
+    """1 once the taker alone has held the object, after the giver held it.
 
     Attributes:
-        hands: who holds it.
+        hands: the two hands and their object.
     """
 
     hands: Hands
 
     def init(self, key: Key, view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Starts with neither."""
+        """Starts with both false."""
         return jnp.zeros((), bool), jnp.zeros((), bool)
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, Bool[Array, ""]]:
-        """Notes who holds it."""
+        """Records who holds the object."""
         gave = memory[0] | self.hands.gives(view)
         took = memory[1] | gave & self.hands.alone(view)
         return (gave, took), took
@@ -200,12 +203,12 @@ class HandedOver:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HeldAtGoal(Latch):
-    """True if the taker alone holds, still and at the goal, what the giver had held before.
+    """True if the taker alone holds the object still at the goal, after the giver held it.
 
     Attributes:
-        hands: who holds it.
-        threshold: distance from the goal that counts as there [m].
-        max_speed: of an object that is still [m/s].
+        hands: the two hands and their object.
+        threshold: greatest distance from the goal [m].
+        max_speed: greatest speed of an object that counts as still [m/s].
     """
 
     hands: Hands
@@ -213,7 +216,7 @@ class HeldAtGoal(Latch):
     max_speed: Positive
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Notes that the giver holds it, and returns whether this is success."""
+        """Records that the giver holds the object, and returns whether this step is a success."""
         memory = memory | self.hands.gives(view)
         seen = view.objects[self.hands.object]
         still = jnp.linalg.norm(seen.linvel_w) < self.max_speed

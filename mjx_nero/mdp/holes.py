@@ -1,4 +1,4 @@
-"""Holes and posts: terms of objects that go to their places from above, and stay there by themselves. See ``towers``."""
+"""Holes and posts: terms for objects that go into place from above and stay there unaided. See ``towers``."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -10,25 +10,25 @@ from mjx_nero.types import View
 
 
 def to_place(view: View, *, place: Place) -> Float[Array, "3"]:
-    """Vector from the lowest object that moves to its true place [m]."""
+    """Vector from the lowest object to be moved to its true place [m]."""
     below, object = next(place.steps)
     return towers.way(view, below=below, object=object, rise=place.rise)
 
 
 def let_be(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
-    """``built``, and the pads touch nothing, by the scene's sensors of the fingers.
+    """True if the tower is ``built`` and the finger sensors read no contact.
 
     Raises:
-        UserError: the scene has none.
+        UserError: the scene has no finger sensors.
     """
     return success.pads_are_free(view, "holes.let_be") & towers.built(view, place=place, max_speed=max_speed)
 
 
 def lowered(view: View, *, place: Place, top: Positive, std: Positive, flat: Positive) -> Scalar:
-    """1 - tanh(d / std) while the object is held or stands, where d is the way to its place from above [m].
+    """1 - tanh(d / std) while the object is held or stands, where d is the length of its path into place from above [m].
 
-    The way is for holes and posts: beside its place by more than ``flat`` [m], the object has to be ``top`` above it [m]. So d is
-    the distance along the table, plus the height, plus twice what the height lacks to ``top`` there.
+    It is for holes and posts. An object more than ``flat`` [m] beside its place has to be ``top`` [m] above it first. So d is the
+    distance along the table, plus the height, plus twice the height that such an object still lacks to ``top``.
     """
 
     def near(level: towers.Level) -> Scalar:

@@ -1,4 +1,4 @@
-"""Observation terms that read cameras: pictures of any shape, for groups whose terms stay apart."""
+"""Observation terms that read cameras: pictures of any shape, for groups that keep their terms ``apart``."""
 
 import dataclasses
 from typing import Any
@@ -33,7 +33,7 @@ def rgbd(view: View, *, camera: str) -> Float[Array, "height width 4"]:
 def _seen(view: View, camera: str, kind: str) -> Any:
     if camera not in view.cameras:
         there = ", ".join(view.cameras) or "none"
-        raise UserError(f"an observation reads the camera {camera!r}, and the scene's cameras (scene.cameras) are: {there}")
+        raise UserError(f"an observation reads the camera {camera!r}, but the scene's cameras (scene.cameras) are: {there}")
     image = getattr(view.cameras[camera], kind)
     if image is None:
         raise UserError(f"an observation reads {kind} of the camera {camera!r}: add it to scene.cameras.{camera}.kinds")
@@ -42,13 +42,13 @@ def _seen(view: View, camera: str, kind: str) -> Any:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lens:
-    """A realistic camera, as a sensor (``mdp.sensors``): exposure and colours of the episode, noise, blur, frame rate and delay.
+    """A realistic camera, as a sensor (``mdp.sensors``): exposure and colours per episode, noise, blur, frame rate and delay.
 
     Attributes:
         camera: the camera's name.
         exposure: range of the factor of all colours, constant for an episode.
-        white_balance: each channel's factor is up to 1 +- this, constant for an episode.
-        blur: greatest share of a pixel's four neighbours in it, constant for an episode.
+        white_balance: each channel is scaled by a factor within 1 +- this, constant for an episode.
+        blur: greatest weight of a pixel's four neighbours in its colour. The weight is constant for an episode.
         noise: standard deviation of each channel in every picture, from 0 to 255.
         depth_noise: standard deviation of a depth, divided by its square [1/m].
         depth_step: resolution of depths [m]; 0: exact.
@@ -71,11 +71,11 @@ class Lens:
     hold: Share = 1.0
 
     def due(self, memory: tuple) -> Bool[Array, ""]:
-        """True if the next ``step`` looks at the picture. Otherwise nobody has to draw it."""
+        """True if the next ``step`` reads the picture. Otherwise it need not be rendered."""
         return memory[3][0] % self.every == 0 if self.every > 1 else jnp.ones((), bool)
 
     def init(self, key: Key, view: View) -> tuple:
-        """Draws the episode's camera, and fills rate and delay with the first picture."""
+        """Draws the episode's camera properties, and fills the memory with the first picture."""
         key, k_exposure, k_white, k_blur, k_delay = jax.random.split(key, 5)
         gain = jax.random.uniform(k_exposure, (), minval=self.exposure[0], maxval=self.exposure[1])
         gain *= 1 + self.white_balance * jax.random.uniform(k_white, (3,), minval=-1.0, maxval=1.0)
@@ -87,7 +87,7 @@ class Lens:
         return key, gain, blur, last, {kind: line.init(k_delay, image) for kind, image in kinds.items()} if line else {}
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """Replaces the picture by the one that the camera gives."""
+        """Replaces the view's picture by the one that the camera delivers."""
         key, gain, blur, last, late = memory
         key, k_noise = jax.random.split(key)
         seen = self._taken(view.cameras[self.camera], gain, blur, k_noise)
@@ -96,7 +96,7 @@ class Lens:
             seen = jax.tree.map(lambda new, old: jnp.where(count % self.every == 0, new, old), seen, before)
             last = count + 1, seen
         if line := delay(self.delay, self.hold):
-            passed = {kind: line.step(late[kind], getattr(seen, kind)) for kind in late}  # equally late: of one key
+            passed = {kind: line.step(late[kind], getattr(seen, kind)) for kind in late}  # one key, so all are equally late
             late = {kind: memory for kind, (memory, _) in passed.items()}
             seen = dataclasses.replace(seen, **{kind: image for kind, (_, image) in passed.items()})
         return (key, gain, blur, last, late), dataclasses.replace(view, cameras={**view.cameras, self.camera: seen})

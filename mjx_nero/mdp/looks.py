@@ -1,6 +1,6 @@
-"""Looks of an episode: (key, model, *, params) -> {field: (rows, values)}, like ``mdp.randomization``, but of the drawn model.
+"""Appearance randomization: (key, model, *, params) -> {field: (rows, values)}, like ``mdp.randomization``, on the drawn model.
 
-Rows are cameras, lights, geoms and materials. Nothing here moves anything: physics has another model.
+Rows are cameras, lights, geoms and materials. The physics has a model of its own, so none of this affects it.
 """
 
 import jax
@@ -15,7 +15,7 @@ from mjx_nero.types import Key
 
 
 def camera_pose(key: Key, model: Model, *, cameras: tuple[str, ...], offset: NonNegative, turn: NonNegative) -> Drawn:
-    """Moves cameras by up to ``offset`` along each axis [m], and turns them by up to ``turn`` about each of their own [rad]."""
+    """Moves cameras by up to ``offset`` [m] along each axis, and turns them by up to ``turn`` [rad] about each of their axes."""
     rows = model.rows("camera", cameras)
     k_offset, k_turn = jax.random.split(key)
     pos = model.fields["cam_pos"][rows] + offset * _within(k_offset, (len(rows), 3))
@@ -55,7 +55,7 @@ def colors(key: Key, model: Model, *, geoms: tuple[str, ...], change: Share, sha
 
 
 def materials(key: Key, model: Model, *, change: Share, shade: PositiveRange = (1.0, 1.0)) -> Drawn:
-    """Varies all materials, which are the robot's, as ``colors`` varies geoms."""
+    """Varies the colours of all materials (the robot's) as ``colors`` varies those of geoms."""
     rows = np.arange(len(model.fields["mat_rgba"]))
     return {"mat_rgba": (rows, _recolored(key, model.fields["mat_rgba"][rows], change, shade))}
 
@@ -65,7 +65,7 @@ def photographs(
 ) -> Drawn:
     """Shows a random photograph of ``SceneCfg.photographs`` on each geom, with probability ``share`` and multiplied by ``shade``.
 
-    Without photographs it draws nothing.
+    Without photographs it does nothing.
     """
     if not (shown := _materials(model, "photograph_")).size:
         return {}
@@ -79,11 +79,12 @@ def photographs(
 
 
 def patterns(key: Key, model: Model, *, geoms: tuple[str, ...] = (), share: Share) -> Drawn:
-    """Shows a random pattern of ``SceneCfg.patterns`` on each geom, in its colour, with probability ``share``; without patterns
-    nothing.
+    """Shows a random pattern of ``SceneCfg.patterns`` on each geom, in the geom's colour, with probability ``share``.
+
+    Without patterns it does nothing.
 
     Args:
-        geoms: empty: all of the robot, which then has one pattern.
+        geoms: their names. Empty: all of the robot's geoms, which then share one pattern.
     """
     if not (shown := _materials(model, "pattern_")).size:
         return {}
@@ -93,7 +94,7 @@ def patterns(key: Key, model: Model, *, geoms: tuple[str, ...] = (), share: Shar
         there = jax.random.bernoulli(k_there, share, rows.shape)
         return {"geom_matid": (rows, _chosen(k_which, model, rows, shown, there))}
     own, there = model.fields["geom_matid"][rows], jax.random.bernoulli(k_there, share)
-    rgba = jnp.where(there, model.fields["mat_rgba"][own], model.fields["geom_rgba"][rows])  # the colour was the material's
+    rgba = jnp.where(there, model.fields["mat_rgba"][own], model.fields["geom_rgba"][rows])  # the old material held the colour
     which = jnp.asarray(shown)[jax.random.randint(k_which, (), 0, len(shown))]
     return {"geom_matid": (rows, jnp.where(there, which, own)), "geom_rgba": (rows, rgba)}
 
@@ -108,9 +109,9 @@ def _chosen(key: Key, model: Model, rows: np.ndarray, shown: np.ndarray, there: 
 
 
 def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range, z: Range, there: Share = 1.0) -> Drawn:
-    """Puts geoms without collisions at random places, turned about the vertical; each is hidden below the table unless ``there``.
+    """Puts geoms without collisions at random places, turned about the vertical at random.
 
-    ``there`` is the probability that a geom is in place.
+    Each one shows with probability ``there``; otherwise it is hidden below the table.
     """
     rows = model.rows("geom", geoms)
     k_pos, k_turn, k_there = jax.random.split(key, 3)

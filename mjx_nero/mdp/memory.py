@@ -1,4 +1,4 @@
-"""Memories of terms: one truth, delays and histories. All have ``init`` and ``step``, as every term with memory does."""
+"""Memories that terms use: latches, delays and histories. All have ``init`` and ``step``, as every term with memory does."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +12,7 @@ from mjx_nero.types import DelayMemory, Key, View
 
 
 class Latch:
-    """Base of terms that remember one truth of the episode so far, false at its start."""
+    """Base of terms that remember whether something has happened in the episode: false at its start."""
 
     def init(self, key: Key, view: View) -> Bool[Array, ""]:
         """Starts with False."""
@@ -52,7 +52,7 @@ class Delay:
 
 
 def delay(steps: Steps, hold: float) -> Delay | None:
-    """Makes a delay; None if nothing is ever late."""
+    """Makes a delay; None if the delay is always 0."""
     return None if steps == (0, 0) else Delay(steps, hold)
 
 

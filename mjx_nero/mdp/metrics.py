@@ -95,7 +95,7 @@ class JointAcceleration(TargetChange):
 
 
 def grasping(**held: Any) -> dict[str, MetricTerm]:
-    """Builds the metrics that tell whether and when an object was first held.
+    """Builds the metrics of whether and when an object was first held.
 
     Args:
         held: parameters of ``rewards.held``.
@@ -107,6 +107,6 @@ def grasping(**held: Any) -> dict[str, MetricTerm]:
 
 
 def calmness(joints: int) -> dict[str, MetricTerm]:
-    """Builds the metrics that tell how calmly a policy moves an arm of ``joints`` joints."""
+    """Builds the metrics of how smoothly a policy moves an arm of ``joints`` joints."""
     params = {"joints": joints}
     return {"target_change": MetricTerm(TargetChange, params=params), "joint_acc": MetricTerm(JointAcceleration, params=params)}

@@ -20,12 +20,12 @@ def joint_pos_rel(view: View) -> Float[Array, " nj"]:
 
 
 def joint_vel_rel(view: View) -> Float[Array, " nj"]:
-    """Joint speeds relative to home, which stands still [rad/s, m/s]."""
+    """Joint velocities relative to home, where they are zero [rad/s, m/s]."""
     return view.joint_vel
 
 
 def reading(view: View, *, name: str) -> Float[Array, " n"]:
-    """A measurement of the scene's sensors, such as ``wrist``: force [N] and torque [N m], or ``fingers`` [N].
+    """A reading of the scene's sensors, such as ``wrist`` (force [N] and torque [N m]) or ``fingers`` [N].
 
     Raises:
         UserError: the scene does not measure it.
@@ -79,7 +79,7 @@ def object_to_goal(view: View, *, object: str = "cube") -> Float[Array, "3"]:
 
 
 def target_error(view: View) -> Float[Array, " nj"]:
-    """Lead of the rate-limited position targets over the joints [rad, m]."""
+    """Rate-limited position targets minus joint positions [rad, m]."""
     return view.ctrl - view.joint_pos
 
 
@@ -95,14 +95,14 @@ def object_orientation(view: View, *, object: str = "cube") -> Float[Array, "4"]
 
 
 def object_shape(view: View, *, object: str = "cube") -> Float[Array, " k"]:
-    """Shape of an object of a mesh, in its own frame: how far it reaches in some directions, and its radii of gyration [m].
+    """Shape of a mesh object in its own frame: its extent in some directions, and its radii of gyration [m].
 
     Raises:
-        UserError: the object is no mesh.
+        UserError: the object is not a mesh.
     """
     shape = view.objects[object].shape
     if shape is None:
-        raise UserError(f"object_shape reads the shape of a mesh, and {object!r} is none")
+        raise UserError(f"object_shape reads the shape of a mesh, but {object!r} is not a mesh")
     return shape.code
 
 

@@ -1,4 +1,4 @@
-"""Obstacles: (key, view, *, params) -> boxes by name, drawn after an episode's start and goal.
+"""Obstacle terms: (key, view, *, params) -> boxes by name, drawn once an episode's start and goal are known.
 
 Boxes that a term does not name stay where the scene parks them, below the table.
 """
@@ -72,7 +72,7 @@ def across(
     Args:
         kinds: kinds to draw from, all equally likely.
         names: names of the two boxes that make an obstacle.
-        thickness: range of the thickness [m]. A shelf's board takes the least.
+        thickness: range of the thickness [m]. A shelf's board has the least.
         width: range of the size across the path [m].
         above: range of the top's height above the path [m].
         top: greatest height above the robot's foot [m].
@@ -132,7 +132,7 @@ def _shelf(site: _Site, keys: Key) -> tuple[Box, Box]:
     return under, _box(site.goal - (site.room + site.thick / 2) * site.along, 0.0, top, site.thick, site.wide)
 
 
-# Makes a kind's two boxes from two keys.
+# Each builds a kind's two boxes from two keys.
 _MAKERS = {"wall": _wall, "bar": _bar, "posts": _posts, "shelf": _shelf}
 KINDS = tuple(_MAKERS)
 

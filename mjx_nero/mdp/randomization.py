@@ -1,7 +1,7 @@
 """Domain randomization terms: (key, model, *, params) -> {field: (rows, values)}, applied in order at every reset.
 
-Fields are MuJoCo's (``mjModel``); their values are the model's, or those of the term before. The rows that a term draws must not
-depend on the key. Constants derived from masses (inverse weights, subtree masses) are recomputed.
+Fields are those of MuJoCo's ``mjModel``; each term reads the values that the term before left. The rows that a term draws must
+not depend on the key. Constants derived from masses (inverse weights, subtree masses) are recomputed.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class Model:
     index: Mapping[str, Mapping[str, int]]
 
     def rows(self, kind: str, names: Sequence[str]) -> np.ndarray:
-        """Looks up the rows of names.
+        """Looks up row numbers by name.
 
         Raises:
             UserError: the model lacks one of the names.
@@ -43,7 +43,7 @@ class Model:
 
 
 def mass(key: Key, model: Model, *, bodies: tuple[str, ...], scale: PositiveRange) -> Drawn:
-    """Scales masses, with their inertias, by one uniform factor per body."""
+    """Scales masses and inertias by one uniform factor per body."""
     rows = model.rows("body", bodies)
     (factor,) = _uniform(key, len(rows), scale)
     inertia = model.fields["body_inertia"][rows] * factor[:, None]
@@ -132,7 +132,8 @@ def passive_joints(
 
     Args:
         joints: names; a fixture's joint is called ``fixture/joint``.
-        armature, damping, friction, upper: ranges of the factors; of dry friction (``frictionloss``), and of the upper limit.
+        armature, damping, friction, upper: ranges of the factors. ``friction`` scales dry friction (``frictionloss``), ``upper``
+            the upper limit.
     """
     dofs, rows = model.rows("dof", joints), model.rows("joint", joints)
     *factors, farther = _uniform(key, len(dofs), armature, damping, friction, upper)
@@ -155,7 +156,7 @@ def center_of_mass(key: Key, model: Model, *, bodies: tuple[str, ...], offset: N
 
 
 def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) -> Drawn:
-    """Scales an object's lengths by one uniform factor. Its mass stays; its inertia follows."""
+    """Scales an object's lengths by one uniform factor. The mass stays; the inertia follows the size."""
     sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # only a can has one
     geoms, body = model.rows("geom", (object, *sides)), model.rows("body", (object,))
     fields, ((factor,),) = model.fields, _uniform(key, 1, scale)
@@ -183,7 +184,7 @@ def gravity_compensation(key: Key, model: Model, *, bodies: tuple[str, ...], sca
 
 
 def encoder_bias(key: Key, model: Model, *, actuators: tuple[str, ...], bias: NonNegative) -> Drawn:
-    """Makes encoders read up to ``bias`` off the joints' positions [rad or m], so that drives pull the readings to the targets.
+    """Biases each encoder by up to ``bias`` [rad or m]: drives pull the biased readings, not the true positions, to the targets.
 
     ``View.encoder_bias`` holds the draw, and ``sensors.Encoders`` adds it to observations. List this term after ``gains``.
     """
@@ -203,7 +204,7 @@ def drives(
     armature: tuple[PositiveRange, ...],
     friction: tuple[NonNegativeRange, ...],
 ) -> Drawn:
-    """Draws the parameters of position drives and joints, uniformly, one range per joint: what ``identify`` writes.
+    """Draws parameters of position drives and joints uniformly, from one range per joint. ``identify`` writes such ranges.
 
     Args:
         stiffness: ranges [N m/rad or N/m].

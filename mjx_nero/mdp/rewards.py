@@ -31,7 +31,7 @@ def _height(view: View, object: str) -> Float[Array, ""]:
 def held(view: View, *, minimal_height: Heights, grasp_radius: Positive, object: str = "cube") -> Bool[Array, ""]:
     """True if the object's centre is above ``minimal_height`` [m] and within ``grasp_radius`` [m] of the grasp point.
 
-    Of a mesh the lowest point counts, and the box around it: its size and the way it lies do not matter.
+    For a mesh, its lowest point and its bounding box count instead, so its size and the way it lies do not matter.
 
     A cube that was knocked into the air is above the height too, but only a gripped one stays at the grasp point. A tuple gives
     one height per object of ``CommandTerm.targets``; the commanded object's counts.
@@ -167,6 +167,6 @@ def touching(view: View) -> Float[Array, ""]:
 
 
 def obstacle_nearness(view: View, *, margin: Positive) -> Float[Array, ""]:
-    """Depth of the end effector in the ``margin`` [m] around an obstacle: 0 at its edge, 1 at the obstacle's surface."""
+    """Depth of the end effector in the ``margin`` [m] around an obstacle: 0 at the margin's edge, 1 at the obstacle's surface."""
     far = [math.box_distance(view.ee_pos_w, box.pos_w, box.quat_w, box.size) for box in view.obstacles.values()]
     return jnp.clip(1.0 - jnp.min(jnp.stack(far)) / margin, 0.0, 1.0)

@@ -1,7 +1,7 @@
-"""Sensors: what stands between state and policy. ``init(key, view) -> memory``, ``step(memory, view) -> (memory, view)``.
+"""Sensor models between state and policy: ``init(key, view) -> memory`` and ``step(memory, view) -> (memory, view)``.
 
-They apply in the task's order, before the observation terms, so all terms of a group see the same wrong world. An object seen a
-centimetre too far left is that much farther from the gripper and that much nearer to the goal.
+They apply in the task's order, before the observation terms, so all terms of a group see the same errors. An error in an object's
+position, for example, changes its distances from gripper and goal as well.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from mjx_nero.types import Key, View
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Encoders:
-    """Joint encoders, which read positions off by the bias of ``randomization.encoder_bias``."""
+    """Joint encoders: they add the bias of ``randomization.encoder_bias`` to the joint positions."""
 
     def init(self, key: Key, view: View) -> tuple[()]:
         """Returns an empty memory: the physics holds the bias."""
@@ -33,7 +33,7 @@ class Encoders:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectPosition:
-    """A camera's estimate of an object's position: off by a constant per episode, noisy, and late.
+    """A camera's estimate of an object's position: with a constant offset per episode, with noise, and late.
 
     Attributes:
         object: the object's name.
@@ -71,12 +71,12 @@ class ObjectPosition:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gauge:
-    """A force sensor: off by a constant and a factor per episode, noisy, and late.
+    """A force sensor: with a constant offset and factor per episode, with noise, and late.
 
     Attributes:
         reading: name in ``View.readings``, such as ``wrist``.
         offset: greatest constant offset of each number [N, N m]; one for all, or one for each.
-        scale: greatest share by which each number is off.
+        scale: greatest deviation of each number's factor from 1.
         noise: greatest noise of each number, drawn at every step; one for all, or one for each.
         delay: least and greatest delay [control steps].
         hold: probability that a step keeps the previous step's delay.
@@ -99,7 +99,7 @@ class Gauge:
         return key, offset, factor, late.init(k_delay, value) if late else ()
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """Replaces the reading by what the sensor tells."""
+        """Replaces the reading by the sensor's output."""
         key, offset, factor, line = memory
         key, k_noise = jax.random.split(key)
         value = view.readings[self.reading]
@@ -112,10 +112,10 @@ class Gauge:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BasePose:
-    """A wrongly calibrated base: all objects and fixtures are seen moved by one rigid motion about it.
+    """A calibration error of the base: all objects and fixtures are seen moved by one rigid motion about it.
 
-    For an arm that knows the world through cameras alone, this equals a displaced base, as long as the base stands upright. The
-    commanded point stays, as it is given in the robot's own frame.
+    For an arm that sees the world through cameras alone, this equals a displaced base, as long as the base stands upright. The
+    commanded point does not move, because it is given in the robot's own frame.
 
     Attributes:
         offset: greatest offset along each axis [m].
@@ -132,7 +132,7 @@ class BasePose:
         return offset, jax.random.uniform(k_turn, (), minval=-self.turn, maxval=self.turn)
 
     def step(self, memory: tuple, view: View) -> tuple[tuple, View]:
-        """Moves the objects in the view."""
+        """Moves the objects and fixtures in the view."""
         offset, turn = memory
         quat = math.axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
 

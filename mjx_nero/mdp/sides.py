@@ -1,4 +1,4 @@
-"""Sides of a box: terms of a box that is to lie with a commanded side up. The command is that side's normal, in the box's frame.
+"""Sides of a box: terms for turning a commanded side of a box up. The command is that side's normal, in the box's frame.
 
 The box *stands* while that side is up and the box rests on the table, held or not. As with ``towers``, a standing box keeps the
 rewards of a held one, so letting go costs nothing.
@@ -23,7 +23,7 @@ NORMALS = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lying:
-    """Measures of how a box has to lie, and of when it counts as held or left.
+    """How a box has to lie, and when it counts as held or left.
 
     Attributes:
         object: the box.
@@ -43,7 +43,7 @@ class Lying:
 
 @functools.cache
 def cube_turns() -> np.ndarray:
-    """The 24 turns of a cube onto itself, wxyz [24, 4]."""
+    """The 24 rotations that map a cube onto itself, wxyz [24, 4]."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     return np.roll(Rotation.create_group("O").as_quat(), 1, axis=1).astype(np.float32)
@@ -58,10 +58,10 @@ def any_side(key: Key) -> Float[Array, "3"]:
 
 
 def other_side_up(key: Key, start: Start, *, base: tuple[float, float, float], yaw: Range, object: str) -> Start:
-    """Lays a cube so that another side than the commanded one is up, and turns it about the vertical by ``yaw`` [rad].
+    """Lays a cube with a side other than the commanded one up, and turns it about the vertical by ``yaw`` [rad].
 
     Args:
-        base: the robot's root, from which commands count [m].
+        base: the robot's root, from which commands are measured [m].
     """
     k_turn, k_yaw = jax.random.split(key)
     wanted = start.goal_pos_w - jnp.array(base)
@@ -72,7 +72,7 @@ def other_side_up(key: Key, start: Start, *, base: tuple[float, float, float], y
     return dataclasses.replace(start, object_quat_w={**start.object_quat_w, object: math.quat_mul(about, turns[index])})
 
 
-# What other terms are made of.
+# Building blocks of the terms.
 
 
 def normal(view: View, object: str) -> Float[Array, "3"]:
@@ -113,7 +113,7 @@ def side(view: View, *, object: str) -> Float[Array, "3"]:
 
 
 def tilt(view: View, *, object: str, lever: Positive) -> Float[Array, ""]:
-    """Way of the commanded side until it is up: ``lever * angle`` [m]."""
+    """Distance that the commanded side still has to turn: ``lever * angle`` [m]."""
     return lever * angle(view, object)
 
 
@@ -123,7 +123,7 @@ def turned_up(view: View, *, lying: Lying, max_speed: Positive) -> Bool[Array, "
     At rest: slower than ``max_speed`` [m/s] and ten times that [rad/s].
 
     Raises:
-        UserError: the scene has no sensors of the fingers.
+        UserError: the scene has no finger sensors.
     """
     free = success.pads_are_free(view, "sides.turned_up")
     seen = view.objects[lying.object]
@@ -145,12 +145,12 @@ def carried(view: View, *, lying: Lying) -> Float[Array, ""]:
 
 
 def turned(view: View, *, object: str, std: Positive) -> Float[Array, ""]:
-    """1 - tanh(angle / std), from the commanded side to straight up [rad], however the box is turned."""
+    """1 - tanh(angle / std), where angle is from the commanded side's normal to straight up [rad]."""
     return 1.0 - jnp.tanh(angle(view, object) / std)
 
 
 def lowered(view: View, *, lying: Lying, std: Positive, near: Positive) -> Float[Array, ""]:
-    """1 - tanh(height / std) of a held or standing box over its rest [m], once its side is within ``near`` of up [rad]."""
+    """1 - tanh(h / std) of a held or standing box whose side is within ``near`` [rad] of up; h is its height over rest [m]."""
     height = jnp.abs(view.objects[lying.object].pos_w[2] - lying.rest)
     return (_carried(view, lying) & (angle(view, lying.object) < near)) * (1.0 - jnp.tanh(height / std))
 
@@ -161,10 +161,10 @@ def standing(view: View, *, lying: Lying) -> Float[Array, ""]:
 
 
 def told_to_open(view: View, *, lying: Lying, open: tuple[float, ...], hold: tuple[float, ...]) -> Float[Array, ""]:
-    """Opening of the fingers' targets while the box stands, from 0 to 1, so that a step to let go pays at once.
+    """Commanded opening of the fingers while the box stands, from 0 to 1, so the first step of letting go pays at once.
 
     Args:
-        open, hold: targets of the gripper's drives (the last ones) for wide open, and where the reward begins [rad or m].
+        open, hold: targets of the gripper's drives (the last ones) where the reward is 1, and where it begins [rad or m].
     """
     opens, holds = jnp.array(open), jnp.array(hold)
     share = jnp.mean((view.ctrl[-len(open) :] - holds) / (opens - holds))

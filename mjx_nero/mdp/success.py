@@ -70,17 +70,17 @@ def touched(view: View) -> Bool[Array, ""]:
 
 
 def pads_are_free(view: View, term: str) -> Bool[Array, ""]:
-    """True if the pads touch nothing, by the scene's sensors of the fingers.
+    """True if the finger sensors read no contact.
 
     Args:
-        term: who asks.
+        term: name of the term that asks, for the message.
 
     Raises:
-        UserError: the scene has none.
+        UserError: the scene has no finger sensors.
     """
     if "fingers" not in view.readings:
-        without = "this task is without, or its backend cannot measure them"
-        raise UserError(f"{term} needs 'fingers' among scene.sensors, and {without}")
+        without = "this task has none, or its backend cannot measure them"
+        raise UserError(f"{term} needs 'fingers' among scene.sensors, but {without}")
     return jnp.max(view.readings["fingers"]) == 0
 
 
@@ -89,7 +89,7 @@ class AtGoalUntouched(Latch):
     """Success at the goal, if nothing has been touched since the start (see ``View.readings``).
 
     Attributes:
-        threshold: distance from the goal that counts as there [m].
+        threshold: greatest distance from the goal [m].
         object: the object that must be there. None: the end effector.
     """
 
@@ -97,7 +97,7 @@ class AtGoalUntouched(Latch):
     object: str | None = None
 
     def step(self, memory: Bool[Array, ""], view: View) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Records a touch, and returns whether this is success."""
+        """Records a touch, and returns whether this step is a success."""
         memory = memory | touched(view)
         distance = ee_distance(view) if self.object is None else object_distance(view, object=self.object)
         return memory, (distance < self.threshold) & ~memory
@@ -125,7 +125,7 @@ class Hold:
     """Counts for how many steps in a row a condition has been true.
 
     Attributes:
-        steps: number of steps that makes success.
+        steps: number of steps in a row that make a success.
     """
 
     steps: int

@@ -1,7 +1,7 @@
-"""Term configs, and the folds that apply them. A term is a function with keyword parameters, checked when the term is made.
+"""Term configs, and the functions that apply them. A term is a function with keyword parameters, checked when the term is made.
 
-The function is pure, or it is a class whose objects remember: ``Class(**params)`` has ``init(key, view) -> memory`` and
-``step(memory, view) -> (memory, value)``. One dict, keyed by dotted name, holds what all terms remember of an episode.
+The function is pure, or it is a class whose objects have a memory: ``Class(**params)`` has ``init(key, view) -> memory`` and
+``step(memory, view) -> (memory, value)``. One dict, keyed by dotted name, holds the memory of all terms in an episode.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History, delay
 from mjx_nero.types import LEVEL, Key, UserError, View
 
-ROBOT = "robot"  # a parameter that any term may have besides its function's: the robot whose arm and hand it sees
+ROBOT = "robot"  # any term may take this parameter besides its function's own: the robot whose arm and hand it sees
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Term:
 
     @functools.cached_property
     def made(self) -> Any:
-        """The object of a term that remembers."""
+        """The instance of a term that has a memory."""
         return self.func(**self._own)
 
     @property
@@ -114,7 +114,7 @@ class ObservationTerm(Term):
 
 @dataclasses.dataclass(frozen=True)
 class ObservationGroup:
-    """Named terms that one reader gets together: the policy, the critic or another.
+    """Named terms for one reader, such as the policy or the critic.
 
     Attributes:
         terms: the terms by name, in the order of the vector.
@@ -155,8 +155,8 @@ class MetricTerm(Term):
         over: how episodes combine: their ``mean``, or the ``rate`` of episodes whose number is above 0.
         where: another metric; the mean covers only episodes where that metric is above 0. Empty: all episodes.
         figure: name of the result, before the suffix ``_mean`` or ``_rate``. Empty: the metric's own name.
-        milestone: the hard part of the task is done once it is true, as a grasp is. Its memory is true from then on, and expert
-            starts lie around that moment (``runs.starts``).
+        milestone: the metric marks that the hard part of the task is done, such as the grasp. Its memory stays true from then on,
+            and expert starts lie around that moment (``runs.starts``).
     """
 
     at_end: bool = dataclasses.field(default=True, kw_only=True)
@@ -214,7 +214,7 @@ class Recall:
 
 
 def init(groups: Mapping[str, Mapping[str, Term]], key: Key, view: View) -> dict[str, Any]:
-    """Collects what the terms remember at the start of an episode, given its first ``view``.
+    """Builds the memory of all terms at the start of an episode, from its first ``view``.
 
     Args:
         groups: the terms of each group, by the group's dotted name in the task.

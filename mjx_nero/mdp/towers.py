@@ -2,7 +2,7 @@
 
 An object *stands* while it is at its place, held or not, and all objects below it stand. Rewards sum over the objects to move,
 each from the moment the ones below it stand. A standing object keeps the rewards of a held one, so letting go there costs
-nothing. An object that flies earns nothing.
+nothing. An object that flies through the air unheld earns nothing.
 """
 
 import dataclasses
@@ -55,7 +55,13 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """One object to move: its way to its place [m], and whether the objects below stand, it is over its place, and it stands."""
+    """One object to move, and its way to its place [m].
+
+    Attributes:
+        due: all objects below it stand.
+        over: it is over its place, at any height.
+        stands: it stands, and all objects below it do.
+    """
 
     object: str
     below: str
@@ -82,7 +88,7 @@ def turn_to_goal(view: View, *, object: str) -> Float[Array, "3"]:
 def turn_to_object(view: View, *, object: str, down: tuple[float, float, float, float]) -> Float[Array, "3"]:
     """Rotation vector that aligns the hand with the object, in the hand's frame [rad].
 
-    The hand points straight down at the orientation ``down``; aligned, it is turned with the object about the vertical.
+    ``down`` is the orientation of a hand that points straight down. An aligned hand points down and has the object's yaw.
     """
     wanted = math.quat_mul(view.objects[object].quat_w, jnp.array(down))
     return math.quat_log(math.quat_mul(math.quat_conj(view.ee_quat_w), wanted))
@@ -125,18 +131,18 @@ def built(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
 
 
 def left_alone(view: View, *, place: Place, max_speed: Positive) -> Bool[Array, ""]:
-    """``built``, and the robot touches none of the objects, by the scene's sensors of the hand.
+    """True if the tower is ``built`` and the hand sensors read no contact with the objects.
 
     Raises:
-        UserError: the scene has none.
+        UserError: the scene has no hand sensors.
     """
     if "hand" not in view.readings:
-        raise UserError("towers.left_alone needs 'hand' among scene.sensors, and this task is without")
+        raise UserError("towers.left_alone needs 'hand' among scene.sensors, but this task has none")
     return built(view, place=place, max_speed=max_speed) & (view.readings["hand"] == 0)
 
 
 def total(values: Iterable[Array]) -> Scalar:
-    """Adds up, from zero."""
+    """Sums the values; zero if there are none."""
     return sum(values, start=jnp.zeros(()))
 
 
@@ -147,8 +153,8 @@ def reached(view: View, *, place: Place, std: Positive) -> Scalar:
 
 
 def is_carried(view: View, level: Level, place: Place) -> Bool[Array, ""]:
-    """True if it is an object's turn to move and it is held, also below its height over its place, or stands."""
-    # Over its place an object may be at any height: otherwise its last centimetre down would forfeit the reward.
+    """True if an object is due, and stands or is held. Over its place it may be held at any height."""
+    # Otherwise the last centimetre down would cost the object its reward.
     lowered = level.over & place.holds(view, level.object, minimal_height=-jnp.inf)
     return level.due & (place.holds(view, level.object) | lowered | level.stands)
 
@@ -192,8 +198,8 @@ def standing(view: View, *, place: Place) -> Scalar:
 def _away(view: View, level: Level, place: Place) -> Scalar:
     """Distance of the grasp point from the object, from 0 to 1. On another object, only distance above or beside counts.
 
-    A hand below has not left: it slides down the tower with fingers hardly open to hold what is there, and takes the object along
-    on its way up.
+    A hand below has not left. It would slide down the tower with its fingers barely open, and take the object along on its way
+    up.
     """
     off = view.ee_pos_w - view.objects[level.object].pos_w
     off = off.at[2].max(0.0) if level.below in view.objects else off
@@ -203,7 +209,7 @@ def _away(view: View, level: Level, place: Place) -> Scalar:
 def _let_go(view: View, level: Level, place: Place, at: Array, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
     """Opening of the finger positions or targets ``at``, from 0 at ``hold`` to 1 at ``open``.
 
-    Below the top of a tower the hand has more work to do, so its distance counts instead, if that is more.
+    Below the top of a tower the hand still has work to do, so its distance counts instead if that is larger.
     """
     opens, holds = jnp.array(open), jnp.array(hold)
     share = jnp.clip(jnp.mean((at[-len(open) :] - holds) / (opens - holds)), 0.0, 1.0)
@@ -211,12 +217,12 @@ def _let_go(view: View, level: Level, place: Place, at: Array, open: tuple[float
 
 
 def told_to_open(view: View, *, place: Place, open: tuple[float, ...], hold: tuple[float, ...]) -> Scalar:
-    """Opening of the fingers' targets while the object stands, from 0 to 1, so that a step to let go pays at once.
+    """Commanded opening of the fingers while the object stands, from 0 to 1, so the first step of letting go pays at once.
 
-    Below the top of a tower, the hand's distance counts (see ``left``), if that is more: the fingers have work elsewhere.
+    Below the top of a tower the hand's distance counts instead (see ``left``) if that is larger: the fingers have work elsewhere.
 
     Args:
-        open, hold: targets of the gripper's drives (the last ones) for wide open, and where the reward begins [rad or m].
+        open, hold: targets of the gripper's drives (the last ones) where the reward is 1, and where it begins [rad or m].
     """
     return total(level.stands * _let_go(view, level, place, view.ctrl, open, hold) for level in levels(view, place))
 
@@ -235,7 +241,7 @@ def left_with_open_fingers(view: View, *, place: Place, open: tuple[float, ...],
     Below the top of a tower, as in ``told_to_open``.
 
     Args:
-        open, hold: positions of the gripper's joints (the last ones) for wide open, and where the reward begins [rad or m].
+        open, hold: positions of the gripper's joints (the last ones) when wide open, and where the reward begins [rad or m].
     """
 
     def gone(level: Level) -> Scalar:
@@ -252,7 +258,7 @@ def completed(view: View, *, place: Place, max_speed: Positive) -> Scalar:
 def rested(view: View, *, place: Place, max_speed: Positive, std: Positive) -> Scalar:
     """``rewards.stillness`` while the tower is built (see ``built``), else 0.
 
-    Without it nothing tells a hand that has done its work to stay: it swings away, and sooner or later meets something.
+    Without it a hand that has finished has no reason to stay: it swings away, and sooner or later hits something.
 
     Args:
         std: speed at which most of the reward is lost [rad/s].

@@ -1,1 +1,1 @@
-"""Robots, scenes, kinematics, physics and pictures: what MuJoCo knows."""
+"""Robots, scenes, kinematics, physics and pictures: everything that builds on MuJoCo."""

@@ -19,7 +19,7 @@ _MOST = {
     "hfield": dict.fromkeys(("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"), 50),
 }
 _CONVEX = 4
-_PARTS = 3  # of a mesh, that one geom touches at once
+_PARTS = 3  # most parts of a mesh that one geom touches at once
 _EQUALITY_ROWS = {"CONNECT": 3, "WELD": 6, "JOINT": 1, "TENDON": 1}
 
 
@@ -36,7 +36,7 @@ class Pair:
 
 
 def contact_pairs(model: mujoco.MjModel) -> tuple[Pair, ...]:
-    """Lists the pairs of geoms that MuJoCo lets meet.
+    """Lists the pairs of geoms that MuJoCo lets collide.
 
     These are the explicit pairs, and those whose contact bits match, except within a body, between a body and its parent, and
     between excluded bodies.
@@ -72,7 +72,7 @@ def constraint_rows(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def sized(robot: RobotCfg, objects: SceneCfg, sim: SimCfg) -> SimCfg:
-    """Sizes MJX-Warp's buffers for every contact that the scene can make. Imported robots get these: nobody counted theirs."""
+    """Sizes MJX-Warp's buffers for all possible contacts of the scene. Imported robots use it: their contacts are not counted."""
     model = scene.build(robot, objects, sim, visuals=False)
     contacts = sum(pair.contacts for pair in contact_pairs(model))
     rows = sum(constraint_rows(model).values())

@@ -14,7 +14,7 @@ from mjx_nero.sim.robot import RobotCfg
 if TYPE_CHECKING:
     from mjx_nero.sim.scene import SceneCfg
 
-_HANGS = 0.5  # cosine of a base's tilt: one that is tilted further hangs from a plate
+_HANGS = 0.5  # cosine of a base's tilt, beyond which the robot hangs from a plate
 
 
 def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
@@ -41,7 +41,7 @@ def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
     if robot.floor < 0:
         world.add_geom(name="floor", type=box, size=[3, 3, 0.02], pos=[x, y, robot.floor - 0.0205], rgba=grey, **hidden)
     up = quats.matrix(robot.base_quat)[:, 2]
-    if up[2] < _HANGS:  # what it hangs from, behind its base
+    if up[2] < _HANGS:  # the plate is behind its base
         behind = np.array(robot.base_pos) - 0.0105 * up
         where = {"size": [0.15, 0.15, 0.01], "pos": behind, "quat": robot.base_quat}
         world.add_geom(name="plate", type=box, **where, rgba=grey, **hidden)
@@ -68,7 +68,7 @@ def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
 
 
 def add_props(spec: mujoco.MjSpec, scene: "SceneCfg", robot: RobotCfg) -> None:
-    """Adds distractors and backdrop, on a body that can be moved (though nobody does): MuJoCo Warp takes others to stay."""
+    """Adds distractors and backdrop, on a movable body: MuJoCo Warp assumes that others never move."""
     if not (scene.distractors or scene.backdrop):
         return
     body = spec.worldbody.add_body(name="props", mocap=True)

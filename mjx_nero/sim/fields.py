@@ -49,7 +49,7 @@ class Draws:
                     if nominal[field].size:
                         self.rows.setdefault(field, set()).update(map(int, drawn))
 
-        jax.eval_shape(note, jax.random.PRNGKey(0))  # rows alone count: what draws the values is not compiled
+        jax.eval_shape(note, jax.random.PRNGKey(0))  # only the rows matter, so nothing has to be compiled
 
     def _model(self, drawn: Fields) -> Model:
         return Model({**{name: jnp.asarray(value) for name, value in self.nominal.items()}, **drawn}, self._index)
@@ -101,7 +101,7 @@ class Randomization:
         """Draws the fields of one world; empty without terms. ``level``: see ``types.LEVEL``.
 
         Args:
-            given: fields that differ already, as those of an object's shape do (``objects.bank``).
+            given: fields that differ for another reason, such as an object's shape (``objects.bank``).
         """
         given = given or {}
         drawn = self._draws(jax.random.split(key, self._count) if self._count else (), given)
@@ -118,7 +118,7 @@ class Randomization:
 
 
 def nominal(model: mujoco.MjModel, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Fields of the model by name, in float32, or in int32 where they are whole numbers."""
+    """Fields of the model by name, as int32 if they hold integers, otherwise as float32."""
     found = {name: np.array(getattr(model, name)) for name in names}
     return {name: x.astype(np.int32 if np.issubdtype(x.dtype, np.integer) else np.float32) for name, x in found.items()}
 
@@ -130,17 +130,17 @@ def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:
         UserError: a decision cannot be undone.
     """
     frictions, bodies, geoms = (sorted(rows.get(name, ())) for name in ("dof_frictionloss", "body_ipos", "geom_size"))
-    model.dof_frictionloss[frictions] = np.maximum(model.dof_frictionloss[frictions], 1e-9)  # without any there is no constraint
+    model.dof_frictionloss[frictions] = np.maximum(model.dof_frictionloss[frictions], 1e-9)  # zero would make no constraint
     if "body_gravcomp" in rows and not model.ngravcomp:
         raise UserError("randomization draws body_gravcomp: this robot has no gravity compensation (robot.gravity_compensation)")
-    for body in bodies:  # frames that are the same are not computed apart
+    for body in bodies:  # MuJoCo does not compute coinciding frames separately
         geoms_too = model.geom_sameframe[model.geom_bodyid == body] == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA
         if model.body_sameframe[body] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY or geoms_too.any():
             name = model.body(body).name
             raise UserError(
-                f"randomization draws body_ipos of {name!r}: its centre of mass is its origin or its shape's, and stays"
+                f"randomization draws body_ipos of {name!r}: its centre of mass is its origin or its shape's, and cannot move"
             )
-    for geom in geoms:  # bounding boxes sort out what cannot touch: large enough for twice the size
+    for geom in geoms:  # bounding boxes rule contacts out: make them large enough for twice the size
         model.geom_aabb[geom, 3:] *= 2
         body = model.geom_bodyid[geom]
         nodes = slice(model.body_bvhadr[body], model.body_bvhadr[body] + model.body_bvhnum[body])
@@ -188,7 +188,8 @@ class _Tree:
         self._alone = bool(free and not model.body_ipos[self._bodies[0]].any() and not model.dof_armature[self._dofs].any())
 
     def __call__(self, fields: Mapping[str, Array], moved: bool = False) -> Drawn:
-        """
+        """Computes the constants.
+
         Args:
             moved: the centres of mass have moved.
         """
@@ -200,11 +201,11 @@ class _Tree:
         armature = fields["dof_armature"][self._dofs]
         matrix = jnp.einsum("b,bki,bkj->ij", mass, linear, linear) + jnp.diag(armature)
         matrix += jnp.einsum("bk,bki,bkj->ij", inertia, self._turning, self._turning)
-        if self._alone:  # a free body: nothing to invert, which on a GPU would take longer than all the rest
+        if self._alone:  # a free body needs no inverse, which on a GPU would take longer than all the rest
             body = jnp.stack([1 / mass, jnp.mean(1 / inertia, axis=1)], axis=1)
             weight = jnp.repeat(body[0], 3)
         else:
-            scale = jax.lax.rsqrt(jnp.diag(matrix))  # of very different sizes: metres and radians, cubes and arms
+            scale = jax.lax.rsqrt(jnp.diag(matrix))  # entries differ widely in size: metres and radians, cubes and arms
             inverse = jnp.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
             weight = jnp.asarray(self._mean) @ jnp.diag(inverse)
             body = jnp.stack([jnp.einsum("bki,ij,bkj->b", part, inverse, part) / 3 for part in (linear, self._turning)], axis=1)

@@ -1,4 +1,4 @@
-"""A robot's fingerprint: it tells robots apart that share a name."""
+"""A robot's fingerprint, which tells apart robots with the same name."""
 
 import hashlib
 
@@ -11,7 +11,7 @@ from mjx_nero.sim.robot import RobotCfg
 def fingerprint(robot: RobotCfg) -> str:
     """A hash of the compiled model's tree, joints and masses, of the drives and of home.
 
-    Numbers count to four digits, so that another compiler or processor does not make another robot.
+    Numbers are rounded to four digits, so that the hash is the same with another compiler or processor.
     """
     model = scene.robot_model(robot)
     bodies = ("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "site_pos")

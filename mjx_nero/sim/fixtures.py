@@ -1,4 +1,4 @@
-"""Fixtures: things that stand in a scene, such as cabinets. Their models come from files, and their joints, if any, move.
+"""Fixtures: things that stand in a scene, such as cabinets. Their models come from files, and may have joints that move.
 
 A fixture's joints are part of ``qpos``. Where it stands differs from episode to episode, so it is a model field of each world.
 """
@@ -32,7 +32,7 @@ class FixtureCfg:
     """A thing that stands in the scene, with joints of its own or at least a site.
 
     Attributes:
-        file: one of ours by name (``assets/fixtures``), or a folder that holds ``model.xml``, MJCF as in a robot's folder.
+        file: a fixture of the package by name (``assets/fixtures``), or a folder with ``model.xml``, MJCF as in a robot's folder.
         pos: place of its origin in the world, before the reset events [m].
         quat: orientation there, wxyz.
     """
@@ -48,7 +48,7 @@ def own() -> tuple[str, ...]:
 
 
 def read(file: str) -> mujoco.MjSpec:
-    """Reads a fixture's model, with the limits that strangers' robots have.
+    """Reads a fixture's model, with the limits for untrusted robots.
 
     Raises:
         UserError: there is no such file, it is damaged, or it holds something that a fixture cannot have.
@@ -71,7 +71,7 @@ def read(file: str) -> mujoco.MjSpec:
 
 @functools.lru_cache(maxsize=16)
 def chain(file: str) -> Chain:
-    """Returns where a fixture's sites are, in its own frame, as a function of its joints; followers of couplings follow.
+    """Returns the poses of a fixture's sites in its own frame as a function of its joints; coupled joints follow.
 
     Raises:
         UserError: as ``read``, or the model does not compile.
@@ -79,7 +79,7 @@ def chain(file: str) -> Chain:
     try:
         model = read(file).compile()
     except ValueError as error:
-        raise UserError(f"the fixture {short(file)} is no model: {error}") from None
+        raise UserError(f"the fixture {short(file)} is not a valid model: {error}") from None
     followers = {coupling.follower for coupling in linkage.couplings(model)}
     free = [model.joint(j).name for j in range(model.njnt) if int(model.jnt_qposadr[j]) not in followers]
     return Chain(model, free, [model.site(i).name for i in range(model.nsite)])
@@ -100,15 +100,15 @@ def at_rest(file: str, site: str) -> tuple[np.ndarray, np.ndarray]:
 def add(spec: mujoco.MjSpec, fixtures: Mapping[str, FixtureCfg], visuals: bool = True) -> None:
     """Adds fixtures to a scene. Everything of fixture ``name`` is called ``name/...`` there.
 
-    What collides in a fixture's file collides with hands and with objects, and never within the fixture. Without ``visuals`` the
-    rest is left out.
+    Geoms that collide in the fixture's file collide with hands and with objects, but never within the fixture. Without
+    ``visuals`` all other geoms are left out.
 
     Raises:
         UserError: as ``read``, or a name is taken.
     """
     if not fixtures:
         return
-    # Under a body that could be moved (though nobody does): MuJoCo Warp takes what is fixed to the world to be where it was.
+    # On a movable body: MuJoCo Warp assumes that bodies fixed to the world never move.
     holder = spec.worldbody.add_body(name=_HOLDER, mocap=True)
     for name, cfg in fixtures.items():
         if spec.body(name) or "/" in name:

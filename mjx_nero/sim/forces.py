@@ -1,7 +1,8 @@
 """Force and torque at the wrist, and the forces at the fingers' pads, measured in the last physics step of a control step.
 
-The wrist's are MuJoCo's force and torque sensors: what the arm exerts on the hand, in the axes of the flange, with the hand's own
-weight and inertia. A pad's is the net force of its contacts. A real sensor's errors are in ``mdp.sensors.Gauge``.
+The wrist's readings are MuJoCo's force and torque sensors: what the arm exerts on the hand, in the axes of the flange, including
+the hand's own weight and inertia. A pad's reading is the net force of its contacts. ``mdp.sensors.Gauge`` has the errors of real
+sensors.
 """
 
 from collections.abc import Collection
@@ -32,7 +33,7 @@ def add(spec: mujoco.MjSpec, robot: RobotCfg, names: Collection[str]) -> None:
     base = spec.body(robot.base_link)
     pads = [geom for geom in base.find_all(mujoco.mjtObj.mjOBJ_GEOM) if "pad" in geom.name and geom.conaffinity]
     if not pads:
-        raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, and {robot.name} has none")
+        raise UserError(f"the sensor 'fingers' measures at shapes with 'pad' in their names, but {robot.name} has none")
     for geom in pads:
         touch.add_sensor(spec, geom.name, reading=FINGERS, reduce=touch.NET)
 

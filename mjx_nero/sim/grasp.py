@@ -1,4 +1,4 @@
-"""The cube that a gripper can lift, and how high above the table it grasps it."""
+"""The cube that a gripper can lift, and the height above the table at which it grasps the cube."""
 
 import dataclasses
 import itertools
@@ -14,12 +14,12 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
 from mjx_nero.types import UserError
 
-SHARE, MOST = 0.4, 0.6  # of the opening: an edge, and the longest that leaves room to miss the middle
+SHARE, MOST = 0.4, 0.6  # of the opening: a cube's edge, and the longest edge that leaves room to miss the middle
 LARGEST = 0.06  # [m]
-STROKE = 5e-3  # [m] pads that part by less do not open
+STROKE = 5e-3  # [m] least stroke of pads that open
 GRIPPED = 0.01  # [m] a cube is this much larger than the closed gripper's gap
 CLEAR = 0.005  # [m] the pads stay this far above the table
-BESIDE = 0.004  # [m] and this far beside what they are going to close on
+BESIDE = 0.004  # [m] and come down this far beside an object
 CLOSING, QUICK = 0.4, 0.3  # [s] least closing times of a script's fingers
 DENSITY = 1000.0  # [kg/m3] 30 g at an edge of 31 mm
 Pad = tuple[float, float, float]
@@ -29,8 +29,6 @@ def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
     """Edge of a cube that the gripper can lift [m]: ``SHARE`` of its opening, or more if long pads would touch the table first.
 
     It is larger than the gap of the closed gripper, by ``GRIPPED`` or a quarter of the stroke; 0 if no cube fits.
-
-    It is larger than the gap of the closed gripper, by ``GRIPPED`` or a quarter of the stroke; 0 where no cube fits between.
 
     Args:
         opening, closed: distance between the pads when open and when closed [m].
@@ -44,8 +42,10 @@ def edge(opening: float, pad: Pad, closed: float = 0.0) -> float:
 
 
 def height(opening: float, pad: Pad, closed: float = 0.0) -> float:
-    """Height of the pads' middle above the table when they grasp that cube [m]: the cube's middle, or higher to keep
-    ``CLEAR``."""
+    """Height of the pads' middle above the table when they grasp that cube [m].
+
+    It is the height of the cube's middle, or more to keep ``CLEAR``.
+    """
     return max(edge(opening, pad, closed) / 2, lowest(pad))
 
 
@@ -74,7 +74,7 @@ def opening(robot: RobotCfg) -> np.ndarray:
 
 
 def _in_hand(robot: RobotCfg, way: tuple[float, float, float]) -> np.ndarray:
-    """A direction in the world, as the hand sees it that points down: ``math.rotate`` without JAX, which takes long to start."""
+    """A direction in the world, in the frame of a hand that points down: ``math.rotate`` without JAX, which is slow to start."""
     w, x, y, z = np.array(robot.down, np.float32) * np.array([1, -1, -1, -1], np.float32)
     vx, vy, vz = np.array(way, np.float32)
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
@@ -82,12 +82,12 @@ def _in_hand(robot: RobotCfg, way: tuple[float, float, float]) -> np.ndarray:
 
 
 def aside(robot: RobotCfg, gap: float) -> float:
-    """Returns how far the pads' middle is, along the opening, from where it is when they go around the robot's cube [m].
+    """Returns the offset of the pads' middle along the opening, from its place around the robot's cube [m].
 
-    0 if both sides move alike. If one side stands still, its pad comes down as near to a small object as to the cube.
+    It is 0 if both sides move alike. If one side stands still, its pad comes down as near to a small object as to the cube.
 
     Args:
-        gap: between the pads [m].
+        gap: distance between the pads [m].
     """
     hand, cube = _Hand(robot), cube_for(robot).size[0] + 2 * BESIDE
     return round(hand.middle(hand.share(gap)) - hand.middle(hand.share(cube)), 3) + 0.0
@@ -123,7 +123,7 @@ def formulas(robot: RobotCfg) -> tuple[Callable, Callable] | None:
 def opened(robot: RobotCfg, gap: float) -> RobotCfg:
     """Returns the robot with a hand that opens no further than ``gap`` between its pads [m], and starts there.
 
-    The robot is unchanged if it opens less, or has no two pads.
+    The robot is unchanged if it opens less, or does not have two pads.
     """
     fingers = robot.gripper
     if fingers.gap is not None and fingers.positions is not None:
@@ -139,7 +139,7 @@ def opened(robot: RobotCfg, gap: float) -> RobotCfg:
 
 
 def shut(robot: RobotCfg, gap: float) -> RobotCfg:
-    """Returns the robot with a hand that holds objects ``gap`` wide [m], if needed by closing as far as its joints go.
+    """Returns the robot with a hand that holds objects ``gap`` wide [m]. If needed, it closes as far as its joints go.
 
     Raises:
         UserError: the pads are still too far apart.
@@ -150,7 +150,7 @@ def shut(robot: RobotCfg, gap: float) -> RobotCfg:
     share = hand.ends()[0]
     if (least := hand.apart(share)) > gap:
         raise UserError(
-            f"the hand of {robot.name} closes to {least:.3g} m between its pads, and is to hold what is {gap:.3g} m wide"
+            f"the hand of {robot.name} closes to {least:.3g} m between its pads: too wide to hold an object {gap:.3g} m wide"
         )
     return dataclasses.replace(
         robot, gripper=dataclasses.replace(fingers, close=tuple(round(float(q), 5) for q in hand.positions(share)))
@@ -176,7 +176,7 @@ def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
 
 
 def hand(robot: RobotCfg) -> Hand:
-    """The hand of a robot, as grasps of meshes are looked for.
+    """The hand of a robot, for finding grasps of meshes.
 
     Raises:
         UserError: the robot has no gripper, or its opening is unknown.
@@ -266,7 +266,7 @@ def cube_for(robot: RobotCfg) -> ObjectCfg:
     """
     where = "its robot.yaml" if robot.folder else "its config"
     if not robot.gripper.joints:
-        raise UserError(f"{robot.name} has no gripper: this task needs one; reach does without")
+        raise UserError(f"{robot.name} has no gripper: this task needs one, but reach does not")
     if robot.opening <= 0:
         raise UserError(f"how far the gripper of {robot.name} opens is unknown: give opening, between its pads [m], in {where}")
     size = edge(robot.opening, robot.pad, robot.closed)

@@ -24,14 +24,14 @@ _ITSELF = (0.0, 1.0)
 
 
 class _Node(NamedTuple):
-    """A joint that moves, its frame at the anchor."""
+    """A moving joint, with its frame at the anchor."""
 
     driver: int  # place in q of the joint that moves it: itself, or the one that it follows
     parent: int  # node that carries it; -1: the world
     fixed: tuple[np.ndarray, np.ndarray]  # transform from there
     axis: np.ndarray
     slide: bool
-    powers: tuple[float, ...]  # how far it is from its qpos0: a polynomial in how far that joint is from its own
+    powers: tuple[float, ...]  # its offset from qpos0, as a polynomial in the driver's offset
 
 
 class Chain:
@@ -140,7 +140,7 @@ class Chain:
                 pos = pos + math.rotate(quat, along * off)
             else:
                 quat = math.quat_mul(quat, math.axis_angle(along, off))
-            # Without a barrier XLA computes a link's pose anew for every number that depends on it: ten times the work.
+            # Without a barrier XLA recomputes a link's pose for every number that depends on it: ten times the work.
             nodes.append(jax.lax.optimization_barrier((pos, quat)))
         return nodes
 
@@ -177,14 +177,14 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
     def pose(qpos: Float[Array, " nq"]) -> Pose:
         q = jnp.append(qpos[at] - still, 0.0)
         angle = q * half
-        # One column a link.
+        # One column per link.
         pos = jnp.asarray(position) + slide * q
         quat = jnp.asarray(quaternion) * jnp.cos(angle) + turned * jnp.sin(angle)
         while (count := pos.shape[1]) > 1:
             pairs = count // 2 * 2
             inner, outer = slice(0, pairs, 2), slice(1, pairs, 2)
             joined = pos[:, inner] + math.rotate(quat[:, inner], pos[:, outer]), math.quat_mul(quat[:, inner], quat[:, outer])
-            # The barrier keeps XLA from computing a round anew for every number of the next: three rounds of that can take longer
+            # The barrier keeps XLA from recomputing a round for every number of the next: three rounds of that can take longer
             # than the physics.
             pos, quat = jax.lax.optimization_barrier(
                 tuple(jnp.concatenate([new, old[:, pairs:]], axis=1) for new, old in zip(joined, (pos, quat), strict=True))

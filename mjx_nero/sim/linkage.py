@@ -1,4 +1,4 @@
-"""Joints that equality constraints of the model couple."""
+"""Joints that are coupled by equality constraints of the model."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 @dataclasses.dataclass(frozen=True)
 class Coupling:
-    """One joint's position as a polynomial of another's. MuJoCo counts both from their ``qpos0``.
+    """One joint's position as a polynomial of another's. MuJoCo measures both from their ``qpos0``.
 
     Attributes:
         follower, leader: addresses in qpos. A follower without a leader is its own leader, with a constant polynomial.
@@ -24,7 +24,7 @@ class Coupling:
     reference: float = 0.0
 
     def position(self, qpos: Float[Array, " nq"] | Float[np.ndarray, " nq"]) -> Float[Array, ""] | float:
-        """Position that the coupling asks of the follower [rad or m]."""
+        """Position of the follower that satisfies the coupling [rad or m]."""
         offset, *powers = self.coefficients
         leader = qpos[self.leader] - self.reference
         return offset + sum((c * leader ** (k + 1) for k, c in enumerate(powers)), 0.0)
@@ -38,13 +38,13 @@ def couplings(model: mujoco.MjModel) -> list[Coupling]:
     while found:
         placed = {c.follower for c in ordered}
         ready = [c for c in found if c.leader not in followers - placed or c.leader == c.follower]
-        ordered += ready or found  # of a ring, as they come
+        ordered += ready or found  # a ring has no order
         found = [c for c in found if c not in ordered]
     return ordered
 
 
 def close(coupled: Iterable[Coupling], qpos: Float[np.ndarray, " nq"]) -> None:
-    """Moves followers to where their leaders want them, in place. ``coupled``: leaders before their followers."""
+    """Moves followers to match their leaders, in place. ``coupled``: leaders before their followers."""
     for coupling in coupled:
         qpos[coupling.follower] = coupling.position(qpos)
 

@@ -1,4 +1,4 @@
-"""Reader of an imported robot's ``model.xml``. A stranger may have made it, so an allow-list and limits come before MuJoCo.
+"""Reader of an imported robot's ``model.xml``. The file may be untrusted, so an allow-list and limits come before MuJoCo.
 
 The list allows what ``import-urdf`` writes and what people add by hand: bodies, joints, primitives and meshes with their defaults
 and materials, couplings of joints. Drives, sensors and options belong to the scene.
@@ -37,7 +37,7 @@ _ALLOWED = {
         "inertial": _POSE + "mass diaginertia fullinertia",
         "joint": _SOLVER + "name class group type axis pos range limited ref stiffness springref damping frictionloss armature "
         "solreflimit solimplimit solreffriction solimpfriction actuatorfrcrange actuatorfrclimited "
-        "joint1 joint2 polycoef active",  # these of a coupling
+        "joint1 joint2 polycoef active",  # these belong to a coupling
         "geom": _POSE + _SOLVER + "name class type size fromto mesh fitscale material rgba group mass density shellinertia "
         "contype conaffinity condim priority friction solmix gap",
         "site": _POSE + "name class type size fromto group material rgba",
@@ -60,7 +60,7 @@ def read(path: pathlib.Path) -> mujoco.MjSpec:
     """
     root = files.parse_xml(files.read_bytes(path, MAX_XML), str(path))
     if root.tag != "mujoco":
-        raise UserError(f"{path} is no model: its outermost element is <{root.tag}>, not <mujoco>")
+        raise UserError(f"{path} is not a model: its outermost element is <{root.tag}>, not <mujoco>")
     etree.strip_tags(root, etree.Comment, etree.ProcessingInstruction)
     for element in root.iter():
         _check(element, f"{path}, line {element.sourceline}")
@@ -68,13 +68,13 @@ def read(path: pathlib.Path) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_string(text, assets=_meshes(root, path))
     except ValueError as error:
-        raise UserError(f"{path} is no model: {error}") from None
+        raise UserError(f"{path} is not a valid model: {error}") from None
 
 
 def _check(element: etree._Element, where: str) -> None:
     tag = str(element.tag)
     if tag not in _ALLOWED:
-        raise UserError(f"{where}: <{tag[:40]}> has no place in a robot's model: remove it (robot.yaml has the drives)")
+        raise UserError(f"{where}: <{tag[:40]}> is not allowed in a robot's model: remove it (robot.yaml has the drives)")
     for name, value in element.attrib.items():
         if name not in _ALLOWED[tag]:
             raise UserError(f"{where}: <{tag}> takes no {str(name)[:40]!r}{hint(str(name), _ALLOWED[tag])}: remove it")
@@ -85,9 +85,9 @@ def _check(element: etree._Element, where: str) -> None:
             raise UserError(f"{where}: {name}={short(value)} is not numbers up to {MAX_NUMBER:g}: correct it")
     kind, name = element.get("type"), element.get("name")
     if kind is not None and kind not in _TYPES.get(tag, (kind,)):
-        raise UserError(f"{where}: <{tag} type={short(kind)}> is not taken: choose from {', '.join(_TYPES[tag])}")
+        raise UserError(f"{where}: <{tag} type={short(kind)}> is not supported: choose from {', '.join(_TYPES[tag])}")
     if name in _SCENES.get(tag, ()):
-        raise UserError(f"{where}: {tag} {name!r} is what scenes call their own: rename it")
+        raise UserError(f"{where}: {tag} {name!r} has a name that scenes use: rename it")
 
 
 def _is_number(text: str) -> bool:
@@ -102,7 +102,7 @@ def _meshes(root: etree._Element, path: pathlib.Path) -> dict[str, bytes]:
     folders = [e.get("meshdir") for e in root.iter("compiler") if e.get("meshdir")]
     names = {e.get("file") for e in root.iter("mesh")} - {None}
     if len(names) > MAX_MESHES:
-        raise UserError(f"{path} names {len(names)} meshes: more than {MAX_MESHES} are not read")
+        raise UserError(f"{path} names {len(names)} meshes: at most {MAX_MESHES} are read")
     out: dict[str, bytes] = {}
     home, left = path.parent.resolve(), MAX_MESH_BYTES
     for name in sorted(map(str, names)):

@@ -15,8 +15,8 @@ from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.types import Carry, Key, ObstacleView, Sim, UserError, View
 
 FIELDS = ("geom_pos", "geom_quat", "geom_size", "geom_rbound")
-_APART = 0x0B57AC  # folded into the episode's key: the draws of other parts stay as they are
-_ANYWHERE = 10.0  # [m] half the edge of the bounding box of an obstacle, which may stand anywhere
+_APART = 0x0B57AC  # folded into the episode's key, so that the draws of other parts stay the same
+_ANYWHERE = 10.0  # [m] half the edge of an obstacle's bounding box: an obstacle may stand anywhere
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,11 +58,11 @@ def add(spec: mujoco.MjSpec, bases: Iterable[str], obstacles: Mapping[str, Obsta
                 "meshes meet boxes on every backend"
             )
         geom.conaffinity |= touch.OBSTACLE
-    # Under a body that can be moved (though nobody does): MuJoCo Warp takes what is fixed to the world to be where it was.
+    # On a movable body: MuJoCo Warp assumes that bodies fixed to the world never move.
     body = spec.worldbody.add_body(name="obstacles", mocap=True)
     for name, item in obstacles.items():
         if spec.geom(name):
-            raise UserError(f"scene.obstacles.{name} needs another name: the robot or the scene has one that is called so")
+            raise UserError(f"scene.obstacles.{name} needs another name: the robot or the scene already uses it")
         body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -78,7 +78,7 @@ def add(spec: mujoco.MjSpec, bases: Iterable[str], obstacles: Mapping[str, Obsta
 
 
 def unbounded(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Makes the model ready for obstacles anywhere: MuJoCo derives bounds from their first poses, and these must hold for all."""
+    """Widens the bounds of obstacles, which MuJoCo derives from their first poses, so that they hold anywhere."""
     for geom in np.flatnonzero(model.geom_contype & touch.OBSTACLE):
         body = model.geom_bodyid[geom]
         model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -120,7 +120,7 @@ class Obstacles(Part):
         """
         if unknown := [name for name in boxes if name not in self._rows]:
             there = ", ".join(self._rows) or "none"
-            raise UserError(f"obstacles draws {', '.join(unknown)}, and the scene's obstacles are: {there}")
+            raise UserError(f"obstacles draws {', '.join(unknown)}, but the scene's obstacles are: {there}")
         now = {name: jnp.asarray(fields.get(name, self._nominal[name])) for name in FIELDS}
         for name, box in boxes.items():
             half = box.size / 2

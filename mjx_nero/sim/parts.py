@@ -1,4 +1,4 @@
-"""The kinds of things in a scene beside the robot, as one world of a batch has them: free objects, banks, obstacles, fixtures.
+"""The kinds of things in a scene besides the robots, as one world of a batch has them: objects, banks, obstacles and fixtures.
 
 Each kind is one class in its own file. A new kind is another ``Part``, which ``scene.parts`` lists.
 """
@@ -14,11 +14,11 @@ Fields = dict[str, Array]  # of a model, by MuJoCo's names
 
 
 class Part:
-    """One kind of thing in a scene. All methods are pure; these defaults are those of a kind that adds nothing.
+    """One kind of thing in a scene. All methods are pure; by default they add nothing.
 
     Attributes:
-        fields: fields of the physics model in which worlds differ because of this kind.
-        seen: fields of the drawn model in which their pictures differ because of it.
+        fields: fields of the physics model that differ between worlds because of this kind.
+        seen: fields of the drawn model that differ because of this kind.
     """
 
     fields: tuple[str, ...] = ()
@@ -29,11 +29,11 @@ class Part:
         return {}
 
     def start(self, view: View, carry: Carry) -> dict[str, Any]:
-        """Returns its fields of the ``Start`` that begins where a state is, at rest."""
+        """Returns its fields of the ``Start`` of an episode that begins in this state, at rest."""
         return {}
 
     def given(self, start: Start) -> Fields:
-        """Returns the model's fields that follow from a start. Randomization changes what these say."""
+        """Returns the model's fields that follow from a start. Randomization changes them afterwards."""
         return {}
 
     def qpos(self, qpos: Float[Array, " nq"], start: Start, fields: Fields) -> Float[Array, " nq"]:
@@ -48,7 +48,7 @@ class Part:
         """Returns ``fields`` with what is drawn last, once start and goal are known.
 
         Args:
-            key: the episode's; a kind folds a number of its own into it.
+            key: the episode's key; each kind folds a number of its own into it.
             see: makes the view of the start.
         """
         return fields
@@ -58,7 +58,7 @@ class Part:
         return {}
 
     def scenery(self, sim: Sim, carry: Carry, look: Fields) -> dict[str, Any]:
-        """Returns its fields of ``Scenery``, ``look`` among them if it changes those: fields of the drawn model."""
+        """Returns its fields of ``Scenery``. ``look``, fields of the drawn model, is among them if it changes those."""
         return {}
 
 

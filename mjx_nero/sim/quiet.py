@@ -1,11 +1,10 @@
-"""Imports MJX, without what it never uses here and without the lines that it prints then. To be imported before Brax.
+"""Imports MJX without two packages that it does not need here, and without the lines that it prints. Import it before Brax.
 
-Brax imports MJX, too. MJX imports two packages for things that a program of ours does seldom or never, and each takes longer than
-MJX itself:
+Brax imports MJX, too. The two packages are seldom or never needed, and each takes longer to import than MJX itself:
 
-- Warp, with all of MuJoCo Warp, for its own way to them. Nothing here goes that way: ``physics.mujoco_warp`` calls MuJoCo Warp
-  itself. MJX has its way if Warp is imported before this package.
-- trimesh, for the convex hulls of collision meshes. It is imported with the first mesh.
+- Warp, with all of MuJoCo Warp, is for MJX's own wrapper of it. Nothing here uses that wrapper: ``physics.mujoco_warp`` calls
+  MuJoCo Warp itself. The wrapper works if Warp is imported before this package.
+- trimesh is for the convex hulls of collision meshes. It is imported with the first mesh.
 """
 
 import contextlib
@@ -25,7 +24,7 @@ class _Later(types.ModuleType):
         return trimesh.Trimesh(*args, **kwargs)
 
 
-_stand_ins = {"warp": None, "trimesh": _Later("trimesh")}  # what is None there cannot be imported
+_stand_ins = {"warp": None, "trimesh": _Later("trimesh")}  # a module that is None there cannot be imported
 _hidden = {name: stand_in for name, stand_in in _stand_ins.items() if name not in sys.modules}
 sys.modules |= _hidden  # type: ignore[arg-type]
 try:

@@ -23,19 +23,19 @@ NO_GL = (
     "no offscreen OpenGL here, so no pictures: install libegl1 (machines with a GPU) or libosmesa6 "
     "(Debian and Ubuntu: apt-get install libosmesa6)"
 )
-_ENOUGH_S = 30.0  # for the drawing of a video
-# Width, height, samples a pixel and shadows' edge, the best first: OpenGL in software takes a tenth of a second and more a frame.
+_ENOUGH_S = 30.0  # for drawing a video
+# Width, height, samples per pixel and edge of the shadow map, the best first: OpenGL in software takes 0.1 s or more per frame.
 _QUALITIES = ((1280, 720, 4, 4096), (960, 540, 0, 1024), (640, 360, 0, 1024))
-_APART = 1.5  # between tables that share a picture, at least [m]
+_APART = 1.5  # [m] least distance between tables that share a picture
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoCfg:
-    """Options of a video. The machine's drawing speed decides what is None or 0: 1280 x 720 at 25 frames a second if it can.
+    """Options of a video. Those that are None or 0 depend on the machine's speed: 1280 x 720 at 25 frames per second at best.
 
     Attributes:
         size: width and height [pixels].
-        fps: frames a second.
+        fps: frames per second.
         envs: robots side by side in one picture; 1 shows episodes one after another.
         in_turn: number of episodes one after another, if ``envs`` is 1.
     """
@@ -57,9 +57,9 @@ class Renderer:
     Args:
         width, height: pixels.
         camera: name of a camera of the model, or a free camera.
-        samples: samples a pixel; None: the model's setting.
+        samples: samples per pixel; None: the model's setting.
         shadows: pixels along a side of the shadow map; None: the model's setting.
-        envs: most robots in one picture.
+        envs: greatest number of robots in one picture.
 
     Raises:
         UserError: the machine cannot draw offscreen.
@@ -127,7 +127,7 @@ class Renderer:
             x, y = i // columns - (rows - 1) / 2, i % columns - (columns - 1) / 2
             for geom in scene.geoms[before : scene.ngeom]:
                 geom.pos[:2] += self._apart * np.array([x, y])
-        for light in scene.lights[: scene.nlight]:  # far enough for all robots, too
+        for light in scene.lights[: scene.nlight]:  # farther away, so that they light all robots
             light.pos[:] -= self._apart * (max(columns, rows) - 1) * light.dir
         return self._renderer.render()
 
@@ -183,8 +183,8 @@ def write_episodes(
     Args:
         qpos: [steps, episodes, nq]; scenery: [steps, episodes, ...], as in ``rollout.Episodes``.
         dt: time between steps [s].
-        seen: pictures to show in a corner, uint8 [steps, episodes, height, width, 3], one entry a camera; not if several robots
-            share a picture.
+        seen: pictures to show in a corner, uint8 [steps, episodes, height, width, 3], one entry per camera. They are left out if
+            several robots share a picture.
         update: called with the numbers of frames drawn and of all frames.
 
     Raises:

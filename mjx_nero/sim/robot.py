@@ -58,7 +58,7 @@ def slides_positions(gap: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class GripperCfg(DriveCfg):
-    """Drives with an open and a closed target. A robot without a gripper has one without joints.
+    """Drives with an open and a closed target. Without a gripper, it has no joints.
 
     Attributes:
         open, close: targets of the two actions [rad] or [m].
@@ -84,8 +84,8 @@ class RobotCfg:
         arm, gripper: drives.
         ee_site: site at the grasp point.
         down: orientation of ``ee_site`` when the gripper points straight down and its fingers open along y, wxyz.
-        gravity_compensation: the drives carry the links' weight, as most robots' own controllers do. False where the recipe of a
-            robot has none.
+        gravity_compensation: the drives carry the links' weight, as most robots' own controllers do. False if a robot's recipe
+            does without.
         max_step: longest physics step at which the drives are stable [s]; 0: no limit.
         workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
             draw their commands from it by default.
@@ -96,9 +96,9 @@ class RobotCfg:
         pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the
             unrotated base frame [m]. Its lowest height is where to grasp a cube that fits the gripper (``sim.grasp``).
         lean: largest angle from straight down that the gripper needs in ``pick`` [rad]; 0: it points down everywhere.
-        turns: whether the gripper can be turned about the vertical there so that its fingers open along y.
-        hold: box above, to which the gripper can bring what it holds, in the same frame [m]. Lift tasks draw their objects from
-            ``pick`` and their goals from ``hold`` by default.
+        turns: in ``pick`` the gripper can be turned about the vertical so that its fingers open along y.
+        hold: box above ``pick`` to which the gripper can bring an object, in the same frame [m]. Lift tasks draw their objects
+            from ``pick`` and their goals from ``hold`` by default.
         folder: folder of an imported robot, which holds ``model.xml``; empty for the package's own.
         mjcf: text of the model, in place of a file.
     """

@@ -33,8 +33,8 @@ _PLAIN = tuple(
     "hold".split()
 )
 _HEAD = """\
-# A robot for mjx_nero: edit at will. Units: m, rad, kg, N, s; quaternions wxyz.
-# arm, gripper: one line a joint: stiffness [N m/rad or N/m] and damping of its position drive, limits of effort and speed, home.
+# A robot for mjx_nero: edit it freely. Units: m, rad, kg, N, s; quaternions wxyz.
+# arm, gripper: one line per joint: stiffness [N m/rad or N/m] and damping of its drive, limits of effort and speed, home.
 # workspace: box from which reach tasks draw their commands, in the base frame before base_quat rotates it.
 # down: orientation of ee_site when the gripper points straight down. floor: height of the floor under a robot beside the table.
 # opening, closed: distance between the pads of the open and of the closed gripper. pad: size of a pad along the approach, across
@@ -81,7 +81,7 @@ def read(folder: pathlib.Path) -> RobotCfg:
     try:
         compiled = spec.compile()
     except ValueError as error:
-        raise UserError(f"{robot.xml} is no model: {error}") from None
+        raise UserError(f"{robot.xml} is not a valid model: {error}") from None
     for name in robot.joints:
         lower, upper = compiled.joint(name).range
         if not lower < upper:
@@ -94,7 +94,7 @@ def read(folder: pathlib.Path) -> RobotCfg:
 
 
 def _check(robot: RobotCfg, path: pathlib.Path) -> None:
-    """Checks what concerns several fields."""
+    """Checks what the fields' types do not say."""
     boxes = {name: getattr(robot, name) or () for name in ("workspace", "pick", "hold")}
     for number in (*robot.base_pos, *(end for box in boxes.values() for axis in box for end in axis)):
         if not abs(number) <= MAX_NUMBER:
@@ -111,7 +111,7 @@ def _check(robot: RobotCfg, path: pathlib.Path) -> None:
             raise UserError(f"{path}: joint {joint!r} is in arm and in gripper: take it out of one")
     for name in (robot.name, robot.base_link, robot.ee_site, *robot.joints):
         if not 0 < len(name) <= model_file.MAX_WORD or not name.isprintable():
-            raise UserError(f"{path}: {short(name)} is no name: it is empty, long, or has control characters")
+            raise UserError(f"{path}: {short(name)} is not a name: it is empty, long, or has control characters")
 
 
 def model(robot: RobotCfg) -> mujoco.MjSpec:
@@ -141,7 +141,7 @@ def _parsed(robot: RobotCfg) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_string(robot.mjcf)
     except ValueError as error:
-        raise UserError(f"the mjcf of {robot.name} is no model: {error}") from None
+        raise UserError(f"the mjcf of {robot.name} is not a valid model: {error}") from None
 
 
 def _rows(drive: DriveCfg, columns: tuple[str, ...]) -> dict[str, dict[str, float]]:
@@ -152,7 +152,7 @@ def _columns(rows: Any, columns: tuple[str, ...], where: str) -> dict[str, Any]:
     """Turns ``joint -> {column: value}`` into the fields of a drive."""
     rows = {} if rows is None else rows
     if not isinstance(rows, Mapping):
-        raise UserError(f"{where} takes a line a joint, got {short(rows)}")
+        raise UserError(f"{where} takes one line per joint, got {short(rows)}")
     out: dict[str, Any] = {"joints": tuple(map(str, rows))}
     for joint, row in rows.items():
         if not isinstance(row, Mapping) or set(row) != set(columns):

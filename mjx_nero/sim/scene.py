@@ -36,23 +36,23 @@ class SceneCfg:
         table: False draws the table but lets nothing touch it; without contacts the physics is several times faster.
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
-        fixtures: things with joints of their own by name, such as a cabinet (``sim.fixtures``).
-        robots: further robots by name, beside the task's own (``sim.team``).
+        fixtures: fixtures by name, such as cabinets, perhaps with joints of their own (``sim.fixtures``).
+        robots: further robots by name, besides the task's own (``sim.team``).
         self_collision: a robot's links collide with one another; ``sim.touch`` measures those forces, too.
-        sensors: names of ``Sim.readings`` beside ``touch``. ``hand``: the force with which robots press objects; ``wrist`` and
+        sensors: names of ``Sim.readings`` besides ``touch``. ``hand``: the force with which robots press objects; ``wrist`` and
             ``fingers``: force and torque between arm and hand, and the forces at the pads, of the task's own robot.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
-        look_at, view_distance: point that people's cameras look at, and their distance from it.
+        look_at, view_distance: point that the viewer's cameras look at, and their distance from it.
         view_from: direction from there to the camera ``front``.
-        distractors: how many things that touch nothing cameras may see (``mdp.looks.places`` puts them somewhere).
-        backdrop: a wall stands behind the robot, for cameras alone.
-        photographs: folder with pictures of the user's (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.
-        patterns: how many patterns ``mdp.looks.patterns`` may show.
-        cameras: what terms and policies see through, by name; none cost nothing.
-        renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: the first with
-            MuJoCo's C library as physics, the second otherwise.
+        distractors: number of things without collisions that cameras may see (``mdp.looks.places`` places them).
+        backdrop: adds a wall behind the robot, which only cameras see.
+        photographs: folder with the user's pictures (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.
+        patterns: number of patterns that ``mdp.looks.patterns`` may show.
+        cameras: cameras of terms and policies, by name.
+        renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: ``mujoco`` with
+            native physics, otherwise ``warp``.
     """
 
     table_center: tuple[float, float] = (0.3, 0.0)
@@ -89,13 +89,13 @@ class SimCfg:
     """Physics options and MJX-Warp's buffer sizes. Overflows are counted, see ``Physics``."""
 
     dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
-    decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps a control step
-    iterations: Iterations = 10  # of the constraint solver, at most
-    ls_iterations: Iterations = 50  # of its line search, at most (MJX-JAX 20); at 20, MuJoCo's C library throws a cube at times
-    ramp: bool = False  # drives' targets go evenly to the new ones in a control step, not at once: stiff drives would jerk
-    impratio: Positive = 10.0  # friction as stiff as the grasp needs not to creep
-    elliptic: bool = True  # friction cones; else pyramids
-    contacts_per_env: Slots = 24  # Warp: contact slots, times the number of environments
+    decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps per control step
+    iterations: Iterations = 10  # most iterations of the constraint solver
+    ls_iterations: Iterations = 50  # most iterations of its line search (MJX-JAX 20); at 20, MuJoCo's C library may throw a cube
+    ramp: bool = False  # spreads a change of the drives' targets over the control step: stiff drives would jerk otherwise
+    impratio: Positive = 10.0  # stiffness of friction relative to normal forces: high enough that grasps do not creep
+    elliptic: bool = True  # elliptic friction cones; False: pyramidal
+    contacts_per_env: Slots = 24  # Warp: contact slots per environment, shared by all environments
     constraints_per_env: Slots = 128  # Warp: constraint rows of one environment
     solver: Annotated[str, OneOf("newton", "mujoco_warp")] = "newton"  # Warp: the package's own kernels, or the engine's
 
@@ -109,7 +109,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     """Compiles robot, table, objects and goal marker. An object's body, joint and geom carry its name.
 
     Args:
-        visuals: False drops what physics does not need (visual shapes, lights, cameras): same qpos, qvel and ctrl, faster steps.
+        visuals: False drops what physics does not need (visual shapes, lights, cameras). qpos, qvel and ctrl stay the same.
         fuse: merges links that cannot move against their parents, unless one is the end effector. Warp goes through the tree
             level by level, so fewer levels are faster.
 
@@ -122,13 +122,13 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     team.add(spec, scene.robots, whole)
     spec.modelname = f"{robot.name}_scene"
     if not visuals:
-        spec.discard_visual()  # before things bring meshes that no geom has yet (``objects.bank``), which it would drop, too
+        spec.discard_visual()  # before meshes are added that no geom has yet (``objects.bank``), which it would drop as well
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.iterations, option.ls_iterations = sim.iterations, sim.ls_iterations
     option.impratio = sim.impratio
-    # Box against box then goes by MJX-Warp's closed form instead of its general convex routine: faster, and quicker to compile.
+    # MJX-Warp then uses its closed form for box against box instead of its general convex routine: it runs and compiles faster.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if sim.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
 
@@ -153,7 +153,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
         cameras.add(spec, scene.cameras)
         drawn.add_props(spec, scene, robot)
         textures.add(spec, scene.photographs, scene.patterns)
-    # Fixtures stand elsewhere in each world, so what carries them has to stay a body.
+    # Fixtures stand elsewhere in each world, so their parent has to remain a body.
     ends = all(spec.site(each.ee_site) is not None for each in every.values())
     spec.compiler.fusestatic = fuse and ends and not scene.fixtures
     return obstacles.unbounded(spec.compile())
@@ -171,9 +171,9 @@ def parts(
 
     Args:
         model: the compiled scene.
-        targets: the objects of which an episode commands one.
-        place: draws where obstacles stand; None: where the scene has them.
-        drawn: makes the scene's model for pictures; None: nobody asks for scenery.
+        targets: objects of which an episode commands one.
+        place: draws where obstacles stand; None: they stay where the scene has them.
+        drawn: makes the scene's model for pictures; None: no scenery is needed.
         varied: names of the model's fields that randomization draws.
     """
     return Parts(
@@ -209,7 +209,7 @@ def around(robot: RobotCfg, scene: SceneCfg) -> SceneCfg:
 
 
 def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
-    """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that meet obstacles only."""
+    """Compiles the mounted robot alone, for kinematics. ``whole`` keeps the shapes that only meet obstacles."""
     return team.mounted(robot, whole).compile()
 
 

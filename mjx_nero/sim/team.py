@@ -1,7 +1,7 @@
 """Scenes of several robots. ``cfg.robot`` is the first; ``SceneCfg.robots`` has the others by name.
 
-In the scene, what the file of a robot called ``taker`` names ``joint1`` is ``taker/joint1``. All joints together are those of the
-first robot, arm first, then those of the others in their order, each likewise.
+In the scene, ``joint1`` of a robot called ``taker`` is ``taker/joint1``. The joints of the scene are those of the first robot,
+arm first, then those of each other robot in the same order.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from mjx_nero.sim import robot_file, touch
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.types import UserError
 
-APART = 0.15  # [m] bases that stand nearer to one another overlap
+APART = 0.15  # [m] bases closer than this overlap
 
 Robots = Mapping[str, RobotCfg]
 
@@ -70,40 +70,40 @@ def check(robot: RobotCfg, others: Robots, things: Iterable[str]) -> None:
     taken = set(things)
     for name in others:
         if not name or "/" in name or not name.isprintable():
-            raise UserError(f"scene.robots.{name!r} is no name: a robot's is one word, without a slash")
+            raise UserError(f"scene.robots.{name!r} is not a name: use one word, without a slash")
         if name in taken:
-            raise UserError(f"scene.robots.{name} needs another name: something else in the scene is called so")
+            raise UserError(f"scene.robots.{name} needs another name: something else in the scene has it already")
     feet = {"the first robot": robot.base_pos, **{name: other.base_pos for name, other in others.items()}}
     for (first, a), (second, b) in itertools.combinations(feet.items(), 2):
         if math.dist(a, b) < APART:
             far = f"{math.dist(a, b):.3g} m from one another"
             raise UserError(
-                f"scene.robots: {first} and {second} stand {far}: give one another base_pos, {APART:g} m away at least"
+                f"scene.robots: {first} and {second} stand {far}: give one another base_pos, at least {APART:g} m away"
             )
 
 
 def alone(robots: Robots, what: str) -> None:
-    """Refuses scenes of several robots; ``robots`` are those beside the first.
+    """Refuses scenes of several robots; ``robots`` are those besides the first.
 
     Raises:
-        UserError: there are some; ``what`` does not know them.
+        UserError: there are others, which ``what`` does not support.
     """
     if robots:
-        raise UserError(f"{what} knows scenes of one robot only, and this one has {', '.join(robots)}, too")
+        raise UserError(f"{what} supports only scenes of one robot, but this one also has {', '.join(robots)}")
 
 
 def add(spec: mujoco.MjSpec, others: Robots, whole: bool) -> None:
     """Adds the other robots to a scene.
 
     Args:
-        whole: keeps the shapes that meet obstacles only.
+        whole: keeps the shapes that only meet obstacles.
     """
     for name, robot in others.items():
         spec.attach(mounted(robot, whole), prefix=f"{name}/", frame=spec.worldbody.add_frame())
 
 
 def mounted(robot: RobotCfg, whole: bool = False) -> mujoco.MjSpec:
-    """Reads and mounts a robot. ``whole`` keeps the shapes that meet obstacles only."""
+    """Reads and mounts a robot. ``whole`` keeps the shapes that only meet obstacles."""
     spec = robot_file.model(robot)
     for geom in [] if whole else spec.geoms:
         if geom.conaffinity == touch.OBSTACLE:

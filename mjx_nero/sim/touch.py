@@ -19,7 +19,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError
 
 OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
-COLLISION = 3  # geom group of the robots' collision shapes, including those that meet nothing yet
+COLLISION = 3  # geom group of the robots' collision shapes, including those that do not collide yet
 NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
 STRONGEST, NET = 2, 3  # what a contact sensor gives: the force of the strongest contact, or that of all, in the world's axes
 # Shapes that every backend can collide with a box.
@@ -35,8 +35,8 @@ def add_pairs(spec: mujoco.MjSpec, robot: RobotCfg, name: str = "") -> None:
     """Lets shapes of the robot collide with one another (``self_pairs``), and adds sensors for their contacts.
 
     Args:
-        robot: as in its own file.
-        name: the robot's in the scene (``sim.team``).
+        robot: the robot, with the names of its own file.
+        name: its name in the scene (``sim.team``).
     """
     before = f"{name}/" if name else ""
     collision_shapes(spec, before + robot.base_link)  # names them
@@ -47,7 +47,7 @@ def add_pairs(spec: mujoco.MjSpec, robot: RobotCfg, name: str = "") -> None:
 
 
 def add_hand(spec: mujoco.MjSpec, base: str, objects: tuple[str, ...]) -> None:
-    """Adds sensors for the contacts of the robot with objects, which stay as they are.
+    """Adds sensors for the contacts between the robot and objects. What collides stays the same.
 
     Args:
         spec: robot and objects.
@@ -95,15 +95,15 @@ def self_pairs(robot: RobotCfg) -> tuple[tuple[str, str], ...]:
         kinds = {mujoco.mjtGeom(model.geom_type[g]) for g in (a, b)}
         if not kinds <= MEETS_BOX:
             names = " and ".join(repr(model.geom(g).name) for g in (a, b))
-            raise UserError(f"scene.self_collision: {names} of {robot.name} are shapes that not every backend brings together")
+            raise UserError(f"scene.self_collision: {names} of {robot.name} are shapes that not every backend can collide")
     return tuple((model.geom(a).name, model.geom(b).name) for a, b in found)
 
 
 def at_home(robot: RobotCfg) -> dict[tuple[str, str], float]:
-    """Names of the robot's links that lie within one another at home, and how deep [m].
+    """Lists pairs of the robot's links that overlap at home, and how deep [m].
 
-    Left out are links that follow one another, the gripper's own parts, and what touches in nearly all postures. The shapes that
-    collide are wider than the links: how deep is said of the hulls of what is drawn, where both links have looks.
+    It leaves out consecutive links, the gripper's own parts, and pairs that touch in nearly all postures. Collision shapes are
+    wider than the links, so the depth is that of the hulls of the visual shapes, if both links have some.
     """
     model, (home, *others) = _depths(robot)
     bodies = {tuple(sorted(model.geom_bodyid[list(pair)])): home[pair] for pair in _now_and_then(home, others) if pair in home}
@@ -129,8 +129,10 @@ def _now_and_then(home: Depths, others: list[Depths]) -> list[Pair]:
 
 @functools.lru_cache(maxsize=8)
 def _depths(robot: RobotCfg) -> tuple[mujoco.MjModel, list[Depths]]:
-    """The robot with shapes that all meet, and how deep those of links that do not follow one another lie within one another
-    [m], in each of ``_postures``."""
+    """The robot with shapes that all meet, and the depth [m] of each overlapping pair in each of ``_postures``.
+
+    Consecutive links are left out.
+    """
     spec = robot_file.model(robot)
     shapes = collision_shapes(spec, robot.base_link)
     for geom in spec.geoms:

@@ -1,1 +1,1 @@
-"""Tasks: frozen configs, one module a kind of task."""
+"""Tasks: frozen configs, one module per kind of task."""

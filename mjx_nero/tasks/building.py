@@ -19,15 +19,15 @@ from mjx_nero.types import UserError
 STILL = 0.005  # [m/s]
 FLAT = 0.005  # [m] tolerance of an object's height at its place
 LIFTED = 0.01  # [m] height of a lifted object above where it lay
-RESTING = 0.3  # [rad/s] speed of the joints at which a hand that has left no longer rests
-CLOSING = 0.5  # [s] least closing time: fingers at a metre a second throw what they meet
+RESTING = 0.3  # [rad/s] joint speed at which a hand that has left no longer counts as resting
+CLOSING = 0.5  # [s] least closing time: fingers at a metre a second throw what they hit
 PRESS = 0.075  # [s] least time the fingers press before an object is lifted
 # Share of each of the ten phases that one control step covers: 305 steps in all, 25 to close and 20 to open.
 QUICK = (0.02, 0.0334, 0.1, 0.04, 0.0334, 0.0134, 0.0286, 0.05, 0.04, 0.2)
 
 
 def lets_go() -> dict[str, Term]:
-    """Lists action terms: velocities, and a gripper that closes as far as told and lets go at once.
+    """Lists action terms: arm velocities, and a continuous gripper that lets go at once.
 
     Anti-windup precedes the speed limit, which starts from its targets.
     """
@@ -37,7 +37,7 @@ def lets_go() -> dict[str, Term]:
 
 
 def working(robot: RobotCfg) -> RobotCfg:
-    """The robot as its own controller runs it: drives that carry its weight, and fingers as quick as real ones."""
+    """Returns the robot as its own controller runs it: with gravity compensation, and fingers no faster than real ones."""
     fingers = robot.gripper
     slow = (min(v, abs(a - b) / CLOSING) for v, a, b in zip(fingers.speed, fingers.open, fingers.close, strict=True))
     return dataclasses.replace(
@@ -107,12 +107,12 @@ class Tower:
 
         Args:
             length_s: duration of an episode with quick fingers [s].
-            own: fields that a task adds, or replaces.
+            own: fields that a task adds or replaces.
         """
         shared = {
             "robot": self.builder,
             "scene": self.scene,
-            # Contact buffers are sized by a count. Stiff drives would jerk at new targets, and cubes slide in the jaw.
+            # Stiff drives would jerk at new targets, and cubes would slide in the jaw, so targets ramp.
             "sim": contacts.sized(self.robot, self.scene, SimCfg(ramp=self.robot.max_step > 0)),
             "episode_length_s": length_s + self.extra,
             "rewards": self.rewards(),
@@ -168,7 +168,7 @@ class Tower:
         return {"time_out": DoneTerm(terminations.time_out, time_out=True), **off}
 
     def controllers(self) -> dict[str, dict[str, Any]]:
-        """Builds the tower by inverse kinematics, object by object.
+        """Builds the settings of the script, which builds the tower by inverse kinematics, object by object.
 
         Raises:
             UserError: the robot's hand cannot point down as high as the tower.
@@ -176,7 +176,7 @@ class Tower:
         there, (low, high) = self.there, regions.box(self.robot, "pick", "where on the table it can grasp")[2]
         top = low + (len(self.objects) - 1 - (towers.GOAL in self.objects)) * self.edge
         if top + LIFTED > high:
-            needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, and pick ends at {high:.3g} m"
+            needs = f"its hand has to point down {top + LIFTED:.3g} m above its root, but pick ends at {high:.3g} m"
             raise UserError(f"{self.robot.name} cannot build a tower that high: {needs}")
         # The hand may have to lean above ``pick``, the region where it can point straight down.
         below = max(0.0, -there.offset[2])  # how far the grasp point is below the object's middle
@@ -191,7 +191,7 @@ class Tower:
             "motion": "ik",
             "turn": self.angle < math.pi,
             **regions.ik(self.robot, "ik."),
-            # Where the hand does not point straight down as high as it goes, it leans, but goes there.
+            # Above ``pick`` the hand cannot point straight down, so it leans.
             **({"ik.orientation_weight": regions.UPRIGHT} if leave > high else {}),
         }
         return {"pick_place": fields}

@@ -161,7 +161,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
         scene=scene,
         # At lift's step of 10 ms, light round objects jump out of small pads. Nero's scripted expert lost 30 of 64 objects at
         # 10 ms, 5 at 5 ms with slower motions, and 2 at 2.5 ms.
-        # With MuJoCo's softer friction what is round creeps out of the fingers within seconds; jerks of stiff drives shake it.
+        # With MuJoCo's softer friction, round objects creep out of the fingers within seconds. Jerks of stiff drives shake them.
         sim=contacts.crowded(setup.robot, scene, SimCfg(dt=0.005, decimation=4, impratio=30.0, ramp=setup.robot.max_step > 0)),
         episode_length_s=8.0,
         actions=velocity_actions(hysteresis=0.5),
@@ -208,7 +208,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
 
 
 def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
-    """Says which axis of each object lies across the hand's opening, and in how many equivalent turns."""
+    """Says which axis of each object lies across the hand's opening, and how many turns about the vertical look the same."""
     lying = {"box": 0, "can": 0, "sphere": 0, "capsule": 2}
     turns = {"box": 2, "can": 0, "sphere": 0, "capsule": 2}
     square = {name for name, item in scene.objects.items() if item.shape == "box" and item.size[0] == item.size[1]}

@@ -1,4 +1,4 @@
-"""Two robots face to face, with a bar between them that changes hands: where they stand, and how far each one reaches."""
+"""Two robots face to face that hand over a bar: where they stand, and how far each one reaches."""
 
 import dataclasses
 import math
@@ -16,11 +16,11 @@ from mjx_nero.types import UserError
 
 BAR, TAKER = "bar", "taker"
 ALONG, HALF = 0.09, 0.13  # [m] from the bar's middle to a hand, and to its end
-SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the meeting
-YAW = 0.25  # [rad] greatest turn of the bar at the start, from straight away from the first arm
+SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the meeting point
+YAW = 0.25  # [rad] greatest turn of the bar at the start; unturned, it points straight away from the first arm
 WIDER = 2.0  # opening of the hands, in widths of the bar
-AWAY = 0.05  # [m] a hand so far from the bar's axis has left it
-JOINTS = 6  # of an arm that can point its hand down anywhere around it
+AWAY = 0.05  # [m] distance from the bar's axis beyond which a hand has left it
+JOINTS = 6  # fewest joints of an arm that can point its hand down all around itself
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Side:
     """One robot, as the task sees it.
 
     Attributes:
-        robot: mounted, its home turned to its own side.
+        robot: the mounted robot, with its home turned to its own side.
         near, far: least and greatest distance of the grasp point from the base, along the table [m].
         low, high: heights at which its hand points down, from the root [m].
-        turn: of the first joint from home to the meeting [rad].
+        turn: angle of the first joint from home to the meeting point [rad].
     """
 
     robot: RobotCfg
@@ -43,12 +43,12 @@ class Side:
 
     @property
     def middle(self) -> float:
-        """Distance from the base at which it meets the other [m]."""
+        """Distance from the base of the meeting point [m]."""
         return (self.near + self.far) / 2
 
     @property
     def across(self) -> float:
-        """Half the width of its region, across the way out from its base [m]."""
+        """Half the width of its region, across the direction away from its base [m]."""
         return round(min(self.near * math.tan(YAW), self.far / 4), 4)
 
 
@@ -56,14 +56,14 @@ def _side(robot: RobotCfg, edge: float, faces: float, aside: float) -> Side:
     """Mounts a robot so that it faces ``faces`` [rad], and turns its home by ``aside`` from there [rad].
 
     Raises:
-        UserError: the robot has too few joints, or its first one does not turn it so far about the vertical.
+        UserError: the robot has too few joints, or its first joint cannot turn it that far about the vertical.
     """
     if len(robot.arm.joints) < JOINTS:
         few = f"{robot.name} has {len(robot.arm.joints)} joints"
         raise UserError(f"{few}: to hand a bar over, an arm needs {JOINTS}, so that its hand points down all around")
     pick = np.array(regions.box(robot, "pick", "where on the table it can grasp"))
     regions.box(robot, "hold", "where it can hold what it has grasped")
-    quarter = round(float(np.arctan2(*pick.mean(1)[1::-1])) / SIDE)  # of a turn: its front
+    quarter = round(float(np.arctan2(*pick.mean(1)[1::-1])) / SIDE)  # direction of its front, in quarter turns
     front = np.sort(np.abs(pick[quarter % 2]))
     half = (faces - quarter * SIDE) / 2
     quat = quats.product([math.cos(half), 0.0, 0.0, math.sin(half)], robot.base_quat)
@@ -93,7 +93,7 @@ def _turned(robot: RobotCfg, ahead: float, faces: float, aside: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two robots that face one another, with the bar between them."""
+    """Two robots that face each other, with the bar between them."""
 
     giver: Side
     taker: Side
@@ -106,7 +106,7 @@ class Pair:
 
     @property
     def meet(self) -> tuple[float, float, float]:
-        """The bar's middle where it changes hands, from the giver's root [m]."""
+        """The bar's middle where it changes hands, relative to the giver's root [m]."""
         return round(self.giver.middle + ALONG, 4), 0.0, round(self.height - self.giver.robot.base_pos[2], 4)
 
     @property
@@ -159,11 +159,11 @@ class Pair:
         )
 
     def ways(self, side: Side) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Region of the bar's middle beside a robot, from its root: across, and out from its base [m]."""
+        """Region of the bar's middle beside a robot, relative to its root: across, and out from its base [m]."""
         return (-side.across, side.across), (round(side.near + ALONG, 4), round(side.far + ALONG, 4))
 
     def script(self) -> dict[str, Any]:
-        """Settings of the script."""
+        """Builds the settings of the script."""
         sides, edge = (self.giver, self.taker), self.edge
         ik = regions.ik(self.giver.robot, "ik.") | regions.ik(self.taker.robot, "ik.")
         return {

@@ -92,7 +92,7 @@ def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
 def _ready(robot: RobotCfg) -> RobotCfg:
     """Opens slow fingers no further than a cube needs.
 
-    A jaw that turns by 85 degrees before it meets a cube hardly ever closes on one by chance, and learning starts with that.
+    A jaw that turns by 85 degrees before it meets a cube seldom grasps one by chance, and learning starts from chance grasps.
     """
     edge = grasp.cube_for(robot).size[0]
     return grasp.opened(robot, OPEN * edge) if grasp.closing_time(robot, edge) > SLOW else robot
@@ -109,10 +109,10 @@ def _pick_place(robot: RobotCfg) -> EnvCfg:
 
 
 def _even(robot: RobotCfg) -> RobotCfg:
-    """Limits how far separately driven fingers close to what their full effort takes.
+    """Limits how far separately driven fingers close, so that their full effort just suffices.
 
-    Drives that push against each other far beyond their limits let an object drift sideways; within them, they centre it like
-    springs.
+    Drives that push against each other far beyond their effort let an object drift sideways. Within it, they centre the object
+    like springs.
     """
     fingers, held = robot.gripper, grasp.opened(robot, grasp.cube_for(robot).size[0]).gripper.open
     if len(fingers.joints) < 2:
@@ -134,7 +134,7 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
 
 
 # These tasks take all they need from the robot, so ``nero_place`` and ``place --robot nero`` are the same task. For the other
-# tasks an arm may bring its own numbers, as ``nero_lift`` brings those of its recipe.
+# tasks an arm may have its own numbers, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
     "clutter": clutter.PRESETS,
     "open_drawer": open_drawer.PRESETS,
@@ -150,7 +150,7 @@ FITTING: dict[str, Presets] = {
 }
 
 
-# The tasks of which an arm may bring its own numbers.
+# Tasks for which an arm may bring its own numbers.
 SETUPS: dict[type, tuple[str, Callable[..., Presets]]] = {
     lift.LiftSetup: ("lift", lift.presets),
     reach.ReachSetup: ("reach", reach.presets),

@@ -23,7 +23,7 @@ class FollowTargetSetup:
 
 
 def default(robot: RobotCfg, setup: FollowTargetSetup) -> EnvCfg:
-    """The target runs round a vertical circle in four seconds. Success is to stay within 2 cm of it."""
+    """The target moves round a vertical circle in four seconds. Success is to stay within 2 cm of it."""
     x, y, z = ((c - s, c + s) for c, s in zip(setup.center, setup.spread, strict=True))
     return EnvCfg(
         # A robot's own controller does this. A weak drive that sags would never arrive.

@@ -21,11 +21,11 @@ from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
-OPEN = 0.06  # [m] the hand opens no further: what it grips is less than 2 cm wide
-NEAR = 0.04  # [m] the handle is in the hand
+OPEN = 0.06  # [m] greatest opening of the hand: handles are less than 2 cm wide
+NEAR = 0.04  # [m] distance from the grasp point within which the handle counts as in the hand
 TILT = math.radians(15)  # of the hand from level, fingertips down
-SPEED = 0.02  # [m/s] a handle that moves so fast is moved
-OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] of the fixture
+SPEED = 0.02  # [m/s] speed above which the handle counts as moved
+OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] offsets of the fixture
 HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
 LIMIT: PositiveRange = (0.9, 1.1)  # factor of the upper limit
 
@@ -35,9 +35,9 @@ class Task:
     """A handle of a fixture, and the robot that moves it.
 
     Attributes:
-        file: the fixture's, and its name in the scene.
+        file: name of the fixture, both of its file and in the scene.
         handle: what to take hold of, without ``grip``, which ``held`` adds.
-        middle: where the handle is to be beside ``place`` at the start, so that its path lies in front of the robot [m].
+        middle: offset of the handle along y from ``place`` at the start, so that its path lies in front of the robot [m].
         follow, beyond: see ``FollowJointCfg``.
         level: the hand stays level, in place of tilted by ``TILT``.
     """
@@ -69,7 +69,7 @@ class Task:
         # From pointing down with the fingers opening along y: forward, then down by the tilt.
         forward = quats.about((0.0, 1.0, 0.0), tilt - math.pi / 2)
         _, site = models.at_rest(self.file, self.handle.site)
-        # The bar is the site's z axis; where it lies across, the hand turns by a quarter about the way in.
+        # The bar lies along the site's z axis. If that is horizontal, the hand makes a quarter turn about its approach.
         lies = abs(1 - 2 * (site[1] ** 2 + site[2] ** 2)) < 0.5
         about = quats.about((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0)
         hand = quats.product(forward, quats.product(about, self.robot.down))
@@ -79,7 +79,7 @@ class Task:
 
     @functools.cached_property
     def scene(self) -> SceneCfg:
-        """The fixture, so that its handle is where the robot can move it."""
+        """The scene, with the fixture placed so that the robot can move its handle."""
         at, _ = models.at_rest(self.file, self.handle.site)
         wanted = np.array(self.robot.base_pos) + self.place + [0.0, self.middle, 0.0]
         x, y, z = (round(float(v), 4) + 0.0 for v in wanted - at)
@@ -91,7 +91,7 @@ class Task:
         return dataclasses.replace(scene, view_from=(-0.6, -0.72, 0.35), look_at=(float(look[0]), float(look[1]), float(look[2])))
 
     def controllers(self) -> dict[str, dict[str, Any]]:
-        """Settings of the script that moves the handle."""
+        """Builds the settings of the script that moves the handle."""
         fields = {
             "file": self.file,
             **{f"handle.{name}": value for name, value in dataclasses.asdict(self.held).items()},
@@ -102,7 +102,7 @@ class Task:
         return {"follow_joint": {**fields, **regions.ik(self.robot, "ik.")}}
 
     def rewards(self, moving: Mapping[str, RewardTerm]) -> dict[str, RewardTerm]:
-        """Rewards reaching, turning and closing the hand, ``moving`` the joint, and calm."""
+        """Rewards reaching, turning and closing the hand, ``moving`` the joint, and calm motion."""
         fingers, held = self.builder.gripper, {"handle": self.held}
         closes = {"near": NEAR, "open": fingers.open, "close": fingers.close}
         return {
@@ -116,7 +116,7 @@ class Task:
         }
 
     def observations(self) -> Groups:
-        """The arm, the handle and the joint; the critic sees speeds besides."""
+        """Observes the arm, the handle and the joint. The critic also sees the joint's speed."""
         held = {"handle": self.held}
         state = {
             **arm_state(),
@@ -128,7 +128,7 @@ class Task:
         return groups(state, {"joint_velocity": ObservationTerm(fixtures.joint_velocity, params=held)})
 
     def opening(self) -> EnvCfg:
-        """Builds a task that is done once the joint is as far as its target, or farther."""
+        """Builds a task that is done once the joint is at its target or beyond."""
         held = {"handle": self.held}
         return self.cfg(
             SuccessCfg(condition=Term(fixtures.opened, params=held), distance=Term(fixtures.opening_way, params=held)),
@@ -141,11 +141,11 @@ class Task:
     def cfg(
         self, success: SuccessCfg, moving: Mapping[str, RewardTerm], command: Term | None = None, limit: bool = True
     ) -> EnvCfg:
-        """Builds the task: what counts as done, and what pays for getting there.
+        """Builds the task from its success and from the rewards ``moving``, which lead there.
 
         Args:
             command: draws the command; None: there is none.
-            limit: the joint's upper limit differs from episode to episode.
+            limit: draws the joint's upper limit anew in each episode.
         """
         command, joint = command or Term(commands.nothing), f"{self.file}/{self.handle.joint}"
         near = {"handle": self.held, "speed": round(SPEED / self.handle.lever, 4), "near": NEAR}

@@ -1,6 +1,6 @@
-"""Handover: one arm takes a bar from the table, another takes it over in the air and brings it to its own side.
+"""Handover: one arm picks up a bar, and another takes it over in the air and brings it to its own side.
 
-Two arms face one another. The bar lies beside the first one, out of the other's reach; the goal is beside the other one.
+The arms face each other. The bar lies beside the first one, out of the other's reach; the goal is beside the other one.
 """
 
 import functools
@@ -27,9 +27,9 @@ from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks.facing import ALONG, BAR, SIDE, TAKER, YAW, Pair, pair
 
 THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
-# Least deviation of a learner's actions: at half an arm's length, one of 0.1 moves the bar faster than what is still.
+# Least standard deviation of a learner's actions: at half an arm's length, 0.1 moves the bar faster than STILL.
 CALMEST = 0.05
-CLASH = 0.09  # [m] grasp points so near to one another: the hands, 7 cm wide each way, would run into one another
+CLASH = 0.09  # [m] distance of the grasp points below which the hands, 7 cm wide each way, would collide
 
 
 def both_arms() -> dict[str, Term]:
@@ -88,7 +88,7 @@ def _rewards(two: Pair) -> dict[str, RewardTerm]:
 
 
 def _goal(two: Pair) -> CommandTerm:
-    """The goal: beside the taker, out from its base, as the giver's root sees it."""
+    """The goal: beside the taker, out from its base, in the giver's root frame."""
     (low, high), root = (two.taker.low, two.taker.high), two.giver.robot.base_pos[2]
     across, out = two.ways(two.taker)
     still = (0.0, 0.0)
@@ -113,14 +113,14 @@ def _start(two: Pair) -> dict[str, Term]:
 
 
 def default(robot: RobotCfg, taker: RobotCfg | None = None) -> EnvCfg:
-    """Success: the second hand alone holds the bar, which the first had held, within 3 cm of the goal, still, for half a second.
+    """Success: for half a second, the second hand alone holds the bar still within 3 cm of the goal, after the first held it.
 
     Args:
         robot: the arm that gives.
         taker: the arm that takes; None: another one of the same kind.
 
     Raises:
-        UserError: one of them cannot do that.
+        UserError: one of the arms cannot do its part.
     """
     two = pair(robot, taker or robot)
     scene, hands, one = two.scene, {"hands": two.hands}, {"object": BAR}
@@ -159,5 +159,5 @@ PRESETS: Presets = {"default": default}
 
 
 def taken_by(taker: RobotCfg) -> Presets:
-    """The presets with another robot that takes the bar."""
+    """The presets with ``taker`` as the arm that takes the bar."""
     return {"default": functools.partial(default, taker=taker)}

@@ -1,4 +1,4 @@
-"""Hang ring: take a ring that lies on the table, and hang it over the post of a stand. For any robot with a gripper."""
+"""Hang ring: pick a ring up from the table, and hang it over the post of a stand. For any robot with a gripper."""
 
 from mjx_nero.envs.task import EnvCfg, Presets
 from mjx_nero.sim import grasp
@@ -9,12 +9,12 @@ from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks import lift_any, putting
 from mjx_nero.tasks.putting import Putting
 
-THICK, WALL = 0.018, 0.015  # [m] of the ring (assets/objects/make.py)
-TIP = 0.038  # [m] the post's, over the bars that the ring comes to lie on (assets/fixtures/stand)
-ROOM = 0.016  # [m] from the post's middle to the ring's, at most, while it lies around the post: its play is 15 mm
-LIFTED = 0.003  # [m] with half its thickness, the height of the lowest point of a lifted ring
-PRESS = 0.008  # [m] on the post, which the ring seldom meets
-OFF = 0.003  # [m] the stand is so far from where it is said to be
+THICK, WALL = 0.018, 0.015  # [m] thickness of the ring and of its wall (assets/objects/make.py)
+TIP = 0.038  # [m] height of the post's tip over the bars on which the ring ends up (assets/fixtures/stand)
+ROOM = 0.016  # [m] greatest distance between the middles of a post and a ring around it: the play is 15 mm
+LIFTED = 0.003  # [m] added to half its thickness: height of the lowest point of a lifted ring
+PRESS = 0.008  # [m] how far the script presses onto the post, which the ring seldom hits
+OFF = 0.003  # [m] greatest error of the stand's given position
 
 
 def default(robot: RobotCfg) -> EnvCfg:

@@ -1,4 +1,4 @@
-"""Insert peg: take a peg that stands on the table, and put it into the hole of a block. For any robot with a gripper.
+"""Insert peg: pick up a standing peg, and put it into the hole of a block. For any robot with a gripper.
 
 The policy knows the block's pose to a millimetre and half a degree, and feels the rest by its wrist and its fingers. The peg is
 square, or round with a rounded end.
@@ -18,24 +18,24 @@ from mjx_nero.tasks.putting import Putting
 
 HOLE, DEEP = 0.026, 0.025  # [m] width and depth of the hole (assets/fixtures/make.py)
 LONG = 0.065  # [m] length of the peg
-LOOSE, TIGHT = 0.002, 0.0005  # [m] the hole is so much wider than the peg
-OFF, TURN = 0.001, 0.01  # [m, rad] the block stands so far from where it is said to stand
+LOOSE, TIGHT = 0.002, 0.0005  # [m] how much wider the hole is than the peg
+OFF, TURN = 0.001, 0.01  # [m, rad] greatest errors of the block's given pose
 DENSITY = 1000.0  # [kg/m3]
-OVER = 0.01  # [m] the script carries the peg so high over the block
-ABOVE = 0.025  # [m] a hand that lags comes from so high above the peg, which it would knock over
-PRESS = 0.002  # [m] on the rim
-AWAY = 0.08  # [m] the hand rises so far once it has let go
+OVER = 0.01  # [m] height over the block at which the script carries the peg
+ABOVE = 0.025  # [m] height above the peg from which the hand descends; a hand that lags would knock the peg over
+PRESS = 0.002  # [m] how far the script presses onto the rim
+AWAY = 0.08  # [m] how far the hand rises once it has let go
 
 
 def peg(width: float, square: bool) -> ObjectCfg:
-    """A peg that stands, of plastic."""
+    """Makes a standing plastic peg."""
     shape, size = ("box", (width, width, LONG)) if square else ("can", (width / 2, LONG))
     area = (1.0 if square else math.pi / 4) * width**2
     return ObjectCfg(shape=shape, size=tuple(round(x, 6) for x in size), mass=float(f"{DENSITY * area * LONG:.3g}"))
 
 
 def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) -> EnvCfg:
-    """Success: the peg stands on the ground of the hole, at rest, and the pads touch nothing."""
+    """Success: the peg stands on the bottom of the hole, at rest, and the pads touch nothing."""
     width = round(HOLE - clearance, 6)
     robot, file = putting.hand(robot, width), "socket_square" if square else "socket_round"
     scene = SceneCfg(

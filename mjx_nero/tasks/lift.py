@@ -1,7 +1,4 @@
-"""Lift: pick a cube off the table and hold it at a commanded point.
-
-A preset is one list, long or not, and reads as one.
-"""
+"""Lift: pick a cube off the table and hold it at a commanded point."""
 
 import dataclasses
 import functools
@@ -54,11 +51,11 @@ class LiftSetup:
 
     @property
     def held(self) -> dict[str, float]:
-        """Height and greatest distance from the grasp point of a held object [m]."""
+        """Least height of a held object, and its greatest distance from the grasp point [m]."""
         return {**self.lifted, "grasp_radius": self.grasp_radius}
 
     def controllers(self, robot: RobotCfg) -> dict[str, dict[str, Any]]:
-        """Settings of the script that picks the cube up."""
+        """Builds the settings of the script that picks the cube up."""
         edge = self.scene.objects["cube"].size[0]
         fields = {
             "lowest": grasp.lowest(robot.pad),
@@ -161,17 +158,17 @@ def carrying(held: Mapping[str, Any], **object: str) -> dict[str, RewardTerm]:
 
 
 def sim2real(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
+    """The default, plus the differences between a simulated arm and a real one: see ``tasks.sim2real``."""
     return sim2reals.randomized(default(robot, setup))
 
 
 def seen(robot: RobotCfg, setup: LiftSetup, sees: str = "rgb") -> EnvCfg:
-    """The default by pictures: nobody tells where the cube is. See ``seeing``."""
+    """The default from pictures: the policy does not observe where the cube is. See ``seeing``."""
     return seeing.seen(default(robot, setup), sees)
 
 
 def sim2real_rgb(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
-    """``sim2real`` by pictures of a random look: see ``seeing.lifelike``."""
+    """``sim2real`` from pictures with a random look: see ``seeing.lifelike``."""
     return seeing.lifelike(sim2real(robot, setup))
 
 

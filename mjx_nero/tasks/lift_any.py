@@ -1,7 +1,7 @@
-"""Lift any: pick up one of the package's everyday objects, as it lies, and hold it at a commanded point.
+"""Lift any: pick up one of the package's everyday objects in any resting pose, and hold it at a commanded point.
 
-Three of the twelve objects are held out: no policy sees them in training. The preset ``held_out`` has these alone, ``all`` has
-all twelve.
+Three of the twelve objects are held out: no policy sees them in training. The preset ``held_out`` has only these three, and
+``all`` has all twelve.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ def thing(files: tuple[str, ...]) -> ObjectCfg:
 
 # Long: a task is one list, to read as one.
 def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
-    """Lift's rewards, with heights and distances that count from the thing's own surface."""
+    """Lift's rewards, with heights and distances measured from the thing's surface."""
     there, one, item = regions.of(robot), {"object": THING}, thing(files)
     scene = scenes.around(robot, SceneCfg(objects={THING: item}))
     held = {"minimal_height": LIFTED, "grasp_radius": NEAR, **one}

@@ -44,7 +44,7 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
     done = {"threshold": 0.02, "object": "cube"}
     return dataclasses.replace(
         plain,
-        sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # a grasp, or leaning on a box
+        sim=dataclasses.replace(plain.sim, contacts_per_env=32, constraints_per_env=160),  # for a grasp, or leaning on a box
         episode_length_s=12.0,
         actions=velocity_actions(),
         controllers=reach_obstacles.controllers(robot, "carry", end_effector_offset=there.offset),
@@ -67,7 +67,7 @@ def default(robot: RobotCfg, setup: LiftObstaclesSetup) -> EnvCfg:
             "gripper_action": RewardTerm(rewards.gripper_action_l2, weight=-0.1),
         },
         # A touch costs a tenth until an environment succeeds. At full cost, ten times what a hand at the cube earns, the policy
-        # learns little but to keep away.
+        # mainly learns to keep away.
         curriculum=CurriculumCfg(
             weights={"touching": Term(curriculum.level_weight, params={"start": -1.0})},
             levels=Term(curriculum.BySuccess, params={"up": 0.5, "down": 0.1}),

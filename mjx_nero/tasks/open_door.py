@@ -13,7 +13,7 @@ HANDLE = Handle("cabinet", "door", "door_handle", target=round(ANGLE, 5), lever=
 
 def default(robot: RobotCfg) -> EnvCfg:
     """Success: the door is open by 60 degrees."""
-    # The handle's arc runs to the right by 14 cm. The round bar turns in the hand, which goes half of the turn.
+    # The handle's arc runs 14 cm to the right. The round bar turns in the hand, which makes half of the door's turn.
     task = Task(robot, "cabinet", HANDLE, middle=0.07, follow=0.5, beyond=0.1)
     return task.opening()
 

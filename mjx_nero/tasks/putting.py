@@ -1,4 +1,4 @@
-"""The parts that ``insert_peg`` and ``hang_ring`` share: a fixture at the goal, and an object that is put into it or over it."""
+"""The parts that ``insert_peg`` and ``hang_ring`` share: a fixture at the goal, and an object to put into it or over it."""
 
 import dataclasses
 import math
@@ -17,8 +17,8 @@ from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks.building import Tower
 from mjx_nero.types import UserError
 
-OPEN = 0.06  # [m] the hand opens no further
-LENGTH = 15.0  # [s] of an episode: a learner's velocities, which approach what the script wants, make the script slow
+OPEN = 0.06  # [m] greatest opening of the hand
+LENGTH = 15.0  # [s] of an episode: with velocity actions, which only approach the script's targets, the script is slow
 APART = 0.08  # [m] least distance from the object's start to the fixture, along the table
 WRIST = {"offset": (0.5, 0.5, 0.5, 0.02, 0.02, 0.02), "noise": (0.2, 0.2, 0.2, 0.01, 0.01, 0.01), "scale": 0.05, "delay": (0, 1)}
 FINGERS = {"offset": (0.0,), "noise": (0.2,), "scale": 0.1, "delay": (0, 1)}
@@ -32,8 +32,8 @@ class Putting(Tower):
     Attributes:
         rise: height of the object's centre over the fixture's site [m].
         top: height over its place at which the object still passes beside the fixture [m].
-        off, turn: by how much the goal is wrong about the fixture [m, rad].
-        fold: how many turns of the object about the vertical look the same; 0: it is round.
+        off, turn: greatest errors of the goal as an estimate of the fixture's pose [m, rad].
+        fold: number of turns about the vertical at which the object looks the same; 0: it is round.
     """
 
     rise: float = 0.0
@@ -59,19 +59,19 @@ class Putting(Tower):
         return {"place": dataclasses.replace(place, rise=self.rise)}
 
     def controllers(self) -> dict[str, dict[str, Any]]:
-        """Lists none: a task brings its own."""
+        """Returns none: each task adds its own."""
         return {}
 
     def success(self) -> SuccessCfg:
-        """Requires the object in its place, at rest, with nothing at the pads, for half a second at the end."""
+        """Requires the object in place and at rest, with nothing touching the pads, for half a second at the end."""
         return SuccessCfg(condition=Term(holes.let_be, params=self.done), distance=Term(towers.distance, params=self.place))
 
     def rewards(self) -> dict[str, RewardTerm]:
-        """A tower's, with a way that leads over the top."""
+        """Replaces the tower's approach with a path that leads over the top."""
         place, one = self.place, {"object": self.object}
         way = {**place, "top": self.top, "flat": self.aside}
         turned = Term(rewards.object_goal_turn, params={"std": 0.2, "fold": max(self.fold, 1), **one})
-        # That a hand rests afterwards has been tried with place and stack alone.
+        # ``resting`` has only been tried in place and stack.
         found = {name: term for name, term in super().rewards().items() if not name.startswith(("approaching", "resting"))}
         return {
             **found,
@@ -80,7 +80,7 @@ class Putting(Tower):
         }
 
     def observations(self) -> dict[str, ObservationGroup]:
-        """The arm, the object, the goal, and what wrist and pads feel. The critic knows where the fixture is."""
+        """Observes the arm, the object, the goal, and what wrist and pads feel. The critic knows where the fixture is."""
         one, place = {"object": self.object}, self.place
         turns = {
             "ee_turn_to_object": ObservationTerm(towers.turn_to_object, params={"down": self.robot.down, **one}, noise=0.01),
@@ -109,7 +109,7 @@ class Putting(Tower):
 
         Args:
             controllers: the scripts that can do it.
-            own: fields that a task adds, or replaces.
+            own: fields that a task adds or replaces.
 
         Raises:
             UserError: the robot's ``pick`` is too small for the fixture and the object beside it.
@@ -158,23 +158,23 @@ class Putting(Tower):
 
 
 def hand(robot: RobotCfg, width: float) -> RobotCfg:
-    """Returns the robot with a hand that opens no further than needed, and closes on what is ``width`` wide [m].
+    """Returns the robot with a hand that opens no further than needed, and closes on an object ``width`` wide [m].
 
     Raises:
         UserError: the hand cannot hold it.
     """
     if robot.gripper.joints and 0 < robot.opening < width + 2 * grasp.CLEAR:
-        raise UserError(f"the hand of {robot.name} opens to {robot.opening:.3g} m, and is to take what is {width:.3g} m wide")
+        raise UserError(f"the hand of {robot.name} opens to {robot.opening:.3g} m: too little for an object {width:.3g} m wide")
     return grasp.shut(grasp.opened(robot, OPEN), width)
 
 
 def picking(robot: RobotCfg, width: float, lowest: float, above: float, **own: Any) -> dict[str, Any]:
-    """Settings of the grasp, of the script that puts things in.
+    """Builds the grasp settings of the scripts that put an object in place.
 
     Args:
-        width: of what the fingers close on [m].
-        lowest: height of the pads' middle above the table, at least [m].
-        above: how high the object is lifted [m].
+        width: width of the object between the fingers [m].
+        lowest: least height of the pads' middle above the table [m].
+        above: height to which the object is lifted [m].
     """
     fields = {
         "lowest": round(lowest, 4),

@@ -40,7 +40,7 @@ RUNNER = {
 
 
 def scene(like: SceneCfg) -> SceneCfg:
-    """Removes the objects, and turns the table into a picture."""
+    """Removes the objects, and makes the table visual only."""
     return dataclasses.replace(like, table=False, objects={})
 
 
@@ -139,7 +139,7 @@ def default(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
 
 
 def sim2real(robot: RobotCfg, setup: ReachSetup) -> EnvCfg:
-    """The default with everything that differs between a simulated arm and a real one: see ``tasks.sim2real``."""
+    """The default, plus the differences between a simulated arm and a real one: see ``tasks.sim2real``."""
     return sim2reals.randomized(default(robot, setup))
 
 

@@ -15,7 +15,7 @@ from mjx_nero.sim.scene import ObstacleCfg, SceneCfg
 from mjx_nero.tasks.reach import BUDGET
 
 NAMES = ("one", "two")  # the boxes that make an obstacle
-SHARE = 0.3  # share of the region's width, at either side, that start and goal are drawn from
+SHARE = 0.3  # share of the region's width, at either side, from which start and goal are drawn
 HAND = 0.08  # [m] from a finger's pad to the far side of the hand, with a margin
 
 
@@ -67,7 +67,7 @@ def between(setup: ReachObstaclesSetup, object: str | None = None) -> Term:
 
 
 def with_obstacles(scene: SceneCfg) -> SceneCfg:
-    """Adds the boxes to the scene, and lets the robot touch itself."""
+    """Adds the boxes to the scene, and lets the robot collide with itself."""
     return dataclasses.replace(scene, obstacles={name: ObstacleCfg() for name in NAMES}, self_collision=True)
 
 
@@ -87,7 +87,7 @@ def aside(robot: RobotCfg, setup: ReachObstaclesSetup) -> dict[str, Term]:
 
 
 def controllers(robot: RobotCfg, name: str, **fields: Any) -> dict[str, dict[str, Any]]:
-    """Names the expert: by RMPflow if the robot has its files, otherwise by inverse kinematics."""
+    """Returns the expert ``name``, with RMPflow if the robot has its files, otherwise with inverse kinematics."""
     if (robot.xml.parent / "rmpflow").is_dir():
         return {name: fields}
     return {name: {**fields, "motion": "ik", **regions.ik(robot, "ik.")}}

@@ -1,4 +1,4 @@
-"""Robots and environments by name. Every module of ``arms`` brings its own."""
+"""Robots and environments by name. Every module of ``arms`` adds its own."""
 
 import contextlib
 import dataclasses
@@ -61,7 +61,7 @@ def robot(name: str | pathlib.Path) -> RobotCfg:
     """A robot: one of the package's by name, or an imported one by its folder.
 
     Raises:
-        UserError: unknown name, or no folder of a robot.
+        UserError: the name is unknown, and not the folder of a robot.
     """
     return _find_robot(name)
 
@@ -72,7 +72,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
     Args:
         env: one of ``list_envs()``.
         preset: one of ``list_presets(env)``.
-        robot: another than the environment's own: a config, a name or the folder of an imported one.
+        robot: a robot other than the environment's own: a config, a name, or the folder of an imported one.
         overrides: fields by dotted name, as in ``**{"rewards.reaching_object.weight": 2.0}``.
 
     Raises:
@@ -88,7 +88,7 @@ def env_cfg(env: str, preset: str = "default", robot: RobotCfg | str | pathlib.P
         raise UserError(f"{env} is for any robot: pass one (--robot, a folder that import-urdf made, or {', '.join(ROBOTS)})")
     cfg = factory(chosen)
     cfg = dataclasses.replace(cfg, sim=cfg.sim.finer(cfg.robot.max_step))
-    if chosen.folder:  # imported: nobody has counted the contacts that its work makes
+    if chosen.folder:  # imported: its contacts have not been counted
         cfg = dataclasses.replace(cfg, sim=contacts.sized(chosen, cfg.scene, cfg.sim))
     return things.overridden(cfg, overrides)
 
@@ -108,13 +108,13 @@ def make(
         preset: one of ``list_presets(env)``.
         impl: physics, one of ``physics.impls()``.
         num_envs: how many copies will be stepped together (as in ``ManipulationEnv``).
-        robot: another than the environment's own: a config, a name or the folder of an imported one.
+        robot: a robot other than the environment's own: a config, a name, or the folder of an imported one.
         overrides: config fields by dotted name.
 
     Raises:
         UserError: unknown name, preset, impl, robot or field, or a value of the wrong type.
     """
-    from mjx_nero.envs.env import ManipulationEnv  # with Brax and MJX, which names and configs do without
+    from mjx_nero.envs.env import ManipulationEnv  # imports Brax and MJX, which names and configs do not need
 
     return ManipulationEnv(env_cfg(env, preset, robot, **overrides), impl=impl, num_envs=num_envs)
 

@@ -31,24 +31,24 @@ from mjx_nero.types import UserError
 BOX = "box"
 TILT, FLAT = math.radians(10), 0.005  # [rad, m] tolerances of a box that lies as commanded
 STILL = 0.005  # [m/s]
-LIFTED = 0.01  # [m] height of a held box above the highest that it has while it is tipped over an edge
+LIFTED = 0.01  # [m] height of a held box above the highest that it reaches when tipped over an edge
 AWAY = 0.02  # [m] clearance of the pads beside a box that the hand has left
 YAW = (-0.3, 0.3)  # [rad] heading of the box at the start
-JOINTS = 6  # of an arm whose hand may lean in any direction
-# The script's way with six joints. With seven, inverse kinematics that lifts a hand turns the other joints about as well.
+JOINTS = 6  # fewest joints of an arm whose hand can lean in any direction
+# How the script moves with six joints. With seven, inverse kinematics also turns the other joints when it lifts the hand.
 ROUND = {"clear": 0.02, "rises": 0.15}
 WIDER = 2.0  # opening of the hand, in edges of the box
 
 
 # Long: a task is one list, to read as one.
 def default(robot: RobotCfg) -> EnvCfg:
-    """Success: the commanded side is up within 10 degrees, the box at rest, the hand away, for half a second.
+    """Success: for half a second, the commanded side is up within 10 degrees, the box is at rest, and the hand is away.
 
     Raises:
         UserError: the arm has fewer joints than its hand needs to lean in any direction.
     """
     if len(robot.arm.joints) < JOINTS:
-        few = f"{robot.name} has {len(robot.arm.joints)} joints, so that its hand leans along its arm alone"
+        few = f"{robot.name} has {len(robot.arm.joints)} joints, so its hand can only lean along its arm"
         raise UserError(f"{few}: turning a cube over needs {JOINTS}")
     there, box, one = regions.of(robot), grasp.cube_for(robot), {"object": BOX}
     edge = box.size[0]

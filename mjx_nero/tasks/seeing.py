@@ -1,7 +1,7 @@
 """Tasks seen through cameras: pictures replace the observations of objects.
 
-The presets are ``rgb``, ``depth`` and ``rgbd``, and each with the suffix ``_fixed``; lifts also have ``sim2real_rgb``. A teacher
-that is told the objects' positions trains a student that is not (``imitation.distill``).
+The presets are ``rgb``, ``depth`` and ``rgbd``, each also with the suffix ``_fixed``; lifts also have ``sim2real_rgb``. A teacher
+that observes the objects' positions trains a student that does not (``imitation.distill``).
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
         sees: one of ``PRESETS``.
 
     Raises:
-        UserError: the scene has no object, or the robot does not say where it works.
+        UserError: the scene has no object, or the robot's config lacks the region where it works.
     """
     objects = tuple(cfg.scene.objects)
     if not objects:
@@ -61,8 +61,10 @@ def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
 
 
 def randomized(cfg: EnvCfg) -> EnvCfg:
-    """A task with cameras whose every episode looks different. Each range is a field of its own
-    (``--env.look.lights.params.brightness "(0.3, 2)"``, ``--env.sensors.front.params.noise 8``)."""
+    """Makes every episode of a task with cameras look different.
+
+    Each range is a field of its own (``--env.look.lights.params.brightness "(0.3, 2)"``, ``--env.sensors.front.params.noise 8``).
+    """
     scene = dataclasses.replace(cfg.scene, distractors=DISTRACTORS, backdrop=True)
     names, objects, there = (
         drawn.distractors(scene),
@@ -112,12 +114,12 @@ def randomized(cfg: EnvCfg) -> EnvCfg:
 
 
 def lifelike(cfg: EnvCfg) -> EnvCfg:
-    """A task of ``tasks.sim2real`` seen through cameras: all that differs there, the random look, and patterns on everything.
+    """Returns a task of ``tasks.sim2real`` seen through cameras: with its differences, a random look, and patterns on everything.
 
-    It has no curriculum, because the teacher knows all of it from the start.
+    It has no curriculum, because the teacher has mastered the full task from the start.
     """
     objects, curriculum = cfg.scene.objects, dataclasses.replace(cfg.curriculum, levels=None)
-    told = {name: term for name, term in cfg.sensors.items() if name not in objects}  # nobody says where objects are
+    told = {name: term for name, term in cfg.sensors.items() if name not in objects}  # the policy is not told where objects are
     cfg = seen(dataclasses.replace(cfg, sensors=told, curriculum=curriculum))
     budget = dataclasses.replace(cfg.budget, steps=3 * STEPS)
     return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, patterns=PATTERNS), budget=budget)

@@ -1,7 +1,7 @@
-"""Sim to real, for any task: the preset ``sim2real`` adds what differs between a simulated arm and a real one.
+"""Sim to real, for any task: the preset ``sim2real`` adds the differences between a simulated arm and a real one.
 
 Every range is a field (``--env.randomization.object_mass.params.scale "(0.5, 4)"``, ``--env.actions.delay.params.steps "(0,
-3)"``). The ranges are the ones that other libraries train manipulation with (mjlab's lift_cube, MuJoCo Playground, Isaac Lab,
+3)"``). The ranges are those with which other libraries train manipulation (mjlab's lift_cube, MuJoCo Playground, Isaac Lab,
 HumanoidVerse). The delays are those of a bus and a camera at 50 control steps a second.
 """
 

@@ -1,4 +1,4 @@
-"""Selects the arm's joints. A robot with more (a second arm, a head, wheels) is cut down to the one arm that its user names."""
+"""Selects the arm's joints. A robot with more (a second arm, a head, wheels) is reduced to the one arm that its user names."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -16,8 +16,13 @@ FINGERS = 3  # least driven joints in series that make a branch an arm, not a fi
 
 @dataclasses.dataclass(frozen=True)
 class Limb:
-    """An arm: its driven joints from the base outwards, the body that it branches off from, and the body that carries its
-    hand."""
+    """An arm.
+
+    Attributes:
+        base: the body that it branches off from.
+        end: the body that carries its hand.
+        joints: its driven joints, from the base outwards.
+    """
 
     base: str
     end: str
@@ -76,7 +81,7 @@ def _check(tree: Tree) -> None:
         joints = f"{len(branches)} branches of at most {max(counts)} driven joint{'s' * (max(counts) > 1)} leave its base"
         choice = f"--chain {limbs[0].base}:{_named(parts, limbs[0].end)}"
         advice = f"Import it with an arm that carries it, or one of its branches, {choice}"
-        raise UserError(f"{tree.name} is no arm: {joints}, as of a hand alone. {advice}")
+        raise UserError(f"{tree.name} is not an arm: {joints}, as in a hand alone. {advice}")
     arms = {j for one in limbs for j in one.joints}
     ends = {name for one in limbs for name in below(parts, one.end)}
     spare = [b.joint.name for b in parts.values() if b.joint and not b.joint.mimic and b.name not in ends]

@@ -153,8 +153,10 @@ class Cloud:
     def _error(
         self, poses: Mapping[str, Poses], wanted: Points, down: bool, tilt: float, along: Vec | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Computes the error to the goals [n, 3 or 6] and its Jacobian. Without ``along``, turns about the approach do not
-        count."""
+        """Computes the error to the goals [n, 3 or 6] and its Jacobian.
+
+        Without ``along``, turns about the approach do not count.
+        """
         sites, jacobian = self.sites(poses), self.jacobian(poses)
         away = wanted - sites[:, :3, 3]
         if not down:

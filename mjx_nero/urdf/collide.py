@@ -10,10 +10,10 @@ from mjx_nero.urdf.geometry import Look, Looks
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Points, Pose, Tree
 
-SMALL = 0.05  # shapes below this share of the volume of their body's largest are left out
+SMALL = 0.05  # shapes with less than this share of the volume of their body's largest shape are left out
 FEW = 3  # most collisions of a link that may each have a shape of their own
 NEAR = 0.02  # [m] links that stay this far above the table never touch it
-FEW_POINTS = 20  # least points of a surface that a shape is fitted to
+FEW_POINTS = 20  # least number of points to fit a shape to
 _CUBE = {"sphere": 1, "capsule": 2, "box": 8}  # contacts of a shape with a cube; with the table: primitives.CONTACTS
 Vec4 = Float[np.ndarray, "4"]
 Collisions = dict[str, list[tuple[str, primitives.Primitive, int]]]  # link -> (name, shape in its frame, contact bits)
@@ -77,8 +77,9 @@ def shapes_of(surfaces: list[tuple[Points, float]], exact: list[primitives.Primi
 def _palm(
     shapes: list[primitives.Primitive], points: Points, site: Pose, hand: Hand, link: str, notes: Notes
 ) -> list[primitives.Primitive]:
-    """Fits the shapes of a link beside the gripper. If one reaches beyond the pads, a box around what lies behind them replaces
-    it.
+    """Fits the shapes of a link beside the gripper.
+
+    If one reaches beyond the pads, a box around the part behind the pads replaces all of them.
 
     Args:
         points: points of its surface [n, 3]; ``site``: the grasp point's pose [4, 4]. Both are in the link's frame.

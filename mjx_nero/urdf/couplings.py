@@ -45,8 +45,10 @@ def adopt(root: etree._Element, notes: Notes) -> None:
 
 
 def _stated(root: etree._Element) -> Iterator[_Stated]:
-    """Yields stated couplings: Gazebo's plugins name a ``joint`` and its follower, and ros2_control gives the follower a
-    parameter."""
+    """Yields stated couplings.
+
+    Gazebo's plugins name a ``joint`` and its follower; ros2_control gives the follower a parameter.
+    """
     for plugin in root.iterfind("gazebo//plugin"):
         source, follower, multiplier, offset = (
             (plugin.findtext(tag) or "").strip() for tag in ("joint", "mimicJoint", "multiplier", "offset")

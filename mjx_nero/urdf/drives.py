@@ -23,7 +23,7 @@ STRETCH = 0.05  # [rad, m] least position error at which a drive gives its full 
 STUCK = 0.01  # [rad, m] greatest position error that dry friction may leave
 DT = 1 / 60  # [s] longest physics step of the tasks
 USUAL = 1.5  # [rad/s, m/s] speed of a joint whose file gives none
-SPEED = 2.0  # [rad/s, m/s] greatest speed of position targets, as is usual near people
+SPEED = 2.0  # [rad/s, m/s] greatest speed of position targets, the usual limit near people
 SQUEEZE = 0.0125  # [m] position error at which a finger gives its full effort
 FORCE = 60.0  # [N] greatest force of a finger
 PRESS = 250.0  # [N/kg] greatest force per mass of the liftable cube; pads then sink in by a millimetre
@@ -48,7 +48,7 @@ def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
         if name not in joints:
             raise UserError(f"{path} names joint {short(name)}{hint(str(name), joints)}: choose from {', '.join(joints)}")
         if not isinstance(row, Mapping) or not {"stiffness", "damping"} <= set(row) or not set(row) <= set(COLUMNS):
-            raise UserError(f"{path}: {name} takes stiffness and damping, and at will effort and speed; got {short(row)}")
+            raise UserError(f"{path}: {name} takes stiffness and damping, and optionally effort and speed; got {short(row)}")
         out[str(name)] = {
             column: read(kind, row[column], f"{path}: {name}.{column}") for column, kind in COLUMNS.items() if column in row
         }

@@ -62,12 +62,10 @@ class Roots:
         self.folders = [*self._own, *self.packages.values()]
 
     def find(self, name: str, base: pathlib.Path | None = None) -> pathlib.Path:
-        """Finds the file that a URDF calls ``name``: ``package://``, ``model://``, ``file://``, absolute, or relative to
-        ``base``.
+        """Finds the file that a URDF calls ``name``.
 
-        An absolute path from another machine is searched for in the package that it passes through.
-
-        An absolute path of another machine is looked for in the package that it passes through.
+        The name starts with ``package://``, ``model://`` or ``file://``, or it is a path, absolute or relative to ``base``. An
+        absolute path from another machine is searched for in the package that it passes through.
 
         Raises:
             UserError: the file lies outside the folders, even by a symbolic link.
@@ -146,8 +144,10 @@ class Roots:
         return found
 
     def _inside(self, path: pathlib.Path, name: str) -> pathlib.Path | None:
-        """Resolves links and ``..`` in ``path``; returns it if it is a regular file within the folders, None if it is not a
-        file."""
+        """Resolves links and ``..`` in ``path``.
+
+        Returns the path if it is a regular file within the folders, and None if it is not a file.
+        """
         try:
             real = path.resolve()
             regular = stat.S_ISREG(real.stat().st_mode)

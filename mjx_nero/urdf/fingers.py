@@ -19,7 +19,7 @@ _NAMES = re.compile(r"grip|finger|jaw|hand|knuckle|claw", re.IGNORECASE)
 MOST_JOINTS = 4  # greatest number of driven joints of a finger
 JAW = 2.8  # [rad] greatest opening of a single jaw; a joint that turns further is a wrist
 STILL = 2e-3  # [m] a joint grips if it changes a distance between fingers by more
-ALIKE = 0.8  # a third finger parts by more than this share of the best pair's
+ALIKE = 0.8  # a third finger opens by more than this share of the best pair's opening
 Chosen = tuple[Tree, tuple[str, ...], str]
 
 
@@ -133,7 +133,7 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
     meetings = swing.between(close, wide)
     if not meetings:
         raise UserError(
-            f"open and closed are the same to {', '.join(joints)}: give --open and --closed, or --gripper with others"
+            f"open and closed are the same for {', '.join(joints)}: give --open and --closed, or --gripper with others"
         )
     first = meetings[0]
     fingers = first.names[:1] if first.fixed else _fingers(swing, meetings)

@@ -68,7 +68,7 @@ def import_fixture(
 
 
 def _text(tree: Tree, looks: Looks, notes: Notes) -> str:
-    """Writes the model, the joints at 0 or as near to it as they go."""
+    """Writes the model, with the joints at 0 or as near to 0 as they go."""
     parts = bodies(tree)
     joints = [body.joint for body in parts.values() if body.joint]
     taken = [link for body in parts.values() for link in body.links]

@@ -47,7 +47,7 @@ def check(out: pathlib.Path, force: bool) -> None:
         raise UserError(f"{out} holds an imported robot: pass --force to replace it, or another --out")
     for name in found:
         if name not in written:
-            raise UserError(f"{out / name} is no file of an import: move it out of {out}, or pass another --out")
+            raise UserError(f"{out / name} was not written by an import: move it out of {out}, or pass another --out")
         if name != _REPORT and _hash(files.read_bytes(out / name, _MAX_FILE)) != written[name]:
             raise UserError(f"{out / name} was changed since it was imported: move it out of {out}, or pass another --out")
 
@@ -103,7 +103,7 @@ def hashes(made: pathlib.Path) -> dict[str, str]:
 
 @contextlib.contextmanager
 def making(out: pathlib.Path, force: bool) -> Iterator[pathlib.Path]:
-    """Gives a folder under a hidden name beside ``out``, and moves it there at the end, or leaves nothing.
+    """Yields a folder with a hidden name beside ``out``. At the end it becomes ``out``; after an error nothing is left.
 
     Raises:
         UserError: the folder cannot be written.

@@ -13,7 +13,7 @@ from mjx_nero.urdf import drawing, files, meshes, primitives
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Link, Matrix, Points, Shape, Tree, Vec
 
-APART = 2e-3  # [m, and of the axes] a collision is not where the visual of the same mesh is
+APART = 2e-3  # [m, and of the axes] least difference of pose between a collision and a visual of the same mesh
 MAX_SHAPES = 4_000  # visuals and collisions of a robot
 MAX_WORK = 8_000_000  # triangles of all its shapes; a mesh counts once per scale
 MAX_SECONDS = 60.0  # [s] of processor time
@@ -144,7 +144,7 @@ class Looks:
         return Look(drawn, surfaces, [primitives.exact(shape) for shape, _, _ in fitted])
 
     def _placed(self, name: str, shown: list[_Loaded], fitted: list[_Loaded]) -> list[_Loaded]:
-        """Puts a link's only collision where its only visual is, if both are one mesh: a wrong visual would have been seen."""
+        """Moves a link's only collision to its only visual, if both are one mesh: a misplaced visual would have been noticed."""
         if len(shown) != 1 or len(fitted) != 1:
             return fitted
         seen, felt = shown[0][0], fitted[0][0]

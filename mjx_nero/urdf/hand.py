@@ -29,9 +29,9 @@ _SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realse
 NEAR = 0.06  # [m] a named frame this near to where the fingers meet is their grasp point; the flange's is farther away
 TOOL_AXIS = 50.0  # [degrees] the working axis of a tool's frame is the one within this of where the fingers point
 ON_AXIS = 5e-3  # [m] the last joint turns a tool this near to its axis, and carries others around
-SHARES, NUDGE = 41, 0.02  # samples between closed and open; share that tells where the fingers are going
+SHARES, NUDGE = 41, 0.02  # samples between closed and open; step in share that shows how the fingers move
 ASIDE = 4e-3  # [m] gap between cube and fixed jaw as the hand comes down, as arms are exact to a few millimetres
-ROUNDS = 3  # of fitting pads to a held cube, whose size follows from the pads
+ROUNDS = 3  # rounds of fitting pads to a held cube: the cube's size follows from the pads in turn
 
 
 def find(
@@ -230,7 +230,7 @@ class _Gripper:
             closed=closed,
             pad=extents,
         )
-        if grip.jaw:  # leaves room to the fixed jaw: the moving jaw pushes the cube there
+        if grip.jaw:  # leaves room beside the fixed jaw; the moving jaw then pushes the cube against it
             edge = grasp.edge(hand.gap, extents, closed)
             aside = min(ASIDE, max(0.0, hand.gap - edge) / 4) + (edge / 2 if self.swing.blind else 0.0)
             hand.grip = np.round(frame[:, 1] * self._fingers(held.share, frame)[0][0][0].outward * aside, 4) + 0.0

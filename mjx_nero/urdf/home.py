@@ -66,10 +66,10 @@ class Search:
         return {**self.start, **{j: float(v) + 0.0 for j, v in arm if j in self.free}}
 
     def amid(self, box: Box | None, down: bool, tilt: float = 0.0) -> Float[np.ndarray, "n k"]:
-        """Finds poses with the grasp point in the middle of a box, hand down or leaning by up to ``tilt``, links clear of the
-        table and of one another.
+        """Finds poses with the grasp point in the middle of a box and the links clear of the table and of one another.
 
-        Poses farthest from joint limits and singularities come first.
+        If ``down``, the hand points down or leans by up to ``tilt``. Poses farthest from joint limits and singularities come
+        first.
         """
         cloud = self.cloud
         if box is None or not self.free:
@@ -91,7 +91,7 @@ def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str
     """Returns joint -> home position [rad, m], and the turn of the hand there (wxyz).
 
     The home is the candidate from which the hand reaches the most of ``place.pick``. Of two turns that do equally well, the
-    nearer one wins, because turning the hand by half a turn costs time.
+    nearer one wins, because half a turn of the hand costs time.
 
     If no candidate in the middle of the workspace leads to all of ``pick``, others over its middle are tried. Without any
     candidate the home is ``start``; or, if a shape is below the table there, the nearest random pose in which none is.

@@ -118,7 +118,7 @@ def import_urdf(
 
 
 def filled(tree: Tree, looks: Looks, notes: Notes) -> Tree:
-    """Fills in what shapes tell: missing tensors, and masses where no link, or no link of a moving body, has one."""
+    """Fills in what shapes imply: missing tensors, and masses where no link, or no link of a moving body, has one."""
     seen = {n: None if look.guessed else look.points for n, look in looks.of.items()}
     masses = {n: link.mass for n, link in tree.links.items()}
     shown = {n: points if looks.of[n].drawn else None for n, points in seen.items()}

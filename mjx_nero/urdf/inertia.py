@@ -117,8 +117,10 @@ def _ball(mass: float, radius: float) -> Matrix:
 
 
 def absurd(mass: Mass, points: Points | None) -> bool:
-    """True if the inertia is a placeholder: at least ``HEAVY``, and ``ABSURD`` for its mass within its shape's ``points`` [n,
-    3]."""
+    """True if the inertia is a placeholder.
+
+    It then is at least ``HEAVY``, and more than ``ABSURD`` times what its mass can have within its shape's ``points`` [n, 3].
+    """
     if points is None or mass.mass < PLACEHOLDER or _lack(mass.inertia) > ROUNDED:
         return False
     return float(np.linalg.eigvalsh(mass.inertia)[-1]) >= HEAVY and _excess(mass, points)[0] > ABSURD
@@ -163,7 +165,7 @@ def _signed(tensor: Matrix, name: str, notes: Notes) -> Matrix:
 
 
 def _lack(tensor: Matrix) -> float:
-    """Share of the largest second moment that the least one lacks to 0; infinite if none is positive, 0 for a zero tensor."""
+    """How far the least second moment is below 0, as a share of the largest; infinite if none is positive, 0 for zeros."""
     values = np.linalg.eigvalsh(tensor)
     moments = values.sum() / 2 - values
     if moments.max() <= 0:

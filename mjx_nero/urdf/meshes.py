@@ -111,7 +111,7 @@ def _check_count(triangles: int) -> None:
 
 
 def _check_stl(content: bytes) -> bytes:
-    """Counts triangles. Its size tells a binary file: 84 bytes plus 50 per triangle."""
+    """Counts triangles. A binary file has 84 bytes plus 50 per triangle."""
     binary = len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
     _check_count((len(content) - 84) // 50 if binary else content.count(b"endfacet"))
     return content
@@ -142,8 +142,10 @@ def _check_dae(content: bytes) -> bytes:
 
 
 def _placed(root: etree._Element) -> int:
-    """Counts how often a COLLADA scene places geometries. Nodes may place one another, doubling at every level, or in a
-    circle."""
+    """Counts how often a COLLADA scene places geometries.
+
+    Nodes may place one another, doubling at every level, or in a circle.
+    """
     nodes = {node.get("id"): node for node in root.iter("{*}node") if node.get("id")}
     known: dict[str, int] = {}
 

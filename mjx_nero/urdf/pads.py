@@ -22,7 +22,7 @@ class Finger:
 
     Attributes:
         name: name of its body, or of the link that is the fixed jaw.
-        points: points of its surface [n, 3], in the link of the gripper's frame; None: unknown.
+        points: points of its surface [n, 3], in the frame of the gripper's link; None: unknown.
         pose: pose of the body or link there [4, 4].
         shut: pose of the body when the gripper is closed [4, 4].
         outward: side along the opening to which it moves away, 1 or -1; a fixed jaw's own side.

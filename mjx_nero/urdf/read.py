@@ -45,9 +45,9 @@ def read(
     if xacro.is_xacro(root):
         root = xacro.expand(root, path, roots, args, notes)
     elif args:
-        raise UserError(f"--arg {next(iter(args))}: {path} is no xacro file")
+        raise UserError(f"--arg {next(iter(args))}: {path} is not a xacro file")
     if root.tag != "robot":
-        raise UserError(f"{path} is no URDF: its outermost element is <{root.tag}>, not <robot>")
+        raise UserError(f"{path} is not a URDF: its outermost element is <{root.tag}>, not <robot>")
     if not (root.get("name") or "").strip():
         root.set("name", path.stem)
     root.set("name", "".join(c for c in root.get("name") if c.isprintable())[: validate.MAX_NAME].strip() or "robot")

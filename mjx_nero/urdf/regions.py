@@ -18,7 +18,7 @@ from mjx_nero.urdf.workspace import Box
 CELLS = 16  # cells along the reach
 NEAR, ASIDE = 0.25, 0.3125  # shares of the reach: least distance ahead of the shoulder, greatest to its side
 LONG, WIDE = 0.25, 0.4  # shares of the reach: greatest size of a region, ahead and aside
-SPARE = 0.02  # share of the reach by which the hand reaches beyond the region, if one such exists
+SPARE = 0.02  # share of the reach: margin that the hand can reach beyond the region, if there is such a region
 OVER = 0.06  # [m] height above the grasp at which the hand still points down, to approach from above
 TALL = 0.4  # share of the reach: greatest height above the table for holding
 WIDTH = 0.15  # share of the reach: a hand with a narrower region tries to lean further
@@ -91,8 +91,8 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
 
     The table in front of the shoulder, on the side of the workspace, is cut into cells of a sixteenth of the reach. A cell counts
     if inverse kinematics reaches it with the hand pointing down and its fingers opening along y, at the height of a grasp and
-    ``OVER`` it, with nothing below the table. If there are no such cells either way round, any turn about the vertical will do;
-    if there are still none, the hand may lean by one of ``LEANS``.
+    ``OVER`` above it, with nothing below the table. If there are no such cells either way round, any turn about the vertical will
+    do; if there are still none, the hand may lean by one of ``LEANS``.
 
     ``pick`` is the rectangle of such cells, up to ``LONG`` by ``WIDE``, with the largest area weighted by nearness to the middle
     in front of the shoulder. It shrinks until inverse kinematics reaches 27 of its points, including the corners. ``hold`` rises

@@ -28,10 +28,10 @@ class Stand:
 
 
 def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: Pose, name: str, notes: Notes) -> Stand:
-    """Places the robot: on the table, on the floor beside it if it is a pedestal or as tall as a person, or hanging as the URDF
-    mounts it.
+    """Places the robot: on the table, on the floor beside it, or hanging as the URDF mounts it.
 
-    The top of a pedestal, where the arm begins, is at the table's height. A hanging robot hangs where the table is within reach.
+    A pedestal, or a robot as tall as a person, stands on the floor. The top of a pedestal, where the arm begins, is at the
+    table's height. A hanging robot hangs where the table is within reach.
     """
     base = next(iter(parts.values()))
     points = seen(base, looks)

@@ -16,7 +16,7 @@ FOLLOWED, KEPT = 250, 2000  # points of a shape that are moved, and points that 
 STEPS, TURN = 13, 73  # positions of a swing, and of a whole turn
 FACE = 0.2  # a shape's face parts within this share of the range over its points
 BESIDE = 0.7  # worth of meeting a fixed shape: two moving shapes that meet equally well are preferred
-INNER = 0.25  # share of the range by which shapes must part again to have met on the way
+INNER = 0.25  # shapes have met on the way only if they part again by this share of the range
 STILL = 1e-6  # [m, 1] least change of pose that counts as motion
 TOUCH = 5e-3  # [m] distance at which shapes touch, as sampled points are millimetres apart
 WIDE = 0.01  # [m] shapes that part by less never met
@@ -42,8 +42,10 @@ class Meeting:
 
     @property
     def worth(self) -> float:
-        """Distance by which the two part, minus their least distance [m]; -inf for a finger that never comes near a fixed
-        shape."""
+        """Distance by which the two part, minus their least distance [m].
+
+        It is -inf for a finger that never comes near a fixed shape.
+        """
         parted = float(np.ptp(self.apart) - self.apart.min())
         return parted if not self.fixed else BESIDE * parted if parted > 0 else -np.inf
 

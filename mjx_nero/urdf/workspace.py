@@ -26,8 +26,9 @@ Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 
 def first_home(parts: Mapping[str, Body], hand: Hand, given: Mapping[str, float]) -> dict[str, float]:
-    """Guesses a home: 0 for a joint with a tenth of its range on both sides, else the middle; gripper open; ``given`` has
-    priority.
+    """Guesses a home: 0 for a joint with a tenth of its range on both sides, else the middle; the gripper is open.
+
+    ``given`` has priority.
 
     Raises:
         UserError: ``given`` names an unknown joint or a position beyond its limits.

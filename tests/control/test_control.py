@@ -412,7 +412,7 @@ def test_the_hand_turns_as_the_object_and_then_as_the_goal(cobotta_view):
 
 
 def test_a_tower_of_nothing_is_refused():
-    with pytest.raises(UserError, match="^tower names what stays or 'goal', then one object or more to move there, got"):
+    with pytest.raises(UserError, match="^tower names what stays or 'goal', then one or more objects to put there, got"):
         placer(tower=("goal",))
 
 

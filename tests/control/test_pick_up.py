@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -69,6 +70,8 @@ def test_room_beside_others_by_hand(controller):
 def test_it_grasps_at_the_objects_middle_or_as_low_as_the_pads_allow(controller):
     np.testing.assert_allclose(controller._pick(seen(0), jnp.array(0.3)), [0.5, 0.1, 0.05], atol=1e-6)
     np.testing.assert_allclose(controller._pick(seen(0, height=0.01), jnp.array(0.3)), [0.5, 0.1, 0.03], atol=1e-6)
+    # An object whose middle is at 6 mm would be at the pads' lower edge, at 5 mm: they go down to 3 mm.
+    np.testing.assert_allclose(controller._pick(seen(0, height=0.006), jnp.array(0.3)), [0.5, 0.1, 0.028], atol=1e-6)
     longer = PickUp(COBOTTA_PRO_900, 0.02, dataclasses.replace(CFG, beyond=0.004))
     np.testing.assert_allclose(longer._pick(seen(0, height=0.01), jnp.array(0.3)), [0.5, 0.1, 0.034], atol=1e-6)
 
@@ -98,9 +101,23 @@ def test_fingers_whose_drives_lag_get_time_to_press():
     assert slow.gentle == 6.0 and quick.gentle == 1.5  # [rad/s2]: the SO-ARM's own drives hardly lag, Nero's by half a second
 
 
-def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
+def fresh() -> pick_up.PickUpMemory:
     zero, q = jnp.zeros((), jnp.int32), jnp.zeros(6)
-    memory = pick_up.PickUpMemory(zero, zero, q, q, zero, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3))
+    return pick_up.PickUpMemory(zero, zero, q, q, zero, q, jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(3))
+
+
+def test_a_hand_that_has_lost_an_object_follows_it_as_it_falls(controller):
+    """Where it was lost, in the air, there would be nothing to grasp."""
+    step = jax.jit(controller.step)
+    for tries, follows in ((0, False), (1, True)):
+        memory = dataclasses.replace(fresh(), tries=jnp.array(tries))
+        for height in (0.3, 0.2):
+            memory, _ = step(memory, seen(0, height=height))
+            np.testing.assert_allclose(memory.pick, [0.5, 0.1, height] if follows else np.zeros(3), atol=1e-6)
+
+
+def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
+    memory = fresh()
 
     def ends(phase, count=0, error=0.0, arrived=True, qd=0.0) -> bool:
         now = dataclasses.replace(memory, phase=jnp.array(phase), count=jnp.array(count), qd=jnp.full(6, qd))
@@ -115,7 +132,7 @@ def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
 
 @pytest.mark.parametrize("fields", [{"turns": (4, 2)}, {"heading": (0, 3), "turns": (1, 1)}, {"turns": (-1,)}])
 def test_what_does_not_say_how_objects_lie_is_refused(fields):
-    with pytest.raises(UserError, match="heading and turns are an axis .0, 1, 2. and a number an object, got"):
+    with pytest.raises(UserError, match="heading and turns take an axis .0 to 2. and a number per object, got"):
         control.make("pick_up", COBOTTA_PRO_900, 0.02, fields)
-    with pytest.raises(UserError, match="aside takes one value an object, got .0.01, 0.02. for 1"):
+    with pytest.raises(UserError, match="aside takes one value per object, got .0.01, 0.02. for 1"):
         control.make("pick_up", COBOTTA_PRO_900, 0.02, {"aside": (0.01, 0.02)})

@@ -186,7 +186,7 @@ def near(term: str) -> dict:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (near("bal"), "^rewards.near.params.object is 'bal', and the scene's objects are: box, .*, pill, target$"),
+        (near("bal"), "^rewards.near.params.object is 'bal', but the scene's objects are: box, .*, pill, target$"),
         (
             {"command": dataclasses.replace(CFG.command, targets=("box", "ball"))},
             "^command.targets names ball: not one of box, bar, cylinder, sphere, capsule, pill$",
@@ -204,7 +204,7 @@ def test_names_that_are_not_there(changes, message):
 
 
 def test_without_targets_no_term_may_name_one():
-    with pytest.raises(UserError, match="^rewards.near.params.object is 'target', and the scene's objects are: cube$"):
+    with pytest.raises(UserError, match="^rewards.near.params.object is 'target', but the scene's objects are: cube$"):
         dataclasses.replace(env_cfg("nero_lift"), **near("target"))
 
 

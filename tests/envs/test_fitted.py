@@ -232,7 +232,7 @@ def test_hands_close_on_what_is_narrow_or_say_so():
     assert jaw.gripper.close == (-0.2,) and jaw.gripper.open == SO_ARM100.gripper.open
     assert env_cfg("clutter", robot="so_arm100").robot.gripper.close == (-0.2,)
     with pytest.raises(
-        UserError, match=r"^the hand of so_arm100 closes to 0\.00198 m between its pads, and is to hold what is 0\.001 m"
+        UserError, match=r"^the hand of so_arm100 closes to 0\.00198 m between its pads: too wide to hold an object 0\.001 m"
     ):
         grasp.shut(SO_ARM100, 0.001)
 
@@ -275,8 +275,8 @@ def test_an_imported_arm_follows_a_target(hand):
 @pytest.mark.parametrize(
     ("env", "changes", "message"),
     [
-        ("lift", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one; reach does without"),
-        ("pick_place", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one; reach does without"),
+        ("lift", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one, but reach does not"),
+        ("pick_place", {"gripper": GripperCfg()}, "nero has no gripper: this task needs one, but reach does not"),
         (
             "lift",
             {"opening": 0.0},
@@ -287,7 +287,7 @@ def test_an_imported_arm_follows_a_target(hand):
             {"pick": None},
             r"nero has no pick, where on the table it can grasp: give it in its config as ranges of x, y and z",
         ),
-        ("lift", {"pick": None, "folder": "x"}, "give it in its robot.yaml as ranges of x, y and z .*, or import it anew$"),
+        ("lift", {"pick": None, "folder": "x"}, "give it in its robot.yaml as ranges of x, y and z .*, or import it again$"),
         ("lift", {"hold": None}, "nero has no hold, where it can hold what it has grasped: give it in its config"),
         ("follow_target", {"pick": None, "workspace": None}, "nero has no workspace, where it can work: give it in its config"),
     ],

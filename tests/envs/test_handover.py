@@ -63,7 +63,7 @@ def test_the_scene_of_one_robot_has_no_others():
     "robots, text",
     [
         ({"cube": beside(NERO)}, "scene.robots.cube needs another name"),
-        ({"a/b": beside(NERO)}, "'a/b' is no name"),
+        ({"a/b": beside(NERO)}, "'a/b' is not a name"),
         ({"taker": beside(NERO, 0.1)}, "the first robot and taker stand 0.1 m from one another"),
         ({"a": beside(NERO), "b": beside(COBOTTA, 1.05)}, "a and b stand 0.05 m from one another"),
     ],
@@ -75,15 +75,15 @@ def test_names_and_places_are_checked(robots, text):
 
 def test_a_term_names_a_robot_that_is_there():
     cfg = env_cfg("nero_handover")
-    with pytest.raises(UserError, match=r"to_goal.params.robot is 'tacker', and the scene's further robots are: taker"):
+    with pytest.raises(UserError, match=r"to_goal.params.robot is 'tacker', but the scene's further robots are: taker"):
         dataclasses.replace(cfg, metrics={"to_goal": MetricTerm(success.ee_distance, params={"robot": "tacker"})})
-    with pytest.raises(UserError, match="events.reset_object_yaw.params.robot means nothing"):
+    with pytest.raises(UserError, match="events.reset_object_yaw.params.robot has no effect"):
         event = cfg.events["reset_object_yaw"]
         event = dataclasses.replace(event, params={**event.params, "robot": "taker"})
         dataclasses.replace(cfg, events={**cfg.events, "reset_object_yaw": event})
     with pytest.raises(UserError, match="is 'tacker/arm', and the drives' groups are: arm, gripper, taker/arm, taker/gripper"):
         make("nero_handover", impl="native", **{"actions.taker_arm.params.group": "tacker/arm"})
-    with pytest.raises(UserError, match="hand_over: taker is 'taker', and the scene's further robots are: none"):
+    with pytest.raises(UserError, match="hand_over: taker is 'taker', but the scene's further robots are: none"):
         HandOver(NERO, 0.02)
     with pytest.raises(UserError, match="so_arm101 has 5 joints: to hand a bar over, an arm needs 6"):
         env_cfg("handover", robot="so_arm101")
@@ -106,7 +106,7 @@ def test_a_view_of_one_robot_is_as_if_it_were_alone(env, state):
 
 def test_what_knows_one_robot_says_so(env):
     with pytest.raises(
-        UserError, match="a data set of demonstrations knows scenes of one robot only, and this one has taker, too"
+        UserError, match="a data set of demonstrations supports only scenes of one robot, but this one also has taker"
     ):
         making.units_of(env, "si")
 

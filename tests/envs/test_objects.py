@@ -118,7 +118,7 @@ def test_shapes_start_where_they_touch_the_table(shape, size, quat, height):
         ),
         ({"scene.objects.cube.size": (0.1,)}, "scene.objects.cube.size of a box is its three edges, got"),
         ({"scene.objects": {"cube": cube(0.03, 0.03), "link4": ObjectCfg()}}, "scene.objects.link4 needs another name"),
-        ({"scene.objects": {}}, "observations.state.ee_to_object.params.object is 'cube', and the scene's objects are: none"),
+        ({"scene.objects": {}}, "observations.state.ee_to_object.params.object is 'cube', but the scene's objects are: none"),
         ({"events.reset_object_position.params.object": "ball"}, "events.reset_object_position.params.object is 'ball'"),
         ({"command.targets": ("picture",)}, "command.targets names picture: not one of cube"),
     ],

@@ -87,7 +87,7 @@ def test_the_cobotta_can_hit_its_own_column():
         ),
         (
             {"obstacles": {"cube": ObstacleCfg()}},
-            "scene.obstacles.cube needs another name: the robot or the scene has one that is called so",
+            "scene.obstacles.cube needs another name: the robot or the scene already uses it",
         ),
     ],
 )
@@ -101,7 +101,7 @@ def test_impossible_obstacles_are_refused_in_one_line(changes, message):
 def test_names_that_the_scene_lacks_are_refused():
     cfg = env_cfg("nero_reach_obstacles")
     env = make("nero_reach_obstacles", impl="native", **{"obstacles.params.names": ("one", "three")})
-    with pytest.raises(UserError, match="obstacles draws three, and the scene's obstacles are: one, two"):
+    with pytest.raises(UserError, match="obstacles draws three, but the scene's obstacles are: one, two"):
         jax.eval_shape(env.sample, jax.random.PRNGKey(0))
     plain = dataclasses.replace(env_cfg("nero_reach"), success=cfg.success)
     with pytest.raises(UserError, match="terms of touch need scene.obstacles or scene.self_collision, and this task has neither"):

@@ -82,7 +82,7 @@ def test_a_ring_around_the_post_hangs_wherever_it_lies_there():
 
 def test_hands_that_cannot_are_told_in_one_line():
     small = dataclasses.replace(NERO, opening=0.03)
-    with pytest.raises(UserError, match="opens to 0.03 m, and is to take what is 0.024 m wide"):
+    with pytest.raises(UserError, match="opens to 0.03 m: too little for an object 0.024 m wide"):
         env_cfg("insert_peg", robot=small)
     near = dataclasses.replace(NERO, pick=((0.3, 0.35), (0.0, 0.1), (0.02, 0.15)))
     with pytest.raises(UserError, match="cannot reach a fixture and an object 0.08 m apart"):

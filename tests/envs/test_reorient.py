@@ -28,7 +28,7 @@ def test_every_arm_of_six_joints_turns_a_cube_of_its_own_size(robot):
 
 
 def test_arms_of_five_joints_are_told_in_one_line():
-    with pytest.raises(UserError, match="so_arm101 has 5 joints, so that its hand leans along its arm alone: .* needs 6"):
+    with pytest.raises(UserError, match="so_arm101 has 5 joints, so its hand can only lean along its arm: .* needs 6"):
         env_cfg("reorient", robot="so_arm101")
     assert "so100_reorient" not in list_envs() and "piper_reorient" in list_envs()
 

@@ -284,7 +284,7 @@ def test_an_object_starts_apart_from_the_goal():
 
 def test_no_room_for_objects_is_one_line():
     params = {"objects": ("a", "b", "c"), "x": (0.0, 0.1), "y": (-0.1, 0.15), "apart": 0.15}
-    with pytest.raises(UserError, match=r"^3 objects 0.15 m apart take 0.3 m, and x \(0.0, 0.1\) and y .* are shorter$"):
+    with pytest.raises(UserError, match=r"^3 objects 0.15 m apart need 0.3 m, but x \(0.0, 0.1\) and y .* are shorter$"):
         events.objects_apart(KEY, start(), **params)
 
 

@@ -146,7 +146,7 @@ def test_without_cameras_nothing_changes():
 @pytest.mark.parametrize(
     "fields, message",
     [
-        ({"link": "hand"}, r"scene.cameras.front.link is 'hand', and the scene's links are: base_link, .*"),
+        ({"link": "hand"}, r"scene.cameras.front.link is 'hand', but the scene's links are: base_link, .*"),
         ({"size": (64, 4000)}, r"size must be at least 1 and at most 2048, got 4000"),
         ({"size": (0, 64)}, r"size must be at least 1"),
         ({"fovy": 180.0}, r"fovy must be at least 1"),
@@ -163,7 +163,7 @@ def test_bad_cameras_are_refused(fields, message):
 @pytest.mark.parametrize(
     "term, camera, message",
     [
-        (images.rgb, "back", r"reads the camera 'back', and the scene's cameras \(scene.cameras\) are: front"),
+        (images.rgb, "back", r"reads the camera 'back', but the scene's cameras \(scene.cameras\) are: front"),
         (images.depth, "front", r"reads depth of the camera 'front': add it to scene.cameras.front.kinds"),
     ],
 )

@@ -180,7 +180,7 @@ def test_our_own_have_what_their_comments_say():
         ),
         ("<mujoco><worldbody><body><joint name='a' type='ball'/></body></worldbody></mujoco>", "choose from hinge, slide"),
         ("<mujoco><include file='/etc/passwd'/></mujoco>", "<include> has no place"),
-        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "is no model: .*mass"),
+        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "is not a valid model: .*mass"),
     ],
 )
 def test_bad_files_get_a_line(tmp_path, text, message):

@@ -116,5 +116,5 @@ def test_a_scene_without_them_has_none():
 
 def test_a_robot_without_pads_is_told():
     bare = dataclasses.replace(ROBOT, name="bare", mjcf=ROBOT.mjcf.replace('name="pad"', 'name="plate"'))
-    with pytest.raises(UserError, match="the sensor 'fingers' measures at shapes with 'pad' in their names, and bare has none"):
+    with pytest.raises(UserError, match="the sensor 'fingers' measures at shapes with 'pad' in their names, but bare has none"):
         scene.build(bare, SceneCfg(sensors=("fingers",)), SimCfg(), visuals=False)

@@ -186,17 +186,17 @@ def test_without_the_library(tmp_path, monkeypatch):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "encloses nothing"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "vertices that it does not have"),
-        ("a.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "v lines are not all 3 numbers"),
+        ("a.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "v lines do not all have the same number of values, 3 or more"),
         ("a.obj", "mtllib ../m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not below its own folder"),
         ("a.obj", "mtllib /etc/passwd\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not below its own folder"),
         (
             "a.obj",
             "".join(f"v {i} 0 0\nv {i} 1 0\nv {i} 0 {1 + i % 7}\nf {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(400)),
-            "400 pieces that do not hang together",
+            "400 disconnected pieces",
         ),
         ("a.stl", "solid x\nendsolid x\n", "holds no triangles"),
         ("a.stl", "x" * 200, "neither a binary file"),
-        ("a.glb", "glTF", "no glTF 2 file"),
+        ("a.glb", "glTF", "not a glTF 2 file"),
     ],
 )
 def test_faults_of_files(tmp_path, name, text, says):

@@ -66,7 +66,7 @@ ROW = {"stiffness": 1.0, "damping": 1.0, "effort": 1.0, "speed": 1.0, "home": 0.
     [
         ({"arms": {}}, r"no field 'arms' \(did you mean 'arm'\?\)"),
         ({"arm": {}}, "arm names no joint"),
-        ({"arm": [1]}, "arm takes a line a joint"),
+        ({"arm": [1]}, "arm takes one line per joint"),
         ({"arm": {"joint1": {"stiffness": 1.0}}}, "joint1 takes stiffness, damping, effort, speed, home; got"),
         ({"arm": {"joint1": {**ROW, "effort": "much"}}}, "joint1.effort takes a finite number, got 'much'"),
         ({"arm": {"joint1": {**ROW, "effort": float("nan")}}}, "joint1.effort takes a finite number, got nan"),

@@ -63,8 +63,8 @@ def test_patterns_are_grey_and_repeat_without_a_seam():
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "is no folder: give one with pictures"),
-        ({}, "has 0 pictures .PNG or JPEG., and a scene takes 1 to 200"),
+        (None, "is not a folder: give one with pictures"),
+        ({}, "has 0 pictures .PNG or JPEG., but a scene takes 1 to 200"),
         ({"a.png": b"\x89PNG\r\n\x1a\n nonsense"}, "cannot read .*a.png: "),
         ({"a.jpg": b""}, "cannot read .*a.jpg: cannot identify image"),
         ({"a.png": b"GIF89a"}, "cannot read .*a.png: cannot identify image"),

@@ -261,7 +261,7 @@ def test_imported_with_arguments(tmp_path):
     path = make.write(tmp_path, document(inner), "x.xacro")
     report = import_urdf(path, tmp_path / "out", args={"n": "0.3"})
     assert report.joints["j"]["limits"] == [0.0, 0.6]
-    with pytest.raises(UserError, match="--arg n: .* is no xacro file"):
+    with pytest.raises(UserError, match="--arg n: .* is not a xacro file"):
         import_urdf(make.write(tmp_path, make.arm(2)), tmp_path / "out2", args={"n": "1"})
 
 

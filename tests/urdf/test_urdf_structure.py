@@ -385,7 +385,7 @@ def test_a_hand_alone_is_no_arm(tmp_path, driven):
         for k in range(driven):
             parts += [make.link(f"{side}{k}", make.inertial(0.01)), make.joint(f"{side}_j{k}", above, f"{side}{k}", axis="0 1 0")]
             above = f"{side}{k}"
-    with pytest.raises(UserError, match=f"is no arm: 2 branches of at most {driven} driven joint.*Import it with an arm"):
+    with pytest.raises(UserError, match=f"is not an arm: 2 branches of at most {driven} driven joint.*Import it with an arm"):
         imported(tmp_path, *parts)
 
 

@@ -1,6 +1,6 @@
 """Cameras of a scene: their pictures as arrays, for terms and policies.
 
-A drawer is one module with one class; ``make`` picks it. All drawers draw the same visual model, and give the same ``Picture``.
+Each drawer is one module with one class; ``Cameras`` picks one. All drawers draw the same visual model and return ``Picture``s.
 """
 
 import copy
@@ -33,14 +33,14 @@ class Drawer(Protocol):
         Args:
             qpos: [nq].
             fields: fields of the drawn model that differ from world to world, by MuJoCo's names.
-            due: False: nobody looks at that camera's picture, which may be anything. None: all are looked at.
+            due: False where a camera's picture is not used, and may be anything. None: all are used.
         """
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics.prepare``."""
 
     def bytes(self) -> int:
-        """Returns the memory that one world takes outside of JAX's."""
+        """Returns the memory of one world outside JAX's [bytes]."""
         return 0
 
 
@@ -71,7 +71,7 @@ class Cameras:
         """Returns the pictures by camera.
 
         Args:
-            due: by camera, False where nobody looks at the picture, which then may be anything.
+            due: by camera, False where the picture is not used, and may be anything.
         """
         now = {name: jnp.asarray(scenery.look.get(name, value)) for name, value in self._nominal.items()}
         for field, row, value in rows(self._model, scenery):
@@ -82,5 +82,5 @@ class Cameras:
 
 
 def renderer(asked: str, impl: str) -> str:
-    """Returns the renderer that ``SceneCfg.renderer`` and the physics' ``impl`` stand for."""
+    """Returns the renderer for ``SceneCfg.renderer`` and the physics' ``impl``."""
     return ("mujoco" if impl == "native" else "warp") if asked == "auto" else asked

@@ -58,7 +58,7 @@ def add(spec: mujoco.MjSpec, cameras: Mapping[str, CameraCfg]) -> None:
         body = spec.body(cfg.link) if cfg.link else spec.worldbody
         if body is None:
             links = ", ".join(b.name for b in spec.bodies if b.name and b.name != "world")
-            raise UserError(f"scene.cameras.{name}.link is {cfg.link!r}, and the scene's links are: {links}")
+            raise UserError(f"scene.cameras.{name}.link is {cfg.link!r}, but the scene's links are: {links}")
         body.add_camera(name=MARK + name, pos=cfg.pos, quat=cfg.quat, fovy=cfg.fovy)
 
 

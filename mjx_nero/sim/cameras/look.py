@@ -26,7 +26,7 @@ class Look:
         terms: by name, each ``(key, model) -> {field: (rows, values)}``.
 
     Attributes:
-        names: of the fields that differ.
+        names: names of the fields that differ.
 
     Raises:
         UserError: a term names something that the model lacks, or draws a field that cannot differ.
@@ -51,7 +51,7 @@ class Look:
 
 
 def rows(model: mujoco.MjModel, scenery: Scenery) -> Iterator[tuple[str, int, Any]]:
-    """Yields what a scenery says of objects and obstacles, as fields of the drawn model: name, row and value."""
+    """Yields the looks of a scenery's objects and obstacles as fields of the drawn model: name, row and value."""
     for name, look in scenery.objects.items():
         row = int(model.geom(name).id)
         yield from (("geom_size", row, look.size), ("geom_rgba", row, look.rgba))

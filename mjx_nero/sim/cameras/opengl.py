@@ -21,7 +21,7 @@ from mjx_nero.sim.render import NO_GL
 from mjx_nero.types import Picture, UserError
 
 _TYPES = {"rgb": np.uint8, "depth": np.float32, "segmentation": np.int32}
-_FAR = 0.999  # share of the farthest distance, from which on nothing is there
+_FAR = 0.999  # share of the farthest distance beyond which a pixel counts as empty
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # switched off: the ray tracer has neither
 
 
@@ -30,7 +30,7 @@ class OpenGL(Drawer):
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
         self._model, self._cfg = copy.copy(model), dict(cfg)
-        self._model.vis.quality.offsamples = 0  # one ray a pixel, as the ray tracer
+        self._model.vis.quality.offsamples = 0  # one sample per pixel, as in the ray tracer
         screen = self._model.vis.global_
         screen.offwidth = max(screen.offwidth, *(c.size[0] for c in cfg.values()))
         screen.offheight = max(screen.offheight, *(c.size[1] for c in cfg.values()))
@@ -50,7 +50,7 @@ class OpenGL(Drawer):
     def __call__(
         self, qpos: jax.Array, fields: Mapping[str, Array], due: Bool[Array, "*n cameras"] | None = None
     ) -> dict[str, Picture]:
-        """Draws the pictures of one world, or of as many as the leading axes say."""
+        """Draws the pictures of one world, or of a batch given by leading axes."""
         lead = qpos.shape[:-1]
         drawn = [fields[name].reshape(*lead, -1) for name in self._fields]
         wanted = jnp.ones((*lead, len(self._cfg))) if due is None else due
@@ -70,7 +70,7 @@ class OpenGL(Drawer):
     def _draw_all(self, packed: Array) -> list[np.ndarray]:
         """(which cameras are due, qpos, fields) of all worlds -> the images.
 
-        JAX calls this function back, so calling JAX in here would deadlock.
+        JAX calls this function, so calling JAX in here would deadlock.
         """
         rows = np.asarray(packed).reshape(-1, packed.shape[-1])
         images = [np.zeros((len(rows), *s.shape), s.dtype) for s in self._shapes]
@@ -113,7 +113,7 @@ class OpenGL(Drawer):
 
 
 def _close(thread: concurrent.futures.ThreadPoolExecutor, renderers: Mapping[Any, mujoco.Renderer]) -> None:
-    """Frees contexts in the thread that made them: another may not."""
+    """Frees contexts in the thread that made them, because no other thread may."""
     with contextlib.suppress(RuntimeError):  # the interpreter ends, and everything with it
         for renderer in renderers.values():
             thread.submit(renderer.close)

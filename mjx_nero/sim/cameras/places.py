@@ -22,27 +22,27 @@ _BEHIND = (0.02, 0.06, 0.1, 0.14)  # [m] distances behind the grasp point
 _AHEAD = 0.03  # [m] the wrist's camera looks this far ahead of the grasp point
 _CLEAR = 0.012  # [m] shapes nearer to a point than this belong to it
 _FREE = 0.01  # [m] free space around a camera
-_EQUAL = 4  # places whose numbers of visible points differ by no more are equal
+_EQUAL = 4  # places count as equal if their numbers of visible points differ by no more than this
 
 
 def find(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",)) -> Cameras:
     """Finds a camera in front and one at the wrist.
 
     Raises:
-        UserError: the robot does not say where it works.
+        UserError: the robot's config lacks its regions.
     """
     return {"front": front(robot, size, kinds), "wrist": wrist(robot, size, kinds)}
 
 
 def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 45.0) -> CameraCfg:
-    """Places a camera in the world, opposite the robot, as near as it can be and still see all of the robot's regions.
+    """Places a camera in the world, opposite the robot, as near as it can be while it sees all of the robot's regions.
 
     Raises:
-        UserError: the robot does not say where that is.
+        UserError: the robot's config lacks them.
     """
     boxes = [np.array(box) for box in (robot.pick or robot.workspace, robot.hold or robot.workspace) if box]
     if not boxes:
-        raise UserError(f"{robot.name} does not say where it works (workspace, pick, hold): give scene.cameras poses of your own")
+        raise UserError(f"{robot.name} has none of workspace, pick and hold, which place cameras: set scene.cameras yourself")
     low, high = np.min([b[:, 0] for b in boxes], axis=0) - _MARGIN, np.max([b[:, 1] for b in boxes], axis=0) + _MARGIN
     corners = np.array(list(itertools.product(*zip(low, high, strict=True)))) + robot.base_pos
     center = corners.mean(0)
@@ -61,7 +61,7 @@ def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 75.0) -> CameraCfg:
     """Places a camera on the hand that looks past the fingers.
 
-    Of many places it takes the one that sees most of what is between and ahead of the fingers, open and closed. Of equals it
+    It takes, of many places, the one that sees most points between and ahead of the fingers, open and closed. Among equals it
     takes the highest at home, which sees the table, then the nearest to the hand.
     """
     link, pos, quat = _on_hand(robot)
@@ -70,7 +70,7 @@ def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 
 @functools.cache
 def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
-    """Link, position and orientation of the wrist's camera, whatever its pictures are."""
+    """Link, position and orientation of the wrist's camera, which do not depend on its pictures."""
     model, data = scenes.at_home(robot, whole=True)
     site = model.site(robot.ee_site).id
     body = int(model.site_bodyid[site])
@@ -78,7 +78,7 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
     straight = turn @ quats.matrix(robot.down).T  # from the world's axes with the hand pointing down to the link's
     side, across, back = straight.T  # rows: columns of ``straight``
     found = []
-    up = data.xmat[body].reshape(3, 3)[2]  # the world's, in the link's frame
+    up = data.xmat[body].reshape(3, 3)[2]  # the world's vertical, in the link's frame
     for aside, behind, angle in itertools.product(_ASIDE, _BEHIND, np.arange(8) * np.pi / 4):
         out = np.cos(angle) * side + np.sin(angle) * across
         pos = grasp + behind * back + aside * out
@@ -90,7 +90,7 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
 
 
 def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:
-    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame sees unhidden."""
+    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame can see."""
     data, count, hit = mujoco.MjData(model), 0, np.zeros(1, np.int32)
     for fingers in (robot.gripper.open, robot.gripper.close):
         for joint, position in zip(robot.joints, (*robot.arm.home, *fingers), strict=True):

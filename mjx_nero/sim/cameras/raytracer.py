@@ -1,7 +1,7 @@
 """MuJoCo Warp's ray tracer: all worlds at once, on an NVIDIA GPU, or on the CPU for tests and small numbers.
 
 As in ``physics.mujoco_warp``, the arrays stay in Warp: one CUDA graph computes the poses and draws, JAX copies positions in and
-pictures out. The function is pure, so what nobody reads is not drawn.
+pictures out. The function is pure, so pictures that are not used are not drawn.
 """
 
 import functools
@@ -26,7 +26,7 @@ _SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
 
 
 class RayTracer(Drawer):
-    """See ``cameras.Drawer``. The first pictures of a batch size on a device make the buffers, which are kept."""
+    """See ``cameras.Drawer``. The first call with a batch size on a device makes the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
         self._model, self._cfg = model, dict(cfg)
@@ -41,7 +41,7 @@ class RayTracer(Drawer):
     def __call__(
         self, qpos: jax.Array, fields: Mapping[str, Array], due: Bool[Array, "*n cameras"] | None = None
     ) -> dict[str, Picture]:
-        """Draws the pictures of one world, or of as many as the leading axes say."""
+        """Draws the pictures of one world, or of a batch given by leading axes."""
         lead = qpos.shape[:-1]
         given = [qpos, *(_bits(fields[name].reshape(*lead, -1)) for name in self._fields)]
         packed = jnp.concatenate(given, axis=-1) if self._fields else qpos
@@ -73,7 +73,7 @@ class RayTracer(Drawer):
         return pictures + tree + 4 * sum(math.prod(shape) for shape in self._fields.values())
 
     def _as_jax(self, sometimes: bool = False) -> Callable:
-        """The function of JAX that draws; ``sometimes``: it also takes which worlds are due, and draws all of them or none."""
+        """Makes the JAX function that draws. ``sometimes``: it also takes which worlds are due, and draws all of them or none."""
         import warp as wp
 
         # As in ``physics.mujoco_warp``: XLA calls this function on the stream that it computes on.
@@ -89,7 +89,7 @@ class RayTracer(Drawer):
                 ("depth", depth_out, seen.depth_data),
                 ("segmentation", segmentation_out, seen.seg_data),
             ):
-                if self._pixels[kind]:  # otherwise nobody reads it
+                if self._pixels[kind]:  # otherwise it is not used
                     wp.copy(out, made)
 
         draw.__annotations__ = {
@@ -147,9 +147,9 @@ class RayTracer(Drawer):
             mujoco_warp.refit_bvh(model, data, seen)
             mujoco_warp.render(model, data, seen)
 
-        if not wp.get_device().is_cuda:  # no graphs there
+        if not wp.get_device().is_cuda:  # there are no graphs on a CPU
             return data, drawn, seen, run, model
-        if drawn is not None:  # orientations that are zero would make no bounding boxes
+        if drawn is not None:  # orientations of zero would make no bounding boxes
             given = [np.ravel(x).view(np.float32) for x in nominal(self._model, self._fields).values()]
             drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
@@ -157,5 +157,5 @@ class RayTracer(Drawer):
 
 
 def _bits(values: Array) -> Array:
-    """The values as they lie in memory: Warp reads whole numbers there."""
+    """The values as bits of floats, where Warp reads integers."""
     return values if jnp.issubdtype(values.dtype, jnp.floating) else jax.lax.bitcast_convert_type(values, jnp.float32)

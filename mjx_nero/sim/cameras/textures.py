@@ -1,4 +1,4 @@
-"""Textures of a drawn scene: photographs of the user's, and patterns; each is a material, which ``mdp.looks`` gives to geoms."""
+"""Textures of a drawn scene: the user's photographs, and patterns. Each is a material that ``mdp.looks`` gives to geoms."""
 
 import io
 import pathlib
@@ -11,21 +11,21 @@ import numpy as np
 from mjx_nero import files
 from mjx_nero.types import UserError
 
-PHOTO, PATTERN = "photograph_", "pattern_"  # and a number: names of materials
-EDGE = 256  # pixels of a photograph's longer edge, at most
-MOST = 200  # photographs of a folder
+PHOTO, PATTERN = "photograph_", "pattern_"  # names of materials, before a number
+EDGE = 256  # most pixels along a photograph's longer edge
+MOST = 200  # photographs in a folder
 _BYTES = 50_000_000  # of a file
 _ENDINGS = (".png", ".jpg", ".jpeg")
-_TIMES = 2.0  # along each edge of a box: a camera sees but a part of a wall
-_TILE = 64  # pixels of a pattern's edge, which is repeated
+_TIMES = 2.0  # repeats along each edge of a box: a camera sees only part of a wall
+_TILE = 64  # pixels along a pattern's edge, which is repeated
 
 
 def add(spec: mujoco.MjSpec, folder: str, patterns: int) -> None:
     """Adds the materials to a scene.
 
     Args:
-        folder: of photographs; empty: none.
-        patterns: how many, the same ones for a number.
+        folder: folder with photographs; empty: none.
+        patterns: how many patterns; each is the same in every scene.
 
     Raises:
         UserError: there are no photographs in the folder, or one cannot be read.
@@ -40,21 +40,21 @@ def _material(spec: mujoco.MjSpec, name: str, picture: np.ndarray) -> None:
     height, width, _ = picture.shape
     made: Any = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3)
     made.data = np.ascontiguousarray(picture).tobytes()
-    material = spec.add_material(name=name, texrepeat=[_TIMES, _TIMES], specular=0.0)  # both renderers shine through it unlike
+    material = spec.add_material(name=name, texrepeat=[_TIMES, _TIMES], specular=0.0)  # the renderers' highlights differ
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
 def photographs(folder: pathlib.Path) -> Iterator[np.ndarray]:
-    """The pictures in a folder by their names' order, uint8 [height, width, 3], made smaller.
+    """Yields the pictures in a folder, scaled down, in the order of their names, uint8 [height, width, 3].
 
     Raises:
         UserError: see ``add``.
     """
     if not folder.is_dir():
-        raise UserError(f"scene.photographs: {folder} is no folder: give one with pictures (PNG or JPEG)")
+        raise UserError(f"scene.photographs: {folder} is not a folder: give one with pictures (PNG or JPEG)")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS and not path.name.startswith("."))
     if not 0 < len(found) <= MOST:
-        raise UserError(f"scene.photographs: {folder} has {len(found)} pictures (PNG or JPEG), and a scene takes 1 to {MOST}")
+        raise UserError(f"scene.photographs: {folder} has {len(found)} pictures (PNG or JPEG), but a scene takes 1 to {MOST}")
     yield from map(_read, found)
 
 

@@ -1,8 +1,8 @@
-"""Different shapes in different worlds of one batch: which of them an object has is a number, and this looks up what follows.
+"""Different shapes in different worlds of one batch. The number of an object's shape decides the fields of the model.
 
 All shapes are in the compiled model. A world differs from another in some fields of the model: which mesh each part is, where it
-lies in the body, its bounds, and the mass. A part that a shape lacks has no mesh (MuJoCo Warp) and touches nothing (MuJoCo's C
-library, which does not know of meshes that are not there). What touches is one body's, so nothing is parked or hidden elsewhere.
+lies in the body, its bounds, and the mass. A part that a shape lacks has no mesh (MuJoCo Warp) or touches nothing (MuJoCo's C
+library, where a geom cannot lack a mesh). All shapes share one body, so nothing is parked or hidden elsewhere.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.types import SHAPE, Carry, Sim, Start, View
 
 _GEOMS = ("geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
-_OF_C = ("geom_contype", "geom_conaffinity")  # which MuJoCo Warp keeps once for all worlds
+_OF_C = ("geom_contype", "geom_conaffinity")  # MuJoCo Warp keeps one copy of these for all worlds
 _BODIES = ("body_mass", "body_inertia", "body_iquat", "body_subtreemass", "body_invweight0")
 _DOFS = ("dof_invweight0", "dof_M0")
 FIELDS = ("geom_dataid", *_GEOMS, *_OF_C, *_BODIES, *_DOFS)
@@ -28,12 +28,12 @@ class Banks(Part):
     """The banks of a scene's objects.
 
     Args:
-        model: the compiled scene; its bounds are widened, so that every shape is inside.
+        model: the compiled scene; its bounds are widened to contain every shape.
         objects: configs of the scene's objects.
         drawn: makes the scene's model for pictures.
 
     Attributes:
-        counts: how many shapes each object with a bank may have.
+        counts: number of shapes of each object with a bank.
     """
 
     def __init__(self, model: mujoco.MjModel, objects: Mapping[str, Any], drawn: Callable[[], mujoco.MjModel] | None = None):
@@ -69,7 +69,7 @@ class Banks(Part):
         return {SHAPE: start.shape} if self.counts else {}
 
     def scenery(self, sim: Sim, carry: Carry, look: Fields) -> dict[str, Fields]:
-        """Returns colours of the drawn geoms by which all but the episode's shapes cannot be seen."""
+        """Returns colours of the drawn geoms that hide all but the episode's shapes."""
         if SHAPE not in carry.memory or not self._drawn:
             return {}
         model = self._drawn()
@@ -116,7 +116,7 @@ def _table(
 
 
 def _alone(model: mujoco.MjModel, name: str, solid: Solid, mass: float) -> mujoco.MjModel:
-    """A model of one shape, as the compiler would have it in the scene."""
+    """A model of one shape alone, compiled as in the scene."""
     spec = mujoco.MjSpec()
     spec.option.timestep = model.opt.timestep
     body = spec.worldbody.add_body(name=name)

@@ -1,7 +1,7 @@
-"""Objects of meshes in a MuJoCo scene: a body whose convex parts touch, and a mesh with its texture that is drawn.
+"""Mesh objects in a MuJoCo scene: a body with convex parts for contacts, and a textured mesh for drawing.
 
-Where an object may have one of several shapes, its body has as many parts as the richest of them, and the fields of the model
-that make the difference are looked up: see ``bank``.
+If an object may have one of several shapes, its body has as many parts as the shape with the most. ``bank`` looks up the fields
+of the model that tell the shapes apart.
 """
 
 from typing import Any
@@ -27,13 +27,13 @@ def add(
 ) -> None:
     """Fills a body with the first of its shapes, and adds the meshes of all.
 
-    The hull meets the table, which is flat and knows no difference; the parts meet everything else.
+    The hull meets the table, which is flat, so that the parts would make no difference. The parts meet everything else.
 
     Args:
-        body: of the spec, with a joint.
-        mass: of each shape [kg].
-        table, others: fields of the geoms that touch the table, and that touch all others.
-        visuals: add what is drawn.
+        body: body of the spec, with a joint.
+        mass: mass of each shape [kg].
+        table, others: fields of the geom that meets the table, and of those that meet everything else.
+        visuals: also add what is only drawn.
     """
     for k, solid in enumerate(solids):
         for mesh_name, points in meshes(name, k, solid):
@@ -42,7 +42,7 @@ def add(
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     weigh(body, solids[0], mass[0])
     for i, geom in enumerate(names(name, solids)):
-        # A part that the first shape lacks is a second copy of one that it has, until ``bank`` takes it away.
+        # A part that the first shape lacks starts as a copy of its first part, until ``bank`` takes it away.
         mesh_name = geom.replace(name, f"{name}/0", 1) if i <= len(solids[0].sizes) else f"{name}/0/0"
         body.add_geom(name=geom, type=_MESH, meshname=mesh_name, group=3, **(others if i else table))
     if visuals:
@@ -51,12 +51,12 @@ def add(
 
 
 def meshes(name: str, shape: int, solid: Solid) -> list[tuple[str, np.ndarray]]:
-    """The meshes of a shape that touch, with their corners: the hull, then the parts."""
+    """The collision meshes of a shape, with their corners: the hull, then the parts."""
     return [(f"{name}/{shape}", solid.hull), *((f"{name}/{shape}/{i}", part) for i, part in enumerate(solid.parts))]
 
 
 def names(name: str, solids: list[Solid]) -> list[str]:
-    """The geoms that touch: the hull, which has the object's name, then as many parts as the richest shape has."""
+    """The collision geoms: the hull, which has the object's name, then as many parts as the shape with the most has."""
     return [name, *(f"{name}/{i}" for i in range(max(len(solid.sizes) for solid in solids)))]
 
 
@@ -68,12 +68,12 @@ def weigh(body: Any, solid: Solid, mass: float) -> None:
 
 
 def drawn_name(name: str, shape: int) -> str:
-    """The geom that draws a shape."""
+    """Name of the geom that draws a shape."""
     return f"{name}/drawn/{shape}"
 
 
 def draw(spec: mujoco.MjSpec, body: Any, name: str, shape: int, solid: Solid) -> None:
-    """Adds what is drawn of a shape to a body; of all but the first shape it is transparent at first."""
+    """Adds the drawn mesh of a shape to a body. All but the first shape start transparent."""
     mesh = spec.add_mesh(name=drawn_name(name, shape))
     mesh.uservert, mesh.userface = solid.vertices.ravel().tolist(), solid.faces.ravel().tolist()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL

@@ -29,17 +29,17 @@ class ObjectCfg:
             cylinder and everything else as the capsule inside it: a flat pad touches a cylinder's side at a single point that
             jumps about, and MJX-JAX finds no contact there.
         size: edges of a box; radius of a sphere; radius and length of a cylinder, or of a capsule without its ends [m].
-        mass: [kg]; a mesh has its ``density``.
+        mass: mass [kg]; that of a mesh follows from ``density``.
         friction: sliding [1], spinning and rolling [m].
-        condim: contact dimension: 3 slides, 4 also spins, 6 also rolls. The larger of two geoms holds.
+        condim: contact dimension: 3 slides, 4 also spins, 6 also rolls. Of two geoms, the larger one counts.
         pos: place before the reset events: x, y, and height above the table [m].
         quat: orientation there, wxyz.
         rgba: colour.
-        file: of a ``mesh``: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name.
-            It is cut into convex parts; its place is its centre of mass.
+        file: for a ``mesh``: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name.
+            The mesh is cut into convex parts; its origin is its centre of mass.
         bank: further files; in each episode the object has one of all these shapes (``sim.objects.bank``).
-        scale: of a mesh's lengths.
-        density: of a mesh [kg/m3], from which its mass follows; 0: what its ``object.yaml`` says, or else 500.
+        scale: factor of a mesh's lengths.
+        density: density of a mesh [kg/m3], which gives its mass; 0: that of its ``object.yaml``, or else 500.
     """
 
     shape: str = "box"

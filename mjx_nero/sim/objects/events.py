@@ -1,4 +1,4 @@
-"""Reset events of objects of meshes: (key, start, *, params) -> start, as in ``mdp.events``."""
+"""Reset events for mesh objects: (key, start, *, params) -> start, as in ``mdp.events``."""
 
 import dataclasses
 import functools
@@ -23,13 +23,13 @@ def at_rest(
     object: str = "cube",
     bank: tuple[str, ...] = (),
 ) -> Start:
-    """Gives the object one of its shapes, lays it in one of the ways in which that rests, and turns it about the vertical.
+    """Gives the object one of its shapes, lays it in one of that shape's resting poses, and turns it about the vertical.
 
-    All shapes are equally likely. Ways of resting are as likely as a throw ends in them.
+    All shapes are equally likely. A resting pose is as likely as a throw is to end in it.
 
     Args:
-        files: of the shapes that it may have, all or some of its own.
-        scale: of the meshes.
+        files: files of the shapes that it may have, all or some of its own.
+        scale: factor of the meshes' lengths.
         yaw: range of the turn [rad].
         bank: all its shapes in the scene's order, its ``file`` and its ``bank``; empty: ``files``. Environments fill it in.
     """
@@ -51,7 +51,7 @@ def at_rest(
 
 @functools.lru_cache(maxsize=32)
 def _rests(files: tuple[str, ...], scale: float) -> tuple[np.ndarray, ...]:
-    """Orientations [shapes, rests, 4], heights of the centre and probabilities [shapes, rests]; padded with ones of no chance."""
+    """Orientations [shapes, rests, 4], heights of the centre and probabilities [shapes, rests], padded with probability 0."""
     solids = [store.find(file).scaled(scale) for file in files]
     most = max(len(solid.rest_share) for solid in solids)
     quats, heights, shares = np.zeros((len(solids), most, 4)), np.zeros((len(solids), most)), np.zeros((len(solids), most))

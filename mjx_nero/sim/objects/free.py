@@ -1,4 +1,4 @@
-"""Free objects of a scene: their bodies in the model, and what one world knows of them."""
+"""Free objects of a scene: their bodies in the model, and their state in one world."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -16,7 +16,8 @@ from mjx_nero.sim.objects.cfg import SHAPES, ObjectCfg, as_geom, side
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.types import LOOK, SHAPE, TARGET, Appearance, Carry, ObjectView, ShapeView, Sim, Start, UserError, View
 
-# Contact bits: the table meets bit 1, objects bit 2; robot geoms have no type, so never meet one another. Objects meet by bit 4.
+# Contact bits: objects meet the table by bit 1, robots by bit 2, and one another by bit 4. Robot geoms have no type, so they
+# never meet one another.
 TABLE, _OBJECT, _OBJECTS = 1, 2, 4
 _APPEARANCE = ("geom_size", "geom_rgba")  # as ``types.Appearance`` has them
 COMMANDED = (0.2, 0.8, 0.3, 1.0)  # colour of the goal, and of the object that belongs there where there are several
@@ -26,7 +27,7 @@ def add(spec: mujoco.MjSpec, objects: Mapping[str, ObjectCfg], visuals: bool) ->
     """Adds objects to a scene. Body, joint and geom carry an object's name.
 
     Args:
-        visuals: add what is only drawn, too.
+        visuals: also add what is only drawn.
 
     Raises:
         UserError: a shape, size or name is not possible.
@@ -78,7 +79,7 @@ def _add_body(spec: mujoco.MjSpec, name: str, item: ObjectCfg):
     if item.condim not in (1, 3, 4, 6):
         raise UserError(f"scene.objects.{name}.condim must be 1, 3, 4 or 6, got {item.condim}")
     if name == "goal" or spec.body(name) or spec.joint(name) or spec.geom(name):
-        raise UserError(f"scene.objects.{name} needs another name: the robot or the scene has one that is called so")
+        raise UserError(f"scene.objects.{name} needs another name: the robot or the scene already uses it")
     x, y, above = item.pos
     body = spec.worldbody.add_body(name=name, pos=[x, y, item.rest_height + above], quat=item.quat)
     body.add_freejoint(name=name)
@@ -100,7 +101,7 @@ class Objects(Part):
     Args:
         model: the compiled scene.
         objects: their configs by name.
-        targets: those of which an episode commands one.
+        targets: objects of which an episode commands one.
         drawn: makes the scene's model for pictures.
         varied: names of the model's fields that randomization draws.
     """
@@ -156,7 +157,7 @@ class Objects(Part):
         return {TARGET: start.target} if self._targets else {}
 
     def view(self, sim: Sim, carry: Carry) -> dict[str, Any]:
-        """Returns the objects, the commanded one also as ``TARGET``, and which that is."""
+        """Returns the objects, the commanded one also as ``TARGET``, and its index."""
         seen = {}
         for name, at in self._at.items():
             pose, speed = sim.qpos[at:][:7], sim.qvel[self._dofs[name] :][:6]

@@ -1,4 +1,4 @@
-"""Triangles and the first texture of a binary glTF file (GLB, version 2): only what it carries itself.
+"""Triangles and the first texture of a binary glTF file (GLB, version 2). References to other files are refused.
 
 Source of the format: the Khronos Group's glTF 2.0 specification.
 """
@@ -25,10 +25,10 @@ def parse(content: bytes, most: int) -> Parsed:
     """Reads vertices [n, 3] (z up), faces [m, 3], places in the texture [n, 2], the texture's bytes, and the colour.
 
     Args:
-        most: how many triangles are read.
+        most: most triangles to read.
 
     Raises:
-        ValueError: the file is damaged, too large, or needs something that is not read.
+        ValueError: the file is damaged or too large, or needs an unsupported feature.
     """
     try:
         head, data = _chunks(content)
@@ -40,7 +40,7 @@ def parse(content: bytes, most: int) -> Parsed:
 def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     magic, version, length = content[:4], int.from_bytes(content[4:8], "little"), int.from_bytes(content[8:12], "little")
     if magic != b"glTF" or version != 2 or length != len(content):
-        raise ValueError("no glTF 2 file of the length that it states")
+        raise ValueError("not a glTF 2 file of the stated length")
     at: int = 12
     found: dict[int, tuple[int, int]] = {}
     while at + 8 <= length:
@@ -51,11 +51,11 @@ def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
         at += 8 + size
     start, size = found.get(_JSON, (0, 0))
     if not 0 < size <= MAX_JSON:
-        raise ValueError(f"its description has {size:,} bytes: up to {MAX_JSON:,} are read")
+        raise ValueError(f"its description has {size:,} bytes: at most {MAX_JSON:,} are read")
     head = files.parse_json(content[start : start + size].rstrip(b" \0"))
     start, size = found.get(_BIN, (0, 0))
     if not isinstance(head, dict):
-        raise ValueError("its description is no object")
+        raise ValueError("its description is not a JSON object")
     return head, content[start : start + size]
 
 
@@ -102,16 +102,16 @@ class _Reader:
             points = self._array(part["attributes"]["POSITION"], 3)
             corners = self._array(part["indices"], 1)[:, 0] if "indices" in part else np.arange(len(points))
             if len(corners) % 3:
-                raise ValueError("indices that do not make up triangles")
+                raise ValueError("its indices do not make up triangles")
             self._left -= len(corners) // 3
             if self._left < 0:
-                raise ValueError("more triangles than are read")
+                raise ValueError("it has too many triangles")
             uv = self._array(part["attributes"]["TEXCOORD_0"], 2) if "TEXCOORD_0" in part["attributes"] else np.zeros((0, 2))
             self._look(part)
             flip = np.linalg.det(pose[:3, :3]) < 0
             faces = corners.reshape(-1, 3).astype(np.int64)[:, :: -1 if flip else 1]
             if len(faces) and faces.max() >= len(points):
-                raise ValueError("a triangle of vertices that it does not have")
+                raise ValueError("a triangle with vertices that it does not have")
             yield points @ pose[:3, :3].T + pose[:3, 3], faces, np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1) if len(uv) else uv
 
     def _look(self, part: dict[str, Any]) -> None:
@@ -128,7 +128,7 @@ class _Reader:
             texture = self._head["textures"][_natural(look["baseColorTexture"]["index"])]
             image = self._head["images"][_natural(texture["source"])]
             if "uri" in image:
-                raise ValueError("its texture lies in another file: pack it in")
+                raise ValueError("its texture lies in another file: embed it")
             self._picture = self._view(image["bufferView"])[0]
 
     def _view(self, index: int) -> tuple[bytes, int]:
@@ -136,34 +136,34 @@ class _Reader:
         view = self._head["bufferViews"][_natural(index)]
         buffer = self._head["buffers"][_natural(view["buffer"])]
         if "uri" in buffer or view["buffer"] != 0:
-            raise ValueError("its numbers lie in another file: pack them in")
+            raise ValueError("its data lies in another file: embed it")
         start, size = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
         if start + size > len(self._data):
-            raise ValueError("numbers beyond its end")
+            raise ValueError("data beyond its end")
         return self._data[start : start + size], _natural(view.get("byteStride", 0))
 
     def _array(self, index: int, width: int) -> np.ndarray:
         """The numbers of an accessor, [n, width]."""
         found = self._head["accessors"][_natural(index)]
         if "sparse" in found or "bufferView" not in found:
-            raise ValueError("numbers that it does not spell out")
+            raise ValueError("its data is sparse or missing")
         kind, count = np.dtype(_NUMBERS[found["componentType"]]), _natural(found["count"])
         if _WIDTH[found["type"]] != width or (width > 1 and kind.kind != "f") or (width == 1 and kind.kind != "u"):
-            raise ValueError("numbers of a kind that is not read")
+            raise ValueError("data of an unsupported type")
         content, stride = self._view(found["bufferView"])
         start, each = _natural(found.get("byteOffset", 0)), width * kind.itemsize
         stride = stride or each
-        self._numbers -= count * width  # the same ones may be placed again and again
+        self._numbers -= count * width  # a file may place the same data again and again
         if self._numbers < 0:
-            raise ValueError("more numbers than are read")
+            raise ValueError("too much data")
         if stride < each or (count and start + stride * (count - 1) + each > len(content)):
-            raise ValueError("numbers beyond the end of their part")
+            raise ValueError("data beyond the end of its buffer view")
         return np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
 
 
 def _natural(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"{str(value)[:40]} where a whole number from 0 belongs")
+        raise ValueError(f"{str(value)[:40]} in place of an integer from 0")
     return value
 
 

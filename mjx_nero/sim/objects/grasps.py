@@ -1,8 +1,8 @@
-"""Finds grasps: places at which a hand of two pads can hold a thing that lies on a table, from straight above.
+"""Finds grasps: places where a hand with two pads can hold a thing that lies on a table, from straight above.
 
 A grasp is a level line through the thing: the pads close along it from both sides. Lines in many directions, at many places and
-heights are tried. One is good if the surface stands across it at both ends, if there is room for the open fingers beside the
-thing and above the table, and if the pads lie flat on it, near the centre of mass.
+heights are tried. One is good if the surface is nearly perpendicular to it at both ends, if there is room for the open fingers
+beside the thing and above the table, and if the pads lie flat on it, near the centre of mass.
 """
 
 import dataclasses
@@ -15,21 +15,21 @@ from jaxtyping import Float
 from mjx_nero.sim.objects import rests
 from mjx_nero.sim.objects.solid import Solid
 
-MOST = 8  # grasps of each way of resting
+MOST = 8  # grasps per resting pose
 TURNS = 12  # directions in half a turn
-STEP = 0.005  # [m] between lines side by side
+STEP = 0.005  # [m] distance between parallel lines
 LEVELS = 4  # heights
-CELL = 0.002  # [m] of the map of heights
-ROOM = (0.012, 0.006)  # [m] beside the thing, on each side, for the open hand: as much as there is
+CELL = 0.002  # [m] cell of the map of heights
+ROOM = (0.012, 0.006)  # [m] room for the open hand on each side of the thing: the first that fits
 CLEAR = 0.0015  # [m] between a finger and what it must not touch
 STEEP = np.cos(np.radians(35.0))  # least cosine between a line and the surface's normal
-FINEST = 40  # candidates that are looked at closely
-APART = (0.01, np.radians(25.0))  # grasps that differ by less are alike
+FINEST = 40  # candidates to examine closely
+APART = (0.01, np.radians(25.0))  # [m, rad] grasps that differ by less count as the same
 
 
 @dataclasses.dataclass(frozen=True)
 class Hand:
-    """A hand of two pads.
+    """A hand with two pads.
 
     Attributes:
         opening: greatest distance between the pads [m].
@@ -48,13 +48,13 @@ class Hand:
 
 @dataclasses.dataclass(frozen=True)
 class Grasps:
-    """Grasps of a thing in one way of resting, the best first, in its own frame.
+    """Grasps of a thing in one resting pose, the best first, in the thing's own frame.
 
     Attributes:
-        middle: of the pads [m].
+        middle: middle of the pads [m].
         across: the direction in which the fingers close.
-        gap: between the pads when they come down [m].
-        cost: the lower the better.
+        gap: distance between the pads when they come down [m].
+        cost: lower is better.
     """
 
     middle: Float[np.ndarray, "n 3"]
@@ -72,7 +72,7 @@ def _sides(points: bytes) -> Float[np.ndarray, "m 4"]:
 
 
 def find(solid: Solid, quat: Float[np.ndarray, "4"], hand: Hand) -> Grasps:
-    """Looks for grasps of a thing that rests in the orientation ``quat``; there may be none."""
+    """Searches for grasps of a thing that rests in the orientation ``quat``; there may be none."""
     up = rests.up(quat)
     aside = np.linalg.svd(up[None])[2][1]
     turn = np.stack([aside, np.cross(up, aside), up])  # rows: the world's axes in the thing's frame
@@ -95,7 +95,7 @@ def find(solid: Solid, quat: Float[np.ndarray, "4"], hand: Hand) -> Grasps:
 
 
 class _Heights:
-    """Height of a thing above the table at each place; 0 where it is not."""
+    """Height of a thing above the table at each place; 0 beside the thing."""
 
     def __init__(self, parts: list[np.ndarray], corners: np.ndarray, margin: float):
         self._low = corners[:, :2].min(0) - margin
@@ -113,7 +113,7 @@ class _Heights:
 
 
 def _cut(sides: np.ndarray, starts: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cuts lines with a convex part: where they enter and leave, and how much of the normal lies along each there, all [n]."""
+    """Intersects lines with a convex part: where they enter and leave, and the cosine to the surface's normal there, all [n]."""
     slope, off = sides[:, :3] @ way, starts @ sides[:, :3].T + sides[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = -off / slope
@@ -130,7 +130,7 @@ def _along(angle: float, parts: list[np.ndarray], corners: np.ndarray, hand: Han
     way, side = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
     reach, top = corners @ side, corners[:, 2].max()
     offsets = np.arange(reach.min() + STEP / 2, reach.max(), STEP)
-    low = max(0.004, hand.lowest - hand.pad[0] / 2 + 0.002)  # pads that hold above the line, of low things
+    low = max(0.004, hand.lowest - hand.pad[0] / 2 + 0.002)  # the pads' middle is above the lines of low things
     levels = np.unique(np.round([*np.linspace(low, max(low, top - 0.003), LEVELS), max(low, top - 0.3 * hand.pad[0])], 4))
     starts = np.array([u * side + [0, 0, z] for u in offsets for z in levels])
     cuts = [_cut(sides, starts, way) for sides in parts]
@@ -158,7 +158,7 @@ def _runs(cuts: list[list[float]]) -> list[tuple[float, float, float]]:
 
 
 def _opened(each: tuple, field: _Heights, hand: Hand) -> tuple | None:
-    """The same grasp with a gap from which the fingers can come down and close; None: something is in their way."""
+    """The same grasp, with a gap from which the fingers can come down and close; None: something is in their way."""
     cost, middle, angle, _, width = each
     for room in ROOM:
         gap = width + 2 * room
@@ -180,7 +180,7 @@ def _fits(middle, way, width: float, gap: float, field: _Heights, hand: Hand) ->
 
 
 def _fine(each: tuple, parts: list[np.ndarray], hand: Hand) -> tuple:
-    """The same grasp, dearer by as much of the pads as does not lie on the thing."""
+    """The same grasp, with a cost for the share of the pads that does not lie on the thing."""
     cost, middle, angle, gap, width = each
     way, side = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
     offsets = [(u, z) for u in (-0.3, 0.0, 0.3) for z in (-0.3, 0.0, 0.3)]
@@ -200,7 +200,7 @@ def _fine(each: tuple, parts: list[np.ndarray], hand: Hand) -> tuple:
 def _unlike(
     sorted_ones: list[tuple], most: int, share: float, test: Callable[[tuple], tuple | None] = lambda x: x
 ) -> list[tuple]:
-    """The first ones of a list that pass the test and differ from all before them."""
+    """The first entries of a list that pass the test and differ from all earlier ones."""
     out: list[tuple] = []
     for each in sorted_ones:
         if len(out) == most:

@@ -1,4 +1,4 @@
-"""Grasps of things by a hand, as padded tables; they take seconds to find, and are kept in the user's cache."""
+"""Grasps of things by a hand, as padded tables. They take seconds to find, so they are kept in the user's cache."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.types import UserError
 
-NONE = 1e3  # cost of a grasp that is not there
+NONE = 1e3  # cost of an entry that only pads the table
 _VERSION = 1
 _MAX_KEPT = 1_000_000  # bytes
 Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -24,10 +24,10 @@ Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 @functools.lru_cache(maxsize=16)
 def table(names: tuple[str, ...], scale: float, hand: Hand) -> Table:
-    """Directions of up [things, rests, 3]; of each rest the ``Grasps``: middle, across [.., grasps, 3], gap, cost [.., grasps].
+    """Directions of up [things, rests, 3]; for each rest its ``Grasps``: middle, across [.., grasps, 3], gap, cost [.., grasps].
 
     Raises:
-        UserError: a thing cannot be grasped in any of the ways in which it rests.
+        UserError: a thing cannot be grasped in any of its resting poses.
     """
     found = []
     for name in names:
@@ -49,7 +49,7 @@ def table(names: tuple[str, ...], scale: float, hand: Hand) -> Table:
 
 
 def _kept(solid: Solid, hand: Hand) -> list[grasps.Grasps]:
-    """The grasps of each way of resting: those that are kept, or new ones."""
+    """The grasps of each resting pose: cached, or new ones."""
     said = hashlib.sha256(repr((_VERSION, grasps.MOST, dataclasses.astuple(hand))).encode())
     for array in (solid.points, solid.sizes, solid.rest_quat):
         said.update(np.ascontiguousarray(array).tobytes())

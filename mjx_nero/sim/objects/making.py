@@ -15,9 +15,9 @@ from mjx_nero.sim.objects.solid import DENSITY, MAX_CORNERS, MAX_PARTS, Solid
 from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles
-COARSE = 2_500  # triangles of what is cut into pieces
+COARSE = 2_500  # triangles of a mesh to cut into pieces
 SECONDS = 12  # of CPU, for the cutting
-MAX_LOOSE = 300  # pieces that do not hang together
+MAX_LOOSE = 300  # disconnected pieces
 FLAT = 1e-4  # least thickness, as a share of the length
 
 
@@ -25,10 +25,10 @@ def make(raw: Raw, parts: list[np.ndarray] | None, density: float = DENSITY) -> 
     """Makes a solid of a mesh.
 
     Args:
-        parts: its convex parts, if somebody has cut it already.
+        parts: its convex parts, if it is cut already.
 
     Raises:
-        UserError: it encloses nothing, is too flat, cannot be cut, or the library that cuts is not installed.
+        UserError: the mesh encloses nothing, is too flat, or cannot be cut, or the library that cuts is not installed.
     """
     mesh, drawn, note = _cleaned(raw)
     hulls = [_hull(part) for part in (parts if parts is not None else _parts(mesh))]
@@ -58,7 +58,7 @@ def make(raw: Raw, parts: list[np.ndarray] | None, density: float = DENSITY) -> 
 
 
 def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
-    """Returns what is weighed and cut, what is drawn, and what was lost."""
+    """Returns the mesh to weigh and cut, the mesh to draw, and a note of what was lost."""
     size = float(np.ptp(raw.vertices[np.unique(raw.faces)], axis=0).max())
     if not size > 0:
         raise UserError("has no size")
@@ -69,10 +69,10 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
         note = f"{len(raw.faces):,} triangles are drawn as {len(drawn.faces):,}" + (", without texture" if len(raw.uv) else "")
     drawn.metadata["uv"] = bool(len(raw.uv)) and not note
     mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
-    if not mesh.is_watertight:  # merging those that are all but the same opens what is closed
+    if not mesh.is_watertight:  # in a closed mesh, merging nearly equal vertices would open it
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     a, b, c = mesh.faces.T
-    mesh.update_faces((a != b) & (b != c) & (c != a))  # but thin ones stay: without them a closed surface has slits
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # thin triangles stay: without them a closed surface has slits
     mesh.update_faces(mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) < 4:
@@ -96,7 +96,7 @@ def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
 
 
 def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
-    """Cuts a mesh into convex parts; one that is convex already is its own.
+    """Cuts a mesh into convex parts. A convex mesh is its own only part.
 
     Raises:
         UserError: the library is not installed, or fails.
@@ -106,7 +106,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
         return [np.asarray(hull.vertices)]
     pieces_of_it = int(trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices)).max()) + 1
     if pieces_of_it > MAX_LOOSE:
-        raise UserError(f"is {pieces_of_it:,} pieces that do not hang together: no solid; more than {MAX_LOOSE} are not cut")
+        raise UserError(f"is {pieces_of_it:,} disconnected pieces, not a solid: at most {MAX_LOOSE} are cut")
     if importlib.util.find_spec("coacd") is None:
         raise UserError(
             "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install -e '.[meshes]')"
@@ -127,7 +127,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
 
 
 def _hull(points: np.ndarray) -> trimesh.Trimesh:
-    """The convex hull, of ``MAX_CORNERS`` corners at most.
+    """The convex hull, with at most ``MAX_CORNERS`` corners.
 
     Raises:
         UserError: the points lie in a plane.
@@ -135,7 +135,7 @@ def _hull(points: np.ndarray) -> trimesh.Trimesh:
     size = float(np.ptp(points, axis=0).max()) or 1.0
     try:
         hull = trimesh.PointCloud(points).convex_hull
-        if len(hull.vertices) > MAX_CORNERS:  # those that stick out farthest in evenly spread directions
+        if len(hull.vertices) > MAX_CORNERS:  # keep the farthest in evenly spread directions
             directions = trimesh.creation.icosphere(2).vertices
             chosen = np.unique(np.argmax(hull.vertices @ directions.T, axis=0))
             if len(chosen) > MAX_CORNERS:
@@ -149,7 +149,7 @@ def _hull(points: np.ndarray) -> trimesh.Trimesh:
 
 
 def _weighed(mesh: trimesh.Trimesh | None, hulls: list[trimesh.Trimesh]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume, centre of mass and inertia about it at density 1: the closed mesh's, or that of the parts together."""
+    """Volume, centre of mass and inertia about it at density 1: of the closed mesh, or else of all parts together."""
     each = [mesh] if mesh is not None and mesh.volume > 0 else hulls
     volumes = np.array([part.volume for part in each])
     centers = np.array([part.center_mass for part in each])
@@ -171,7 +171,7 @@ def _colour(raw: Raw) -> tuple[float, float, float, float]:
 
 
 def cut(path: pathlib.Path, raw: Raw) -> list[np.ndarray]:
-    """The convex parts that a file of them holds: its pieces that hang together.
+    """The convex parts in a file of parts: its connected pieces.
 
     Raises:
         UserError: there are none, or more than ``MAX_PARTS``.

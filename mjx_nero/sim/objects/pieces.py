@@ -1,6 +1,6 @@
 """Cuts a mesh into convex pieces, in a process of its own: pieces.py < mesh > pieces.
 
-The library is C++ that may take hours over a mesh, or end the process; neither must happen to whoever asked. Imports nothing of
+The library is written in C++ and may take hours over a mesh or crash, so it gets its own process. This file imports nothing of
 the package, so that it starts at once.
 """
 
@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-THRESHOLD = 0.04  # concavity that is left, as a share of the mesh's size
+THRESHOLD = 0.04  # remaining concavity, as a share of the mesh's size
 MAX_MEMORY = 1_500_000_000  # bytes beyond what the libraries take to load
 
 
@@ -18,8 +18,8 @@ def main(most: int, corners: int, seconds: int, closed: bool) -> None:
     """Reads ``vertices`` and ``faces`` (npz), writes ``points`` and ``sizes`` of the pieces.
 
     Args:
-        most, corners: how many pieces, and corners of each, there may be.
-        seconds: of the processor's time.
+        most, corners: greatest number of pieces, and of corners of each.
+        seconds: CPU time.
         closed: the surface has no holes.
     """
     import coacd

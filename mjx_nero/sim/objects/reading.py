@@ -1,6 +1,6 @@
-"""Meshes of objects: OBJ, STL and GLB files, read with limits, for a stranger may have made them. Returned as plain arrays.
+"""Reads meshes of objects as plain arrays, from OBJ, STL and GLB files. The files may be untrusted, so there are limits.
 
-The readers are our own, since general ones follow references, unpack what is packed, and believe the counts that a file states.
+The package has its own readers: general ones follow references, unpack archives, and trust the counts that a file states.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ MAX_MTL = 1_000_000  # bytes of a file of materials
 MAX_PICTURE = 40_000_000  # bytes
 MAX_PIXELS = 8192  # along an edge of a picture
 PIXELS = 1024  # along an edge, as drawn
-_FAR = 1e6  # a coordinate is less
+_FAR = 1e6  # bound of a coordinate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ def read(path: pathlib.Path, content: bytes) -> Raw:
     """Reads a mesh.
 
     Args:
-        path: where it lies; its materials must lie in the same folder.
+        path: its path; its materials must lie in the same folder.
         content: its bytes.
 
     Raises:
@@ -56,7 +56,7 @@ def read(path: pathlib.Path, content: bytes) -> Raw:
     """
     kind = path.suffix.lower()
     if kind not in KINDS:
-        raise UserError(f"{path} is no mesh that is read: give one of {', '.join(KINDS)}")
+        raise UserError(f"{path} is not a supported mesh: give one of {', '.join(KINDS)}")
     try:
         vertices, faces, uv, picture, rgba = {".obj": _obj, ".stl": _stl, ".glb": _glb}[kind](path, content)
     except ValueError as error:
@@ -68,11 +68,11 @@ def _checked(path, vertices, faces, uv, picture, rgba) -> Raw:
     if not len(faces) or not len(vertices):
         raise UserError(f"{path} holds no triangles")
     if len(faces) > MAX_TRIANGLES:
-        raise UserError(f"{path} has {len(faces):,} triangles: more than {MAX_TRIANGLES:,} are not read")
+        raise UserError(f"{path} has {len(faces):,} triangles: at most {MAX_TRIANGLES:,} are read")
     if not (np.abs(vertices) < _FAR).all():
         raise UserError(f"{path} has a coordinate that is not finite or not below {_FAR:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise UserError(f"{path} has a triangle of vertices that it does not have")
+        raise UserError(f"{path} has a triangle with vertices that it does not have")
     texture = np.zeros((0, 0, 3), np.uint8) if picture is None else _picture(path, picture)
     if not texture.size or len(uv) != len(vertices) or not np.isfinite(uv).all():
         uv = np.zeros((0, 2))
@@ -86,7 +86,7 @@ def _stl(path, content: bytes):
         corners = rows["v"].reshape(-1, 3)
     else:
         if not content.lstrip()[:5].lower() == b"solid":
-            raise ValueError("neither a binary file of the length that it states nor text")
+            raise ValueError("neither a binary file of the stated length nor text")
         corners = _numbers(re.findall(rb"^\s*vertex\s+([^\r\n]*)", content, re.MULTILINE), "vertex")
     if len(corners) % 3:
         raise ValueError("its vertices do not make up triangles")
@@ -115,12 +115,12 @@ def _obj(path: pathlib.Path, content: bytes):
     seams = _indices([word.split(b"/")[1] for word in corners], len(textured))
     pairs, each = np.unique(np.stack([at, seams], axis=1), axis=0, return_inverse=True)
     if pairs.min() < 0 or pairs[:, 0].max() >= len(places) or pairs[:, 1].max() >= len(textured):
-        raise ValueError("a face of vertices that it does not have")
+        raise ValueError("a face with vertices that it does not have")
     return places[pairs[:, 0]], each.reshape(-1)[fan], textured[pairs[:, 1]], picture, rgba
 
 
 def _fan(sizes: np.ndarray) -> np.ndarray:
-    """Corners of triangles [n, 3] that fill polygons with so many corners, counted through all polygons."""
+    """Corners of triangles [n, 3] that fill polygons of ``sizes`` corners, numbered through all polygons."""
     first = np.cumsum(sizes) - sizes
     if (sizes == 3).all():
         return first[:, None] + np.arange(3)
@@ -138,13 +138,13 @@ def _indices(words: list[bytes], count: int) -> np.ndarray:
 
 
 def _numbers(lines: list[bytes], what: str, least: int = 3) -> np.ndarray:
-    """The first ``least`` numbers of each line, [n, least]; all lines have as many."""
+    """The first ``least`` numbers of each line, [n, least]. All lines must have equally many."""
     if not lines:
         return np.zeros((0, least))
     words = b" ".join(lines).split()
     width, rest = divmod(len(words), len(lines))
     if len(words) > MAX_NUMBERS or rest or width < least:
-        raise ValueError(f"its {what} lines are not all {least} numbers or more, and as many in each")
+        raise ValueError(f"its {what} lines do not all have the same number of values, {least} or more")
     if max(map(len, words)) > 40:
         raise ValueError(f"a number of more than 40 characters in a {what} line")
     return np.array(words).astype(float).reshape(-1, width)[:, :least]
@@ -176,7 +176,7 @@ def _beside(path: pathlib.Path, name: bytes) -> pathlib.Path:
         inner = pathlib.PurePosixPath(word)
         real = path.parent.joinpath(inner).resolve()
     except (OSError, RuntimeError, ValueError):
-        raise UserError(f"{path} names a file that cannot be: correct its mtllib and map_Kd lines") from None
+        raise UserError(f"{path} names an impossible file: correct its mtllib and map_Kd lines") from None
     outside = "\\" in word or inner.is_absolute() or ".." in inner.parts or not real.is_relative_to(path.parent.resolve())
     if outside or not word.isprintable() or len(word) > 200:
         raise UserError(f"{path} names {word[:80]!a}, which is not below its own folder: copy it there")
@@ -194,7 +194,7 @@ def _picture(path: pathlib.Path, content: bytes) -> np.ndarray:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture:
             if max(picture.size) > MAX_PIXELS or not min(picture.size):
                 raise UserError(
-                    f"the texture of {path} has {picture.size[0]} x {picture.size[1]} pixels: at most {MAX_PIXELS} an edge"
+                    f"the texture of {path} has {picture.size[0]} x {picture.size[1]} pixels: at most {MAX_PIXELS} per edge"
                 )
             picture.draft("RGB", (PIXELS, PIXELS))
             small = picture.convert("RGB")
@@ -203,4 +203,4 @@ def _picture(path: pathlib.Path, content: bytes) -> np.ndarray:
     except UserError:
         raise
     except Exception as error:  # decoders fail in their own ways
-        raise UserError(f"the texture of {path} is no PNG or JPEG: {' '.join(str(error).split())[:100]}") from None
+        raise UserError(f"the texture of {path} is not a valid PNG or JPEG: {' '.join(str(error).split())[:100]}") from None

@@ -1,4 +1,4 @@
-"""Finds the ways in which a thing rests on a table: by geometry, and then by the physics, which alone decides."""
+"""Finds the resting poses of a thing on a table: candidates by geometry, then the physics decides."""
 
 from typing import Any
 
@@ -8,22 +8,22 @@ from jaxtyping import Float
 
 from mjx_nero.sim import quats
 
-LEAST_SHARE = 0.02  # of the ways in which an object comes to rest
+LEAST_SHARE = 0.02  # least share of throws that end in a resting pose
 MAX_RESTS = 8
-ALIKE, MOST_ALIKE = 0.02, 2  # heights that differ by this share are alike; of as many alike ways of resting are kept
+ALIKE, MOST_ALIKE = 0.02, 2  # share by which the heights of alike poses may differ; how many alike poses are kept
 FIRM = 0.1  # [rad] an object rests where it returns from this tilt
-SETTLED = np.radians(4.0)  # a rest from which the physics turns it further is none
+SETTLED = np.radians(4.0)  # a pose that the physics turns by more than this is not a rest
 SECONDS = 1.0
 
 Points = Float[np.ndarray, "n 3"]
 
 
 def find(hull: Points, inertia: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "k 4"], Float[np.ndarray, " k"]]:
-    """Orientations (wxyz) in which a thing rests, and how often a throw ends in each; the kinds that are most frequent first.
+    """Orientations (wxyz) in which a thing rests, and the share of throws that end in each, the most frequent kinds first.
 
     Args:
         hull: corners about the centre of mass [m].
-        inertia: for each kilogramme [m2].
+        inertia: inertia per kilogram [m2].
     """
     import trimesh
 
@@ -49,16 +49,16 @@ def find(hull: Points, inertia: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndar
 
 
 def up(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3"]:
-    """The direction of up in the frame of a thing so turned (wxyz)."""
+    """The vertical, in the frame of a thing with this orientation (wxyz)."""
     return quats.matrix(quat)[2]
 
 
 def _settled(hull: Points, inertia: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, float]:
-    """The orientation after a second on a table, and by how much it was turned until then [rad]."""
+    """The orientation after a second on a table, and the angle by which it has turned [rad]."""
     size = float(np.ptp(hull, axis=0).max())
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.add_mesh(name="hull").uservert = (hull / size * 0.1).ravel().tolist()  # 10 cm, whatever its scale will be
+    spec.add_mesh(name="hull").uservert = (hull / size * 0.1).ravel().tolist()  # scaled to 10 cm
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     body = spec.worldbody.add_body(pos=[0, 0, float(_height(hull, up(quat)[None])[0]) / size * 0.1], quat=quat)
     body.add_freejoint()
@@ -79,7 +79,7 @@ def _height(points: Points, ups: np.ndarray) -> np.ndarray:
 
 
 def _firm(points: Points, up: np.ndarray) -> bool:
-    """True if tilting it by ``FIRM`` any way lifts its centre."""
+    """True if tilting the thing by ``FIRM`` in any direction lifts its centre."""
     aside = np.linalg.svd(up[None])[2][1:]
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ways = np.cos(angles)[:, None] * aside[0] + np.sin(angles)[:, None] * aside[1]
@@ -88,7 +88,7 @@ def _firm(points: Points, up: np.ndarray) -> bool:
 
 
 def _simple(hull: Points) -> Any:
-    """The hull of rounded corners: parts meet in corners that are the same but for the last digits."""
+    """The hull of rounded corners: parts share corners that differ only in the last digits."""
     import trimesh
 
     digits = max(0, 4 - int(np.floor(np.log10(float(np.ptp(hull, axis=0).max())))))

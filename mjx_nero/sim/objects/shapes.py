@@ -16,12 +16,12 @@ def points(solid: Solid) -> Float[np.ndarray, "26 3"]:
 
 
 def box(solid: Solid) -> Float[np.ndarray, "2 3"]:
-    """Middle and edges of the box around it, along its axes [m]."""
+    """Middle and edges of the solid's bounding box, along its axes [m]."""
     low, high = solid.points.min(0), solid.points.max(0)
     return np.stack([(low + high) / 2, high - low])
 
 
 def code(solid: Solid) -> Float[np.ndarray, "17"]:
-    """Returns how far it reaches in 14 directions, and its three radii of gyration, the least first [m]."""
+    """Returns the solid's reach in 14 directions, and its three radii of gyration, the least first [m]."""
     reach = (solid.hull @ DIRECTIONS[CODED].T).max(0)
     return np.concatenate([reach, np.sqrt(np.linalg.eigvalsh(solid.inertia) / solid.volume)])

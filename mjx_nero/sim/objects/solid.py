@@ -1,4 +1,4 @@
-"""An object of a mesh: its convex parts, mass properties and rests for the physics, and what is drawn of it."""
+"""A mesh object: its convex parts, mass properties and resting poses for the physics, and the mesh to draw."""
 
 import dataclasses
 
@@ -7,24 +7,24 @@ from jaxtyping import Float, Int, UInt8
 
 from mjx_nero.sim.objects import rests
 
-MAX_PARTS, MAX_CORNERS = 16, 48  # of an object; of a part
-DENSITY = 500.0  # [kg/m3] of a thing of which nobody knows it
+MAX_PARTS, MAX_CORNERS = 16, 48  # parts of an object; corners of a part
+DENSITY = 500.0  # [kg/m3] if none is given
 
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A solid of density 1, its origin at the centre of mass, its axes the file's.
+    """A solid of density 1, with its origin at the centre of mass and the file's axes.
 
     Attributes:
         points: corners of all convex parts, one part after another.
         sizes: how many corners each part has.
-        hull: corners of the convex hull of all.
-        volume, inertia: [m3], and about the centre of mass [m5].
+        hull: corners of the convex hull of all parts.
+        volume, inertia: volume [m3], and inertia about the centre of mass [m5].
         center: the centre of mass in the file's frame [m].
-        rest_quat, rest_share: orientations (wxyz) in which it rests on a table, and how often it falls so.
+        rest_quat, rest_share: orientations (wxyz) in which it rests on a table, and the share of throws that end in each.
         vertices, faces, uv, texture, rgba: what is drawn (``reading.Raw``).
-        density: [kg/m3].
-        note: what was lost on the way, for people.
+        density: density [kg/m3].
+        note: what was lost in the making, for the user.
     """
 
     points: Float[np.ndarray, "n 3"]

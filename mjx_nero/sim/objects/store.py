@@ -1,7 +1,7 @@
-"""Finds the solid of a mesh file, of a folder with ``object.yaml``, or of one of the package's objects; and keeps what cost time.
+"""Finds the solid of a mesh file, of a folder with ``object.yaml``, or of one of the package's objects, and caches it.
 
-A solid is kept beside its file, or in the user's cache where that folder cannot be written to. What is kept is found by what the
-files hold, and checked like any other file that a stranger may have made.
+A solid is cached beside its file, or in the user's cache if that folder is not writable. It is found again by the content of the
+files, and checked like any other untrusted file.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ ABOUT = "object.yaml"
 MAX_KEPT = 30_000_000  # bytes
 ENDING = ".solid"
 KINDS = (".obj", ".stl", ".glb")
-MAX_BYTES = 300_000_000  # of a mesh
+MAX_BYTES = 300_000_000  # of a mesh file
 GREY = (0.7, 0.7, 0.72, 1.0)
-_VERSION = 8  # of what is kept
+_VERSION = 8  # of the cached format
 _ARRAYS = {field.name for field in dataclasses.fields(Solid) if field.name not in ("volume", "rgba", "density", "note")}
 
 
@@ -41,9 +41,9 @@ class AboutCfg:
     """The fields of ``object.yaml``.
 
     Attributes:
-        mesh: file of what is drawn and weighed, in the same folder.
-        parts: file of its convex parts, in the same folder. Empty: it is cut.
-        density: [kg/m3].
+        mesh: file of the mesh to draw and weigh, in the same folder.
+        parts: file of its convex parts, in the same folder. Empty: the mesh is cut.
+        density: density [kg/m3].
         rgba: colour.
     """
 
@@ -55,7 +55,7 @@ class AboutCfg:
 
 @functools.lru_cache(maxsize=1)
 def names() -> tuple[str, ...]:
-    """The package's own objects."""
+    """Names of the package's own objects."""
     return tuple(sorted(path.parent.name for path in HOME.glob(f"*/{ABOUT}")))
 
 
@@ -102,7 +102,7 @@ def _found(path: pathlib.Path, *_changed: int) -> Solid:
     for place in places:
         if (kept := _kept(place, key.hexdigest())) is not None:
             return kept
-    from mjx_nero.sim.objects import making, reading  # with what configs and help do without
+    from mjx_nero.sim.objects import making, reading  # configs and help do not need them
 
     try:
         raw = reading.read(whole, content)
@@ -123,12 +123,12 @@ def _about(path: pathlib.Path) -> AboutCfg:
     about = values.read(AboutCfg, files.read_yaml(path), f"{path}")
     for name in filter(None, (about.mesh, about.parts)):
         if pathlib.PurePath(name).name != name or pathlib.PurePath(name).suffix.lower() not in KINDS:
-            raise UserError(f"{path}: {values.short(name)} is no {', '.join(KINDS)} file in its own folder: change it")
+            raise UserError(f"{path}: {values.short(name)} is not a {', '.join(KINDS)} file in its own folder: change it")
     return about
 
 
 def _places(path: pathlib.Path, key: str) -> list[pathlib.Path]:
-    """Lists the places where the solid may be kept: beside its file, else in the user's cache."""
+    """Lists the places where the solid may be cached: beside its file, else in the user's cache."""
     found = [path.with_name(path.name + ENDING)] if not path.is_relative_to(HOME) else []
     if kept := cache.folder():
         found.append(kept / "objects" / (key[:32] + ENDING))
@@ -136,7 +136,7 @@ def _places(path: pathlib.Path, key: str) -> list[pathlib.Path]:
 
 
 def _keep(places: list[pathlib.Path], made: Solid, key: str) -> None:
-    """Writes the solid to the first place that takes it; one that none takes is made again the next time."""
+    """Writes the solid to the first place that takes it. If none does, it is made again the next time."""
     plain = {"volume": made.volume, "rgba": made.rgba, "density": made.density, "note": made.note}
     arrays = {name: np.ascontiguousarray(getattr(made, name)) for name in _ARRAYS}
     content = tensors.save(arrays, {"key": key, "plain": json.dumps(plain)})
@@ -147,7 +147,7 @@ def _keep(places: list[pathlib.Path], made: Solid, key: str) -> None:
 
 
 def _kept(place: pathlib.Path, key: str) -> Solid | None:
-    """A solid that was kept for these files; None: there is none, it is another's, or damaged."""
+    """The solid that was cached for these files; None: there is none, it belongs to other files, or it is damaged."""
     if not os.path.lexists(place) or place.is_symlink():
         return None
     try:
@@ -166,7 +166,7 @@ def _kept(place: pathlib.Path, key: str) -> Solid | None:
 
 
 def _sound(found: Solid) -> bool:
-    """True if what was kept can be used: shapes, ranges and finite numbers."""
+    """True if a cached solid is usable: shapes, ranges and finite numbers."""
     n, rests = len(found.vertices), len(found.rest_quat)
     shapes = [found.points.shape[1:] == (3,), found.vertices.shape[1:] == (3,), found.faces.shape[1:] == (3,)]
     shapes += [found.inertia.shape == (3, 3), found.center.shape == (3,), found.rest_quat.shape == (rests, 4)]

@@ -26,7 +26,7 @@ class Footprint:
 
     Attributes:
         in_program: JAX's memory, in a compiled step.
-        outside: the backend's own memory, beside JAX's.
+        outside: the backend's own memory, besides JAX's.
         free: memory available for ``outside`` on each device.
     """
 

@@ -1,6 +1,6 @@
 """The motion of trees of joints, as two GPU kernels: before the contacts and after the constraints' forces.
 
-MuJoCo Warp goes through a tree level by level and quantity by quantity, in about ninety kernels a physics step, most of which
+MuJoCo Warp goes through a tree level by level and quantity by quantity, in about ninety kernels per physics step, most of which
 take microseconds for thousands of environments. Here a thread takes one environment from its positions to all that does not
 depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them MuJoCo
 Warp finds the contacts, and ``newton`` the forces.
@@ -16,7 +16,7 @@ import numpy as np
 
 from mjx_nero.sim.physics import kernels
 
-# What the sources read and write of MuJoCo Warp's model and data.
+# Fields of MuJoCo Warp's model and data that the sources read and write.
 _MODEL = "body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp jnt_pos jnt_axis jnt_stiffness"
 _MODEL += " jnt_stiffnesspoly jnt_actfrcrange qpos0 qpos_spring geom_pos geom_quat dof_armature dof_damping dof_dampingpoly"
 _MODEL += " actuator_gainprm actuator_biasprm actuator_gear actuator_forcerange actuator_ctrlrange"
@@ -35,7 +35,7 @@ _FORCES = (  # of mjtDisableBit
 
 
 def missing(m: mujoco.MjModel) -> list[str]:
-    """Names what a model has that these kernels do not know, so that MuJoCo Warp's own must step it."""
+    """Lists features of a model that these kernels do not support, so that MuJoCo Warp's own must step it."""
     linked = np.isin(m.eq_type, _LINKS)
     free = m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     driven = m.jnt_type[m.actuator_trnid[:, 0]]
@@ -64,11 +64,11 @@ def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[
     """Makes the parts of a step before the contacts and after the constraint forces.
 
     Args:
-        m: without anything that is ``missing``.
-        model, data: MuJoCo Warp's, of ``m``. The integrator reads ``data.efc.Ma`` and ``data.qacc``.
+        m: a model without ``missing`` features.
+        model, data: MuJoCo Warp's model and data of ``m``. The integrator reads ``data.efc.Ma`` and ``data.qacc``.
 
     Returns:
-        two functions without arguments.
+        Two functions without arguments.
     """
     import warp as wp
 

@@ -1,8 +1,8 @@
-"""A Python function as an operation of compiled CPU programs, under a name that lasts.
+"""A Python function as an operation of compiled CPU programs, with a stable name.
 
-JAX's own callbacks are known by an address, so JAX never keeps a program that has one between runs: compiling it again took most
-of a start on a CPU. This operation is XLA's foreign function interface, spoken through ctypes (``xla/ffi/api/c_api.h``, which
-jaxlib brings along); programs that have it are kept like all others.
+JAX knows its own callbacks by an address, so it never caches a program with a callback between runs; compiling such programs
+again took most of the start on a CPU. This operation uses XLA's foreign function interface through ctypes
+(``xla/ffi/api/c_api.h``, part of jaxlib). Programs with it are cached like all others.
 """
 
 import ctypes
@@ -26,10 +26,10 @@ def call(key: int, work: Work, result: jax.ShapeDtypeStruct, given: jax.Array) -
     """Calls ``work`` with one float32 array and gives one back; under ``jit`` and ``vmap``, on a CPU.
 
     Args:
-        key: names ``work`` in this process and in others. Functions with the same key have to do the same; the first one
+        key: identifies ``work``, in this process and in others. Functions with the same key have to do the same; the first one
             is called, and kept as long as the process lives.
-        work: called with Python's lock held. What it raises becomes an error of the program.
-        result: what comes back, with the same leading axes as ``given``.
+        work: called while Python's lock is held. An exception becomes an error of the program.
+        result: shape and type of the result, with the same leading axes as ``given``.
     """
     _register()
     _known.setdefault(key, work)
@@ -52,7 +52,7 @@ _Extension._fields_ = (
     ("size", ctypes.c_size_t),
     ("type", ctypes.c_int),
     ("next", ctypes.POINTER(_Extension)),
-    ("metadata", ctypes.POINTER(_Metadata)),  # of this type alone
+    ("metadata", ctypes.POINTER(_Metadata)),  # only in an extension of this type
 )
 
 
@@ -114,7 +114,7 @@ class _Frame(ctypes.Structure):
 
 @functools.cache
 def _register() -> Callable:
-    """Tells XLA of the operation, and keeps the function alive."""
+    """Registers the operation with XLA, and keeps the function alive."""
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))(_handle)
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(handler), platform="cpu")
     return handler
@@ -131,6 +131,6 @@ def _handle(pointer) -> int | None:
         key = frame.attributes.items[0].contents.value.contents.value
         _known[key](frame.args.items[0].contents.array(), frame.results.items[0].contents.array())
         return None
-    except BaseException as error:  # nothing may pass through XLA's frames
+    except BaseException as error:  # no exception may pass through XLA's frames
         message = f"{type(error).__name__}: {error}".encode()
         return frame.api.contents.error(_ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message, _INTERNAL))

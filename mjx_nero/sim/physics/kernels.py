@@ -10,20 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Warp's current device is the process's and not a thread's: whoever changes it keeps others from making anything meanwhile, as
-# kernels that find their arrays on another device than they were loaded for end the process.
+# Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
+# makes anything meanwhile: kernels with arrays on another device than their own end the process.
 WARP = threading.Lock()
 
 
 def make(
     name: str, constants: Mapping[str, int | Iterable[int]], values: Mapping[str, Any], n: int, threads: int = 1
 ) -> Callable[[], None]:
-    """A source of this folder as a function without arguments, so many threads for each of ``n`` environments.
+    """Makes a function that runs a source of this folder, with ``threads`` threads for each of ``n`` environments.
 
     Args:
-        name: the source's, without ``.cu``: the body of a function of (tid, problem).
-        constants: numbers and tables that it is compiled with.
-        values: the fields of ``problem``: Warp's arrays, and whole numbers.
+        name: name of the source, without ``.cu``: the body of a function of (tid, problem).
+        constants: integers and tables to compile it with.
+        values: the fields of ``problem``: Warp arrays and integers.
     """
     import warp as wp
 
@@ -55,10 +55,10 @@ def packed(name: str, values: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
-    """Makes a function of Warp's arrays a function of JAX's, which XLA calls on the stream that it computes on.
+    """Turns a function of Warp's arrays into a function of JAX's, which XLA calls on the stream that it computes on.
 
-    Warp has no graph mode here: it would capture the function for every set of addresses that XLA comes up with. Nothing is
-    loaded while JAX traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
+    Graph mode is off, because it would capture the function for every set of addresses that XLA uses. Nothing is loaded while JAX
+    traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
 
     Args:
         function: takes arrays, annotated as Warp's; the last ``outputs`` of them are written.
@@ -122,15 +122,15 @@ def captured(run: Callable[[], None]) -> Callable[[], None]:
 
 
 def source(name: str) -> str:
-    """A source of this folder."""
+    """The text of a source of this folder."""
     return resources.files(__package__).joinpath(f"{name}.cu").read_text()
 
 
 def load(work: Callable[[], None]) -> None:
-    """Compiles all that ``work`` would launch on the current device, side by side, and launches nothing.
+    """Compiles all kernels that ``work`` would launch on the current device, side by side, and launches nothing.
 
-    Warp compiles a kernel when it is first launched, so a first call of ``work`` would compile one after another; and the modules
-    of MuJoCo Warp hold many kernels that no model here needs.
+    Warp compiles a kernel at its first launch, so a first call of ``work`` would compile them one after another. Whole modules of
+    MuJoCo Warp hold many kernels that no model here needs.
     """
     import warp as wp
 

@@ -59,7 +59,7 @@ class JaxPhysics(Physics):
 
     @property
     def compiler_options(self) -> dict[str, str | bool]:
-        """Always None, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
+        """Empty, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
         return {}
 
     def footprint(self, num_devices: int = 1) -> Footprint:

@@ -41,7 +41,7 @@ class WarpPhysics(Physics):
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step; leading axes are environments."""
-        # The drawn fields travel with the targets: without any these go alone.
+        # The drawn fields travel with the targets. Without fields, the targets go alone.
         lead = sim.qpos.shape[:-1]
         drawn = [sim.fields[name].reshape(*lead, -1) for name in self._fields]
         targets = [ctrl, sim.ctrl] if self._cfg.ramp else [ctrl]
@@ -72,7 +72,7 @@ class WarpPhysics(Physics):
             wp.copy(qvel_out, data.qvel)
             wp.copy(warmstart_out, data.qacc_warmstart)
             wp.copy(overflow_out, data.overflow)
-            if strongest is not None:  # otherwise nobody reads it
+            if strongest is not None:  # otherwise it is not used
                 wp.copy(force_out, strongest)
 
         names = ("qpos", "qvel", "given", "warmstart", "qpos_out", "qvel_out", "warmstart_out")
@@ -97,7 +97,7 @@ class WarpPhysics(Physics):
         """Returns the size of MuJoCo Warp's data, and the free memory."""
         import warp as wp
 
-        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes' are theirs to ask
+        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes ask for their own
         return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
 
     @functools.cached_property
@@ -124,7 +124,7 @@ class WarpPhysics(Physics):
         """Makes what ``n`` environments need on the current device.
 
         Returns:
-            MuJoCo Warp's data, the targets that it goes to, the drawn fields as one array, the function that steps, the readings
+            MuJoCo Warp's data, the targets to ramp to, the drawn fields as one array, the function that steps, the readings
             (each None if there are none), and objects that must stay alive.
         """
         import warp as wp
@@ -152,7 +152,7 @@ class WarpPhysics(Physics):
         if not wp.get_device().is_cuda:  # Warp's CPU mode, which has no graphs: for tests
             return data, wanted, drawn, run, strongest, run
         kernels.load(run)
-        run()  # makes what kernels keep between launches, which cannot be done while a graph is captured
+        run()  # allocates what kernels keep between launches, which cannot be done while a graph is captured
         return data, wanted, drawn, kernels.captured(run), strongest, run
 
     def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
@@ -191,7 +191,7 @@ class WarpPhysics(Physics):
 
 
 def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
-    """Makes an array of targets, and the function that moves ``ctrl`` towards them by one of so many equal steps."""
+    """Makes an array of targets, and the function that moves ``ctrl`` towards them by one of ``left`` equal steps."""
     import warp as wp
 
     wanted: Any = wp.zeros_like(ctrl)
@@ -209,13 +209,13 @@ def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
 
 
 def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> Any:
-    """Replaces fields of the model by views of one array [n, numbers], one row a world. None without fields.
+    """Replaces fields of the model by views of one array [n, numbers], one row per world. None without fields.
 
-    Whole numbers are read as they lie in memory (see ``whole_numbers``).
+    Integers are read as they lie in memory (see ``whole_numbers``).
 
     Args:
-        model: MuJoCo Warp's.
-        shapes: of the fields, by name.
+        model: MuJoCo Warp's model.
+        shapes: shapes of the fields, by name.
     """
     import warp as wp
 
@@ -229,7 +229,7 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
         item = drawn.strides[1] * size // rows
         shape: tuple[int, ...] = (n, rows)
         strides: tuple[int, ...] = (row, item)
-        if getattr(model, name).ndim == 3:  # two vectors a row
+        if getattr(model, name).ndim == 3:  # two vectors per row
             shape, strides = (n, rows, 2), (row, item, item // 2)
         view: Any = wp.array(ptr=drawn.ptr + drawn.strides[1] * at, dtype=kind, shape=shape, strides=strides)
         setattr(model, name, view)
@@ -238,7 +238,7 @@ def world_fields(model: Any, shapes: Mapping[str, tuple[int, ...]], n: int) -> A
 
 
 def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any) -> Callable[[], None]:
-    """Makes the function that converts fields of ``world_fields`` which are whole numbers, but given as floats: ids of meshes."""
+    """Makes the function that converts those fields of ``world_fields`` that are integers given as floats: ids of meshes."""
     import warp as wp
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -253,7 +253,7 @@ def whole_numbers(model: Any, shapes: Mapping[str, tuple[int, ...]], drawn: Any)
     at, jobs = 0, []
     for name, shape in shapes.items():
         if getattr(model, name).dtype is wp.int32:
-            # Two rows or more: MuJoCo Warp takes meshes to be everywhere where all worlds share one row.
+            # At least two rows: with a single one, MuJoCo Warp assumes that all worlds have the same meshes.
             out = wp.zeros((max(2, drawn.shape[0]), shape[0]), dtype=int)
             setattr(model, name, out)
             jobs.append((at, out, shape[0]))

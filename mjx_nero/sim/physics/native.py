@@ -1,6 +1,6 @@
 """MuJoCo's C library on CPU threads: the fastest physics without an accelerator, and the sim-to-sim check of policies.
 
-A program calls the host once a control step with all environments of a batch. The library computes in double precision.
+A program calls the host once per control step, with all environments of a batch. The library computes in double precision.
 """
 
 import collections
@@ -40,8 +40,8 @@ class NativePhysics(Physics):
     The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
     physics step: a fair first guess, and a function of the state.
 
-    Of equal ones the first does the work of all, and lives as long as the process, as a compiled program may call it at any time
-    (``host.call``). It keeps its model, and MuJoCo's data for each thread: 15 MB of addresses, of which little is touched.
+    Of equal instances the first does the work of all. It lives as long as the process, because a compiled program may call it at
+    any time (``host.call``). It keeps its model, and MuJoCo's data for each thread: 15 MB of address space, little of it touched.
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
@@ -63,7 +63,7 @@ class NativePhysics(Physics):
         shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._numbers), jnp.float32)
         if jax.default_backend() == "cpu":
             found = host.call(self._key, self._step, shape, packed)
-        else:  # an accelerator's program, which JAX does not keep between runs
+        else:  # an accelerator's program, which JAX does not cache between runs
             found = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
         qpos, qvel, warmstart, read = jnp.split(found, self._sizes[:3], axis=-1)
         read = readings.split(self._readings, read)
@@ -106,7 +106,7 @@ class NativePhysics(Physics):
             if reads := self._readings.values():
                 each = [read(sensors).max(axis=1) if read.strongest else read(sensors[:, -1]) for read in reads]
                 after[:, nqvv:] = np.column_stack(each)
-            # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time tells.
+            # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time stops short.
             after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
 
     def _set(self, models: Any, present: np.ndarray, fields: np.ndarray) -> None:
@@ -120,7 +120,7 @@ class NativePhysics(Physics):
         present[:] = fields
 
     def footprint(self, num_devices: int = 1) -> Footprint:
-        """Returns what an environment takes of the host: a model of its own where fields are drawn, and the arrays of a step."""
+        """Returns the host memory of an environment: a model of its own if fields are drawn, and the arrays of a step."""
         m = self.model
         told = (2 + self.decimation) * (m.nq + 2 * m.nv) + self.decimation * (m.nu + m.nsensordata)
         return Footprint(in_program=8.0 * told + (m.nbuffer if self._fields else 0))
@@ -137,9 +137,9 @@ class NativePhysics(Physics):
     def _make(self, n: int) -> tuple:
         m, steps = self.model, self.decimation
         state = 1 + m.nq + m.nv
-        start = np.ones((n, state))  # the clock starts at 1, so that one after a reset, from 0, differs
+        start = np.ones((n, state))  # time starts at 1, so MuJoCo's automatic reset, which restarts it at 0, shows
         sensors = np.empty((n, steps, m.nsensordata))
-        # With drawn fields every environment has a model of its own, and those its fields that it has now; NaN: not yet set.
+        # With drawn fields every environment has its own model. ``present`` holds that model's current fields; NaN: not yet set.
         models = [copy.copy(m) for _ in range(n)] if self._fields else [m] * n
         present = np.full((n, sum(map(math.prod, self._fields.values()))), np.nan, np.float32)
         return models, present, start, np.empty((n, m.nv)), np.empty((n, steps, m.nu)), np.empty((n, steps, state)), sensors
@@ -147,7 +147,7 @@ class NativePhysics(Physics):
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Silences MuJoCo's warnings, which it prints and writes to a file. The environments count the states that they concern."""
+    """Silences MuJoCo's warnings, which it prints and writes to a file. The environments count the affected states."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:

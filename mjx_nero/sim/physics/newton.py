@@ -1,9 +1,9 @@
 """MuJoCo's Newton solver for constraint forces, as one GPU kernel.
 
-MuJoCo Warp solves with a dozen kernels an iteration, each for all environments, until the slowest of them has converged: at
-thousands of environments that is most of a step that grasps. Here a block of 32 threads takes one environment from beginning to
-end, in shared memory; the Jacobian only where it is dense, which MuJoCo Warp has it for up to 32 degrees of freedom. The problem
-is MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that minimise Gauss' cost and the
+MuJoCo Warp solves with a dozen kernels per iteration, each for all environments, until the slowest of them has converged. With
+thousands of environments that is most of a step with a grasp. Here a block of 32 threads solves one environment from beginning to
+end, in shared memory. The Jacobian is there only if it is dense, as in MuJoCo Warp up to 32 degrees of freedom. The problem is
+MuJoCo's own (mujoco.readthedocs.io, Computation, "Primal problem": the accelerations that minimise Gauss' cost and the
 constraints' cost, with elliptic or pyramidal friction cones), so the solution is, too.
 
 The source, ``newton.cu``, compiles for the CPU as well, with one thread for all 32: slow, for tests.
@@ -17,8 +17,8 @@ import mujoco
 
 from mjx_nero.sim.physics import kernels
 
-_SHARED_BYTES = 48 * 1024  # of a block, on every GPU that Warp supports
-_DOFS = 64  # a bit for each
+_SHARED_BYTES = 48 * 1024  # shared memory of a block, on every GPU that Warp supports
+_DOFS = 64  # one bit each
 
 
 def floats(nv: int, njmax: int, dense: bool) -> int | None:
@@ -29,13 +29,12 @@ def floats(nv: int, njmax: int, dense: bool) -> int | None:
 
 
 def fits(model, data) -> bool:
-    """True if the kernel can solve for this model; MuJoCo Warp's own solver does otherwise."""
+    """True if the kernel can solve for this model; otherwise MuJoCo Warp's own solver does."""
     return floats(model.nv, data.njmax, not model.is_sparse) is not None
 
 
 def make(model, data) -> Callable[[], None]:
-    """Makes a function that writes the solution to ``data.qacc`` and ``data.efc.Ma``, which is all that MuJoCo Warp's integrators
-    read.
+    """Makes a function that writes the solution to ``data.qacc`` and ``data.efc.Ma``: all that MuJoCo Warp's integrators read.
 
     If the model has sensors, it also writes the contacts' forces to ``data.efc.force``.
 
@@ -43,7 +42,7 @@ def make(model, data) -> Callable[[], None]:
         model, data: MuJoCo Warp's model and data.
 
     Returns:
-        a function without arguments; it calls MuJoCo Warp's own solver if the model is too large for this one.
+        A function without arguments. It calls MuJoCo Warp's own solver if the model is too large for this one.
     """
     import warp as wp
     from mujoco.mjx.third_party import mujoco_warp
@@ -54,7 +53,7 @@ def make(model, data) -> Callable[[], None]:
         return lambda: mujoco_warp.solve(model, data)
     numbers = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "SIZE": size}
     numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
-    numbers["FORCES"] = int(model.nsensordata > 0)  # nobody else reads them
+    numbers["FORCES"] = int(model.nsensordata > 0)  # only sensors use them
     arrays: dict[str, Any] = {name: getattr(data, name) for name in ("nefc", "ne", "nf", "M", "qfrc_smooth", "qacc_warmstart")}
     arrays |= {f"efc_{name}": getattr(data.efc, name) for name in ("J", "D", "aref", "frictionloss", "type", "id", "Ma", "force")}
     arrays |= {f"efc_J_{name}": getattr(data.efc, f"J_{name}") for name in ("rownnz", "rowadr", "colind")}

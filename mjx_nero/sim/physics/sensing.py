@@ -20,10 +20,10 @@ Work = Callable[[], None]
 def make(m: mujoco.MjModel, model: Any, data: Any) -> tuple[Any, list[Work], list[Work]]:
     """Makes the array of all readings [worlds, numbers], None without any, and the functions that fill it.
 
-    The first ones keep the strongest contacts of every physics step. The others measure the rest, once a control step.
+    The first ones keep the strongest contacts of every physics step. The others measure the rest, once per control step.
 
     Args:
-        m: the model.
+        m: the compiled model.
         model, data: MuJoCo Warp's.
     """
     import warp as wp
@@ -102,7 +102,7 @@ def _wrench(m: mujoco.MjModel, model: Any, data: Any, reading: Reading, out: Any
         out: wp.array2d(dtype=float),  # type: ignore
     ):
         w = wp.tid()
-        # Of the tree's centre of mass, in the world's axes: torque, then force.
+        # About the tree's centre of mass, in the world's axes: torque, then force.
         force = wp.spatial_bottom(inner[w, body])
         torque = wp.spatial_top(inner[w, body]) - wp.cross(place[w, site] - middle[w, root], force)  # type: ignore[operator]
         axes = wp.transpose(turn[w, site])

@@ -1,1 +1,1 @@
-"""One module an arm: its ``ROBOT``, the setups of its tasks, and its environments ``ENVS``. The registry finds them by itself."""
+"""One module per arm: its ``ROBOT``, its task setups, and its environments ``ENVS``. The registry finds the modules itself."""

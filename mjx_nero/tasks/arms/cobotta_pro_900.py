@@ -50,8 +50,8 @@ ROBOT = COBOTTA_PRO_900 = RobotCfg(
         joints=("finger_joint", "right_outer_knuckle_joint"),
         stiffness=(20.0, 20.0),
         damping=(1.0, 1.0),
-        effort=(2.3, 2.3),  # 30 N a finger at a 51.5 mm grip: within the gripper's 25 to 120 N
-        speed=(0.9, 0.9),  # the gap at the gripper's top speed, 135 mm/s
+        effort=(2.3, 2.3),  # 30 N per finger at a 51.5 mm grip: within the gripper's 25 to 120 N
+        speed=(0.9, 0.9),  # changes the gap at the gripper's top speed, 135 mm/s
         home=(0.0, 0.0),
         open=(0.0, 0.0),
         close=(0.628, -0.628),

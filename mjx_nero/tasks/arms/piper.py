@@ -46,7 +46,7 @@ REACH = reach.ReachSetup(
     episode_length_s=6.0,
 )
 
-# Wider apart than the recipe's regions, for what is to stand between.
+# Farther apart than the recipe's regions, to leave room for the obstacle.
 REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
     start=(0.3, -0.2), goal=((0.28, 0.38), (0.14, 0.24), (0.2, 0.35)), top=0.3, scene=LIFT.scene
 )

@@ -83,7 +83,7 @@ REACH = reach.ReachSetup(
     scene=reach.scene(SCENE),
     position=((0.1, 0.25), (-0.1, 0.1), (0.1, 0.3)),
 )
-# Wider apart than what it picks from, for what is to stand between.
+# Farther apart than the region that it picks from, to leave room for the obstacle.
 REACH_OBSTACLES = reach_obstacles.ReachObstaclesSetup(
     start=(0.16, -0.18), goal=((0.12, 0.22), (0.14, 0.2), (0.1, 0.25)), top=0.2, scene=SCENE
 )
@@ -93,9 +93,10 @@ LIFT_OBSTACLES = lift_obstacles.LiftObstaclesSetup(
 
 
 def so_arm(prefix: str, robot: RobotCfg, *setups: Any) -> Envs:
-    """Lists the environments of either SO-ARM. The preset ``isaac`` has the recipe's drives.
+    """Lists the environments of an SO-ARM. The preset ``isaac`` has the recipe's drives.
 
-    None stacks three cubes: the hand does not point straight down so high. None turns cubes over: it has five joints.
+    The stack of three cubes is missing, because the hand cannot point straight down that high. Reorient is missing, because the
+    arm has only five joints.
     """
     envs = fitted.envs(prefix, robot, *setups, REACH_OBSTACLES, LIFT_OBSTACLES)
     for task in ("lift", "reach"):

@@ -1,4 +1,4 @@
-"""Expands xacro to URDF with an expander of our own, so that a stranger's file can only calculate.
+"""Expands xacro to URDF with the package's own expander, so that an untrusted file can only calculate.
 
 The usual implementation passes expressions to Python's ``eval`` and opens whatever a file names. Here expressions are walked node
 by node (``evaluate``), with the functions and methods of one table (``functions``). Files are found only within the given folders

@@ -47,7 +47,7 @@ def evaluate(expression: str, lookup: Callable[[str], Any], budget: Budget) -> V
         lookup: name -> value, ``Function`` or ``Namespace``; KeyError if unknown.
 
     Raises:
-        Fault: it is no expression, does what has no rule here, fails, or passes a limit.
+        Fault: it is not an expression, does something without a rule here, fails, or exceeds a limit.
     """
     shown = expression.strip()[:80]
     if len(expression) > _MAX_LENGTH:

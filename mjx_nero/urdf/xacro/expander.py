@@ -39,7 +39,7 @@ def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: M
         args: values of ``xacro:arg``, instead of their defaults.
 
     Raises:
-        UserError: one line that says what is wrong in which construct of which file.
+        UserError: one line that names the file, the construct, and what is wrong with it.
     """
     expander = _Expander(path, roots, args)
     try:

@@ -20,7 +20,7 @@ class Surroundings:
     Args:
         path: the document.
         args: values of arguments.
-        functions: of the namespace ``xacro``, those that depend on the file.
+        functions: functions of the namespace ``xacro`` that depend on the file.
     """
 
     def __init__(self, path: pathlib.Path, args: Mapping[str, str], functions: Mapping[str, Callable[..., Any]]):
@@ -49,7 +49,7 @@ class Scope(Namespace):
 
     Args:
         parent: scope in which missing names are looked up.
-        named: it is an include's with ``ns``, not a macro's.
+        named: the scope belongs to an include with ``ns``, not to a macro.
     """
 
     def __init__(self, around: Surroundings, parent: "Scope | None" = None, named: bool = False):
@@ -64,8 +64,8 @@ class Scope(Namespace):
         """Looks up a property, function or namespace.
 
         Raises:
-            KeyError: nothing.
-            Fault: it is a property that is defined by itself.
+            KeyError: the name is unknown.
+            Fault: the property is defined by itself.
         """
         scope = self.holder("properties", name)
         if scope is None:

@@ -14,7 +14,7 @@ _UNITS = {"radians": 1.0, "degrees": math.pi / 180, "meters": 1.0, "millimeters"
 
 
 def values(path: pathlib.Path, budget: Budget) -> Value:
-    """Reads the file's content. Numeric keys are numbers; of a repeated key, which some makers' files have, the last one counts.
+    """Reads the file's content. Numeric keys are numbers; if a key is repeated, as in some makers' files, the last one counts.
 
     Raises:
         Fault: a value with a unit is not a number.
