@@ -61,6 +61,21 @@ class Solution:
     orientation_error: Float[Array, "*b"]  # [rad]
 
 
+@struct.dataclass
+class _Poses:
+    """Poses to reach. Quaternions are of unit length, warm starts within the limits."""
+
+    pos: Float[Array, "b 3"]
+    quat: Float[Array, "b 4"]
+    q0: Float[Array, "b nj"]
+    valid: Bool[Array, " b"]  # finite, as given
+    weight: Float[Array, ""]  # of the orientation [m/rad]
+
+    def of(self, which: Int[Array, " n"]) -> tuple[Array, Array]:
+        """Returns positions and orientations of some of the poses."""
+        return self.pos[which], self.quat[which]
+
+
 class InverseKinematics:
     """Finds joint positions that bring a frame of a robot to a pose in the world. It ignores collisions.
 
@@ -125,15 +140,12 @@ class InverseKinematics:
         Args:
             weight: orientation weight [m/rad]; None: the config's.
         """
-        key = jax.random.PRNGKey(0)
-        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], key, 0, self._weight(weight)))
-
-    def _weight(self, weight: float | Array | None) -> float | Array:
-        return self.cfg.orientation_weight if weight is None else weight
+        weight = self.cfg.orientation_weight if weight is None else weight
+        return jax.tree.map(lambda x: x[0], self._solve(pos[None], quat[None], q0[None], jax.random.PRNGKey(0), 0, weight))
 
     def solve_batch(self, pos: Float[Array, "b 3"], quat: Float[Array, "b 4"], q0: Float[Array, "b nj"], key: Key) -> Solution:
         """``solve`` for many poses at once. Faster than ``vmap``: the starts go to the poses that are still unsolved."""
-        return self._solve(pos, quat, q0, key, self.cfg.restarts, self._weight(None))
+        return self._solve(pos, quat, q0, key, self.cfg.restarts, self.cfg.orientation_weight)
 
     def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int, weight: Array) -> Solution:
         # On a GPU the default precision of products is too coarse for kinematics.
@@ -143,21 +155,12 @@ class InverseKinematics:
             pos = jnp.where(valid[:, None], pos, 0.0)
             quat = jnp.where(valid[:, None], quat / norm[:, None], jnp.array([1.0, 0.0, 0.0, 0.0]))
             q0 = self._within(jnp.where(jnp.isfinite(q0), q0, self._center))
-            return self._search(pos, quat, q0, valid, key, restarts, weight)
+            return self._search(_Poses(pos, quat, q0, valid, weight), key, restarts)
 
-    def _search(
-        self,
-        pos: Float[Array, "b 3"],
-        quat: Float[Array, "b 4"],
-        q0: Float[Array, "b nj"],
-        valid: Bool[Array, " b"],
-        key: Key,
-        restarts: int,
-        weight: Array,
-    ) -> Solution:
-        b = len(pos)
-        nothing = Solution(q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
-        found = self._descents(q0, jnp.arange(b), pos, quat, q0, ~valid, nothing, weight)
+    def _search(self, poses: _Poses, key: Key, restarts: int) -> Solution:
+        b, valid = len(poses.pos), poses.valid
+        nothing = Solution(poses.q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
+        found = self._descents(poses.q0, jnp.arange(b), poses, ~valid, nothing)
 
         def unsolved(carry):
             restart, found = carry
@@ -168,8 +171,8 @@ class InverseKinematics:
             solved = found.success | ~valid
             left = jnp.argsort(solved)  # the unsolved poses come first
             target = left[jnp.arange(max(b, self.cfg.starts)) % jnp.maximum(jnp.sum(~solved), 1)]
-            start = self._starts(jax.random.fold_in(key, restart), pos[target], quat[target])
-            return restart + 1, self._descents(start, target, pos, quat, q0, solved, found, weight)
+            start = self._starts(jax.random.fold_in(key, restart), *poses.of(target))
+            return restart + 1, self._descents(start, target, poses, solved, found)
 
         if restarts:
             _, found = jax.lax.while_loop(unsolved, again, (0, found))
@@ -185,12 +188,9 @@ class InverseKinematics:
         self,
         start: Float[Array, "n nj"],
         target: Int[Array, " n"],  # the pose that each start is for
-        pos: Float[Array, "b 3"],
-        quat: Float[Array, "b 4"],
-        q0: Float[Array, "b nj"],
+        poses: _Poses,
         solved: Bool[Array, " b"],
         found: Solution,
-        weight: Array,
     ) -> Solution:
         """Runs all descents until every pose is solved or the budget is spent; keeps what is better than ``found``."""
 
@@ -200,10 +200,10 @@ class InverseKinematics:
 
         def step(carry):
             i, trial, q = carry
-            trial, following = jax.vmap(self._step, (0, 0, 0, None))(q, pos[target], quat[target], weight)
+            trial, following = jax.vmap(self._step, (0, 0, 0, None))(q, *poses.of(target), poses.weight)
             return i + 1, trial, jnp.where(trial.success[:, None], q, following)
 
-        n = len(target)
+        n, q0 = len(target), poses.q0
         trial = Solution(start, jnp.zeros(n, bool), jnp.full(n, jnp.inf), jnp.full(n, jnp.inf))
         _, trial, _ = jax.lax.while_loop(going, step, (0, trial, start))
         # The same pose, with each joint as close to the warm start as whole turns bring it.
@@ -212,7 +212,7 @@ class InverseKinematics:
 
         rating, before = self._rating(trial, q0[target]), self._rating(found, q0)
         best = before.at[target].min(rating)[target]
-        at = jnp.where((rating == best) & (rating < before[target]), target, len(pos))  # beyond the end: dropped
+        at = jnp.where((rating == best) & (rating < before[target]), target, len(q0))  # beyond the end: dropped
         return jax.tree.map(lambda old, x: old.at[at].set(x, mode="drop"), found, trial)
 
     def _rating(self, found: Solution, q0: Float[Array, "n nj"]) -> Float[Array, " n"]:

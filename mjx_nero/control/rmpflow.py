@@ -16,7 +16,6 @@ import pathlib
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
@@ -25,7 +24,7 @@ from mjx_nero.config.values import unknown
 from mjx_nero.control import rmp
 from mjx_nero.control import rmpflow_config as cfg
 from mjx_nero.math import rotate, rotation_matrix
-from mjx_nero.sim import scene
+from mjx_nero.sim import quats, scene
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
@@ -165,9 +164,7 @@ class RmpFlow:
         """Places the cylinders around the base in the world."""
         cylinders = self.config.body_cylinders
         ends = np.array([(c.pt1, c.pt2) for c in cylinders]).reshape(-1, 2, 3)
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, base.quat)
-        self._cylinders = (base.pos + ends @ turn.reshape(3, 3).T).astype(np.float32)
+        self._cylinders = (base.pos + ends @ quats.matrix(base.quat).T).astype(np.float32)
         self._cylinder_radius = np.array([c.radius for c in cylinders], np.float32)
 
     def _set_limits(self, config: pathlib.Path) -> None:

@@ -27,7 +27,7 @@ from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
-from mjx_nero.sim import cameras, forces, linkage, scene, team, touch
+from mjx_nero.sim import cameras, linkage, readings, scene, team
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Fields, Randomization
@@ -235,10 +235,7 @@ class ManipulationEnv(Env):
             warmstart=jnp.zeros(nv),
             time=jnp.zeros(()),
             fields=fields,
-            readings={
-                **dict.fromkeys(touch.readers(self.physics_model), jnp.zeros(())),
-                **{name: jnp.zeros(gauge.size) for name, gauge in forces.gauges(self.physics_model).items()},
-            },
+            readings={name: jnp.zeros(each.shape) for name, each in readings.of(self.physics_model).items()},
         )
         carry = Carry(
             rng=rng,

@@ -9,7 +9,6 @@ from mjx_nero.sim.scene import ObjectCfg
 
 LIFTED = 0.01  # [m] height of the lowest point of a lifted thing
 NEAR = 0.03  # [m] greatest distance of the grasp point from the box around a held thing
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 THINNEST = 0.006  # [m] thinnest part that the script's fingers close on
 GRIP: dict[str, Any] = {"friction": (1.0, 0.01, 0.001), "condim": 4}  # without torsion, things turn about the line of contacts
 
@@ -22,6 +21,6 @@ def expert(robot: RobotCfg, object: str, item: ObjectCfg) -> dict[str, dict[str,
         "scale": item.scale,
         "lowest": grasp.lowest(robot.pad),
         "beyond": grasp.beyond(robot, grasp.cube_for(robot).size[0]),
-        "closing": round(max(CLOSING, grasp.closing_time(robot, THINNEST)), 3),
+        "closing": grasp.closing(robot, THINNEST),
     }
     return {"grasp_thing": {**fields, **regions.ik(robot, "ik.")}}

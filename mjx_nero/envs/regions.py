@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.sim import grasp
+from mjx_nero.sim import grasp, quats
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.sim.scene import SceneCfg
@@ -60,8 +60,7 @@ def of(robot: RobotCfg) -> Regions:
     rest = grasp.cube_for(robot).rest_height
     pick = box(robot, "pick", "where on the table it can grasp")
     hold = box(robot, "hold", "where it can hold what it has grasped")
-    turned = np.zeros(3)
-    mujoco.mju_rotVecQuat(turned, np.array(robot.grip), np.array(robot.down))
+    turned = quats.rotated(robot.grip, robot.down)
     x, y = (span(low + by, high + by) for (low, high), by in zip(pick[:2], turned[:2], strict=True))
     dx, dy, dz = robot.base_pos
     return Regions(
@@ -106,10 +105,8 @@ def turn_to(robot: RobotCfg, x: float, y: float) -> float:
 
     0 if that joint does not turn the arm about the vertical.
     """
-    model = scenes.robot_model(robot)
-    data, first = mujoco.MjData(model), model.joint(robot.arm.joints[0])
-    data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = robot.home
-    mujoco.mj_kinematics(model, data)
+    model, data = scenes.at_home(robot)
+    first = model.joint(robot.arm.joints[0])
     axis, about = data.xaxis[first.id], data.xanchor[first.id]
     if first.type[0] != mujoco.mjtJoint.mjJNT_HINGE or abs(axis[2]) < 0.99:
         return 0.0

@@ -6,9 +6,9 @@ from typing import Any
 
 from mjx_nero import config
 from mjx_nero.config import bounds
-from mjx_nero.config.bounds import Count, NonNegative, Positive, Share, Steps
+from mjx_nero.config.bounds import Count, NonNegative, Positive, Range, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, curriculum, fixtures, observations, success, terminations
+from mjx_nero.mdp import actions, curriculum, events, fixtures, observations, success, terminations
 from mjx_nero.mdp.terms import (
     ROBOT,
     CommandTerm,
@@ -71,6 +71,12 @@ def observed(state: Mapping[str, ObservationTerm], **object: str) -> dict[str, O
     """Groups the observations of a policy, and those of a critic that also knows the object's velocity."""
     velocity = ObservationTerm(observations.object_velocity, params=object)
     return groups(state, {"object_velocity": velocity})
+
+
+def on_table(x: Range, y: Range, **object: str) -> dict[str, Term]:
+    """Lists the event that puts the object on the table, at uniform ``x`` and ``y`` in the world [m]."""
+    place = {"x": x, "y": y, "z": (0.0, 0.0), **object}
+    return {"reset_object_position": Term(events.object_position_uniform, params=place)}
 
 
 def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:

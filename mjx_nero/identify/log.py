@@ -55,8 +55,7 @@ def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[s
     head = ["time", *(f"target.{j}" for j in joints), *(f"position.{j}" for j in joints)]
     lines = [*(f"# {note}" for note in notes), ",".join(head)]
     lines += [",".join([f"{time:.6f}".rstrip("0").rstrip("."), *rows[time]]) for time in sorted(rows)]
-    with files.whole(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+    files.write(path, ("\n".join(lines) + "\n").encode())
 
 
 def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, fewest: int = FEWEST) -> Log:
@@ -69,11 +68,7 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
     Raises:
         UserError: there is none, it is too large, or it is no log of these joints; the message names the line.
     """
-    try:
-        text = files.read_bytes(path, MAX_BYTES).decode()
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = numbered(path, MAX_BYTES)
     if len(lines) > MAX_ROWS:
         raise UserError(f"{path} has {len(lines):,} rows: more than {MAX_ROWS:,} are not read")
     head = [name.strip() for name in lines[0][1].split(",")] if lines else []
@@ -103,6 +98,19 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
     if table[-1, 0] - table[0, 0] > 3600:
         raise UserError(f"{path} is longer than an hour: a minute is enough")
     return log
+
+
+def numbered(path: pathlib.Path, limit: int) -> list[tuple[int, str]]:
+    """Reads the lines of a table that are neither empty nor notes, each with its number in the file.
+
+    Raises:
+        UserError: there is none, it is larger than ``limit`` bytes, or no text.
+    """
+    try:
+        text = files.read_bytes(path, limit).decode()
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
+    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
 
 
 def number(text: str, where: str, empty: bool = True) -> float:

@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim import linkage, scene, touch
+from mjx_nero.sim import linkage, quats, scene, touch
 from mjx_nero.sim.robot import RobotCfg
 
 _KINDS = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
@@ -106,8 +106,6 @@ def _shape(model: mujoco.MjModel, g: int) -> dict[str, Any]:
     kind, size = _SHAPES.get(int(model.geom_type[g])), model.geom_size[g]
     if kind is None:
         center, half = model.geom_aabb[g, :3], model.geom_aabb[g, 3:]
-        turned = np.zeros(3)
-        mujoco.mju_rotVecQuat(turned, center, quat)
-        kind, size, pos = "box", half, pos + turned
+        kind, size, pos = "box", half, pos + quats.rotated(center, quat)
     name = model.geom(g).name or f"{body}'s shape {g - int(model.body_geomadr[model.geom_bodyid[g]]) + 1}"
     return {"name": name, "body": body, "type": kind, "size": size.tolist(), "pos": pos.tolist(), "quat": quat.tolist()}

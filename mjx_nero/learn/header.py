@@ -5,6 +5,8 @@ import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from mjx_nero import files
 from mjx_nero.config.values import short
 from mjx_nero.errors import UserError
@@ -15,21 +17,8 @@ MAX_POLICY = 200_000_000  # bytes
 MAX_ARRAYS = 5_000
 MAX_LAYERS, MAX_WIDTH = 16, 8192  # of networks
 MAX_SIZE = 1_000_000  # numbers per observation group
-DTYPES = {
-    "F64": "float64",
-    "F32": "float32",
-    "F16": "float16",
-    "I64": "int64",
-    "I32": "int32",
-    "I16": "int16",
-    "I8": "int8",
-    "U64": "uint64",
-    "U32": "uint32",
-    "U16": "uint16",
-    "U8": "uint8",
-    "BOOL": "bool",
-}
-_BYTES = {name: 1 if name == "BOOL" else int(name[1:]) // 8 for name in DTYPES}
+_SIZES = {"F": ("float", (64, 32, 16)), "I": ("int", (64, 32, 16, 8)), "U": ("uint", (64, 32, 16, 8))}
+DTYPES = {f"{short}{bits}": f"{name}{bits}" for short, (name, sizes) in _SIZES.items() for bits in sizes} | {"BOOL": "bool"}
 Arrays = dict[str, tuple[str, tuple[int, ...]]]  # name -> (numpy's name of the type, shape)
 
 
@@ -95,7 +84,7 @@ def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
     """Returns type, shape, first byte and end of an array."""
     kind, shape, (first, last) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
     whole = all(type(n) is int and 0 <= n < 1 << 40 for n in (*shape, first, last))
-    if not whole or len(shape) > 8 or math.prod(shape) * _BYTES[kind] != last - first:
+    if not whole or len(shape) > 8 or math.prod(shape) * np.dtype(DTYPES[kind]).itemsize != last - first:
         raise ValueError
     return DTYPES[kind], shape, first, last
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mjx_nero.types import Bank, Key
 
 ROWS = 16_384  # of ``types.Shown``
+HELD = {"[0]": ".normalizer", "[1]": ".params"}  # ``Kind.held`` of a state with these two
 Params = Any  # a policy's parameters: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
 Observation = Mapping[str, "jax.Array"]
@@ -29,6 +30,8 @@ class State(Protocol):
 
 class Learner(Protocol):
     """Learns on a batch of environments. ``init`` and ``run`` are pure.
+
+    The methods that are not abstract are those of one device, and of a state with ``normalizer`` and ``params``, the policy.
 
     Attributes:
         env: the batch, from ``wrappers.for_training``.
@@ -47,42 +50,36 @@ class Learner(Protocol):
 
     def init(self, key: "Key", bank: "Bank | None" = None) -> Any:
         """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts."""
-        ...
 
     def place(self, state: Any) -> Any:
         """Spreads the state, or its shapes, over the devices, as ``run`` takes it."""
-        ...
+        return state
 
     def run(self, state: Any, iterations: int) -> tuple[Any, Metrics]:
         """Makes ``iterations`` iterations; returns the state and the mean metrics of an iteration.
 
         ``sum/<name>`` is an environment's metric summed over an iteration.
         """
-        ...
 
     def policy(self, state: Any) -> Params:
         """Returns the policy's parameters, on one device."""
-        ...
+        return state.normalizer, state.params
 
     def with_policy(self, state: Any, params: Params) -> Any:
         """Returns a new state that starts from a policy."""
-        ...
+        return dataclasses.replace(state, normalizer=params[0], params=params[1])
 
     def slower(self, state: Any) -> Any:
         """Returns the state with a lower learning rate and other random draws, for a restart after divergence."""
-        ...
 
     def act(self, params: Params, obs: Observation) -> "jax.Array":
         """Computes the deterministic action, single or batched."""
-        ...
 
     def describe(self) -> dict[str, Any]:
         """Describes the policy for its file, beside the environment: plain JSON, enough for ``Kind.policy``."""
-        ...
 
     def footprint(self) -> tuple[float, float]:
         """Estimates the memory of ``run`` on a device [bytes]: the fixed part, and the part per environment."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from mjx_nero.sim import quats
 from mjx_nero.sim.cameras import cfg as cameras
 from mjx_nero.sim.objects import body as mesh_body
 from mjx_nero.sim.objects.cfg import as_geom
@@ -39,10 +40,9 @@ def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
     grey = [0.6, 0.62, 0.64, 1]
     if robot.floor < 0:
         world.add_geom(name="floor", type=box, size=[3, 3, 0.02], pos=[x, y, robot.floor - 0.0205], rgba=grey, **hidden)
-    up = np.zeros(9)
-    mujoco.mju_quat2Mat(up, np.array(robot.base_quat) / np.linalg.norm(robot.base_quat))
-    if up[8] < _HANGS:  # the plate is behind its base
-        behind = np.array(robot.base_pos) - 0.0105 * up.reshape(3, 3)[:, 2]
+    up = quats.matrix(robot.base_quat)[:, 2]
+    if up[2] < _HANGS:  # the plate is behind its base
+        behind = np.array(robot.base_pos) - 0.0105 * up
         where = {"size": [0.15, 0.15, 0.01], "pos": behind, "quat": robot.base_quat}
         world.add_geom(name="plate", type=box, **where, rgba=grey, **hidden)
     spec.add_texture(

@@ -1,7 +1,6 @@
 """Model fields that differ between worlds: those that ``mdp.randomization`` draws, and those derived from them."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +14,54 @@ from mjx_nero.types import Key, UserError
 
 # Fields that a term may draw: all backends read them at every step.
 DRAWABLE = (
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_gravcomp",
-    "geom_size",
-    "geom_rbound",
-    "geom_friction",
-    "geom_rgba",
-    "dof_armature",
-    "dof_damping",
-    "dof_frictionloss",
-    "jnt_range",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
-)
+    "body_mass body_inertia body_ipos body_gravcomp geom_size geom_rbound geom_friction geom_rgba dof_armature dof_damping "
+    "dof_frictionloss jnt_range actuator_gainprm actuator_biasprm actuator_forcerange"
+).split()
 Fields = dict[str, Array]
+Terms = Mapping[str, Callable[[Key, Model], Drawn]]
+
+
+class Draws:
+    """Draws fields of a model by terms, one after another.
+
+    Args:
+        kind: what the terms are, for messages.
+        terms: by name, each ``(key, model) -> {field: (rows, values)}``.
+        nominal: the fields that may differ, as the model has them.
+        index: rows by name, see ``mdp.randomization.Model``.
+
+    Attributes:
+        rows: field -> all rows that the terms draw. A field of which the model has nothing is left out.
+
+    Raises:
+        UserError: a term names something that the model lacks, or draws a field that cannot differ.
+    """
+
+    def __init__(self, kind: str, terms: Terms, nominal: dict[str, np.ndarray], index: Mapping[str, Mapping[str, int]]):
+        self._terms, self.nominal, self._index = terms, nominal, index
+        self.rows: dict[str, set[int]] = {}
+
+        def note(key: Key) -> None:
+            for name, term in terms.items():
+                for field, (drawn, _) in term(key, self._model({})).items():
+                    if field not in nominal:
+                        raise UserError(f"{kind}.{name} draws {field}: only {', '.join(nominal)} may differ")
+                    if nominal[field].size:
+                        self.rows.setdefault(field, set()).update(map(int, drawn))
+
+        jax.eval_shape(note, jax.random.PRNGKey(0))  # only the rows matter, so nothing has to be compiled
+
+    def _model(self, drawn: Fields) -> Model:
+        return Model({**{name: jnp.asarray(value) for name, value in self.nominal.items()}, **drawn}, self._index)
+
+    def __call__(self, keys: Iterable[Key], given: Mapping[str, Array]) -> Fields:
+        """Returns ``given`` with what the terms draw, by one key each."""
+        drawn = dict(given)
+        for key, term in zip(keys, self._terms.values(), strict=True):
+            for field, (rows, values) in term(key, self._model(drawn)).items():
+                if field in self.rows:
+                    drawn[field] = drawn.get(field, jnp.asarray(self.nominal[field])).at[rows].set(values)
+        return drawn
 
 
 class Randomization:
@@ -48,32 +78,23 @@ class Randomization:
         UserError: a term names something that the model lacks, or draws a field that cannot differ.
     """
 
-    def __init__(self, model: mujoco.MjModel, terms: Mapping[str, Callable[[Key, Model], Drawn]]):
-        self._terms = terms
-        self._nominal = {name: np.array(getattr(model, name), np.float32) for name in DRAWABLE}
+    def __init__(self, model: mujoco.MjModel, terms: Terms):
+        self._count = len(terms)
         hinges = {model.joint(j).name: int(model.jnt_dofadr[j]) for j in range(model.njnt) if model.jnt_type[j] >= 2}
-        self._index = {
+        index = {
             "body": {model.body(i).name: i for i in range(1, model.nbody)},
             "geom": {model.geom(i).name: i for i in range(model.ngeom)},
             "dof": hinges,
             "joint": {name: model.joint(name).id for name in hinges},
             "actuator": {model.actuator(i).name: i for i in range(model.nu)},
         }
-        rows: dict[str, set[int]] = {}
-
-        def note(key: Key) -> None:
-            for name, term in terms.items():
-                for field, (drawn, _) in term(key, self._model({})).items():
-                    if field not in DRAWABLE:
-                        raise UserError(f"randomization.{name} draws {field}: only {', '.join(DRAWABLE)} may differ")
-                    rows.setdefault(field, set()).update(map(int, drawn))
-
-        jax.eval_shape(note, jax.random.PRNGKey(0))  # only the rows matter, so nothing has to be compiled
+        self._draws = Draws("randomization", terms, nominal(model, DRAWABLE), index)
+        rows = self._draws.rows
         _make_room(model, rows)
         bodies = rows.get("body_mass", set()) | rows.get("body_inertia", set()) | rows.get("body_ipos", set())
         trees = {int(model.body_treeid[b]) for b in bodies} | {int(model.dof_treeid[d]) for d in rows.get("dof_armature", ())}
         self._trees = [_Tree(model, tree) for tree in sorted(trees - {-1})]
-        self._derived = {name: np.array(getattr(model, name), np.float32) for name in _DERIVED} if trees else {}
+        self._derived = nominal(model, _DERIVED) if trees else {}
         self.names = tuple(rows) + tuple(self._derived)
 
     def __call__(self, key: Key, level: Float[Array, ""] | None = None, given: Mapping[str, Array] | None = None) -> Fields:
@@ -83,15 +104,10 @@ class Randomization:
             given: fields that differ for another reason, such as an object's shape (``objects.bank``).
         """
         given = given or {}
-        drawn: Fields = dict(given)
-        for k_term, term in zip(
-            jax.random.split(key, len(self._terms)) if self._terms else (), self._terms.values(), strict=True
-        ):
-            for field, (rows, values) in term(k_term, self._model(drawn)).items():
-                drawn[field] = drawn.get(field, jnp.asarray(self._nominal[field])).at[rows].set(values)
-        nominal: dict[str, Any] = {**self._nominal, **given}
-        drawn = {name: toward(level, jnp.asarray(nominal[name]), values) for name, values in drawn.items()}
-        now: Fields = {**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}
+        drawn = self._draws(jax.random.split(key, self._count) if self._count else (), given)
+        plain: Fields = {**{name: jnp.asarray(value) for name, value in self._draws.nominal.items()}, **given}
+        drawn = {name: toward(level, plain[name], values) for name, values in drawn.items()}
+        now = {**plain, **drawn}
         derived = {name: jnp.asarray(given.get(name, value)) for name, value in self._derived.items()}
         for tree in self._trees:
             for name, (rows, values) in tree(now, moved="body_ipos" in drawn).items():
@@ -100,8 +116,11 @@ class Randomization:
             derived["body_subtreemass"] = derived["body_subtreemass"].at[0].set(jnp.sum(now["body_mass"]))
         return {**drawn, **derived}
 
-    def _model(self, drawn: Fields) -> Model:
-        return Model({**{name: jnp.asarray(value) for name, value in self._nominal.items()}, **drawn}, self._index)
+
+def nominal(model: mujoco.MjModel, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Fields of the model by name, as int32 if they hold integers, otherwise as float32."""
+    found = {name: np.array(getattr(model, name)) for name in names}
+    return {name: x.astype(np.int32 if np.issubdtype(x.dtype, np.integer) else np.float32) for name, x in found.items()}
 
 
 def _make_room(model: mujoco.MjModel, rows: Mapping[str, set[int]]) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero import math
 from mjx_nero.config.values import hint, short
-from mjx_nero.sim import linkage, model_file
+from mjx_nero.sim import linkage, model_file, quats
 from mjx_nero.sim.kinematics import Chain
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.sim.robot import ASSETS
@@ -92,10 +92,9 @@ def at_rest(file: str, site: str) -> tuple[np.ndarray, np.ndarray]:
         KeyError: there is no such site.
     """
     model = read(file).compile()
-    data, quat = mujoco.MjData(model), np.zeros(4)
+    data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    mujoco.mju_mat2Quat(quat, data.site(site).xmat)
-    return data.site(site).xpos.copy(), quat
+    return data.site(site).xpos.copy(), quats.of_matrix(data.site(site).xmat)
 
 
 def add(spec: mujoco.MjSpec, fixtures: Mapping[str, FixtureCfg], visuals: bool = True) -> None:
@@ -216,11 +215,9 @@ class Fixtures(Part):
 
     def _ranges(self, name: str, fields: Mapping[str, Array]) -> dict[str, Float[Array, "2"]]:
         """Ranges of a fixture's joints; a joint without limits has an infinite one."""
-        now, out = jnp.asarray(fields.get("jnt_range", self._nominal["jnt_range"])), {}
-        for joint, at in zip(self._chains[name].joints, self._joints[name], strict=True):
-            out[joint] = now[at.id] if self._limited(name, joint) else jnp.array([-jnp.inf, jnp.inf])
-        return out
-
-    def _limited(self, name: str, joint: str) -> bool:
-        found = self._chains[name]
-        return bool(np.isfinite(found.lower[found.joints.index(joint)]))
+        now, found = jnp.asarray(fields.get("jnt_range", self._nominal["jnt_range"])), self._chains[name]
+        ranges = [
+            now[at.id] if low > -np.inf else jnp.array([-np.inf, np.inf])
+            for at, low in zip(self._joints[name], found.lower, strict=True)
+        ]
+        return dict(zip(found.joints, ranges, strict=True))

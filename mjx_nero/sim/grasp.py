@@ -20,6 +20,7 @@ STROKE = 5e-3  # [m] least stroke of pads that open
 GRIPPED = 0.01  # [m] a cube is this much larger than the closed gripper's gap
 CLEAR = 0.005  # [m] the pads stay this far above the table
 BESIDE = 0.004  # [m] and come down this far beside an object
+CLOSING, QUICK = 0.4, 0.3  # [s] least closing times of a script's fingers
 DENSITY = 1000.0  # [kg/m3] 30 g at an edge of 31 mm
 Pad = tuple[float, float, float]
 
@@ -161,6 +162,11 @@ def closing_time(robot: RobotCfg, gap: float) -> float:
     hand = _Hand(robot)
     way = np.abs(hand.positions(hand.share(gap)) - hand.positions(1.0))
     return float(np.max(way / np.array(robot.gripper.speed), initial=0.0))
+
+
+def closing(robot: RobotCfg, gap: float, least: float = CLOSING) -> float:
+    """Time that a script gives the fingers to close to ``gap`` [m]: what they take, ``least`` at least [s]."""
+    return round(max(least, closing_time(robot, gap)), 3)
 
 
 def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.sim import linkage
+from mjx_nero.sim import linkage, quats
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -228,7 +228,4 @@ def _attach(nodes: list[Pose], parent: int, fixed: tuple[np.ndarray, np.ndarray]
 
 def _compose(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Composes two transforms, in double precision: ``b`` given in the frame ``a``."""
-    pos, quat = np.zeros(3), np.zeros(4)
-    mujoco.mju_rotVecQuat(pos, np.asarray(b[0], float), a[1])
-    mujoco.mju_mulQuat(quat, a[1], np.asarray(b[1], float))
-    return a[0] + pos, quat
+    return a[0] + quats.rotated(b[0], a[1]), quats.product(a[1], b[1])

@@ -128,14 +128,10 @@ class Obstacles(Part):
             now = {f: now[f].at[self._rows[name]].set(v) for f, v in zip(FIELDS, values, strict=True)}
         return {**fields, **now}
 
-    def views(self, fields: Mapping[str, Array]) -> dict[str, ObstacleView]:
-        """Returns the boxes by name."""
-        pos, quat, half = (jnp.asarray(fields.get(name, self._nominal[name])) for name in FIELDS[:3])
-        return {name: ObstacleView(pos[row], quat[row], 2 * half[row]) for name, row in self._rows.items()}
-
     def view(self, sim: Sim, carry: Carry) -> dict[str, dict[str, ObstacleView]]:
         """Returns ``obstacles`` of a view."""
-        return {"obstacles": self.views(sim.fields)}
+        pos, quat, half = (jnp.asarray(sim.fields.get(name, self._nominal[name])) for name in FIELDS[:3])
+        return {"obstacles": {name: ObstacleView(pos[row], quat[row], 2 * half[row]) for name, row in self._rows.items()}}
 
     def scenery(self, sim: Sim, carry: Carry, look: Fields) -> dict[str, dict[str, ObstacleView]]:
         """Returns ``obstacles`` of a scenery."""

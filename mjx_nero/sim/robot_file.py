@@ -28,24 +28,9 @@ COLUMNS: dict[str, Any] = {  # of a drive
 }
 _ARM = (*COLUMNS, "home")
 _GRIPPER = (*_ARM, "open", "close")
-_PLAIN = (
-    "name",
-    "base_link",
-    "base_pos",
-    "base_quat",
-    "ee_site",
-    "down",
-    "gravity_compensation",
-    "workspace",
-    "floor",
-    "opening",
-    "closed",
-    "pad",
-    "grip",
-    "pick",
-    "lean",
-    "turns",
-    "hold",
+_PLAIN = tuple(
+    "name base_link base_pos base_quat ee_site down gravity_compensation workspace floor opening closed pad grip pick lean turns "
+    "hold".split()
 )
 _HEAD = """\
 # A robot for mjx_nero: edit it freely. Units: m, rad, kg, N, s; quaternions wxyz.
@@ -80,9 +65,9 @@ def read(folder: pathlib.Path) -> RobotCfg:
     if not isinstance(raw, Mapping):
         raise UserError(f"{path} takes fields like arm, gripper, ee_site; it holds {type(raw).__name__}")
     default = RobotCfg(name=folder.name, arm=DriveCfg())
+    valid = (*_PLAIN, "arm", "gripper")
     for name in raw:
-        if name not in (*_PLAIN, "arm", "gripper"):
-            valid = (*_PLAIN, "arm", "gripper")
+        if name not in valid:
             raise UserError(f"{path}: no field {short(name)}{hint(str(name), valid)}: choose from {', '.join(valid)}")
     kinds = hints(RobotCfg)
     fields = {name: read_value(kinds[name], raw[name], f"{path}: {name}") for name in _PLAIN if name in raw}

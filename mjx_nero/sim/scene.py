@@ -213,6 +213,15 @@ def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
     return team.mounted(robot, whole).compile()
 
 
+def at_home(robot: RobotCfg, whole: bool = False) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot alone, as ``robot_model`` compiles it, and all its poses at home."""
+    model = robot_model(robot, whole)
+    data = mujoco.MjData(model)
+    data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = robot.home
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
 def _add_drives(spec: mujoco.MjSpec, drive) -> None:
     for name, kp, kd, effort in zip(drive.joints, drive.stiffness, drive.damping, drive.effort, strict=True):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)

@@ -7,11 +7,9 @@ in every step and miss what happens between two control steps.
 
 import collections
 import copy
-import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,6 +21,7 @@ from mjx_nero.types import UserError
 OBSTACLE = 8  # contact bit; scenes without obstacles leave out robot shapes with this bit alone
 COLLISION = 3  # geom group of the robots' collision shapes, including those that do not collide yet
 NAME, HAND = "touch", "hand"  # the readings, and the prefixes of their sensors' names
+STRONGEST, NET = 2, 3  # what a contact sensor gives: the force of the strongest contact, or that of all, in the world's axes
 # Shapes that every backend can collide with a box.
 MEETS_BOX = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH}
 _SAMPLES = 1000  # postures in which links are tested
@@ -68,47 +67,16 @@ def collision_shapes(spec: mujoco.MjSpec, base: str) -> list:
     return geoms
 
 
-def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, reading: str = NAME) -> None:
-    """Adds a sensor of the strongest contact of a geom: with another one, or with anything."""
-    data, strongest = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2
+def add_sensor(spec: mujoco.MjSpec, first: str, second: str | None = None, reading: str = NAME, reduce: int = STRONGEST) -> None:
+    """Adds a sensor of the contact force of a geom: with another one, or with anything."""
     spec.add_sensor(
         name=":".join(filter(None, (reading, first, second))),
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_GEOM,
         objname=first,
         **({"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": second} if second else {}),
-        intprm=[data, strongest, 1],
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), reduce, 1],
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Reader:
-    """Computes the strongest contact's force [*b] [N] from sensor values [*b, nsensordata], in NumPy or JAX.
-
-    Attributes:
-        addresses: place of each contact's force, three numbers, among the sensor values.
-        pairs: geoms whose contacts count, booleans [ngeom, ngeom].
-    """
-
-    addresses: np.ndarray
-    pairs: np.ndarray
-
-    def __call__(self, values: Any) -> Any:
-        """Returns the force."""
-        return (values[..., self.addresses[:, None] + np.arange(3)] ** 2).sum(-1).max(-1) ** 0.5
-
-
-def readers(model: mujoco.MjModel) -> dict[str, Reader]:
-    """Makes the readers of a model's sensors, by name in ``Sim.readings``. Empty if the scene has no such sensor."""
-    found = {}
-    for name in (NAME, HAND):
-        ours = [i for i in range(model.nsensor) if model.sensor(i).name.startswith(f"{name}:")]
-        pairs = np.zeros((model.ngeom, model.ngeom), bool)
-        for first, second in zip(model.sensor_objid[ours], model.sensor_refid[ours], strict=True):
-            pairs[first, second if second >= 0 else slice(None)] = True
-        if ours:
-            found[name] = Reader(np.array(model.sensor_adr[ours]), pairs | pairs.T)
-    return found
 
 
 @functools.cache

@@ -25,7 +25,6 @@ DENSITY = 2000.0  # [kg/m3] stone: light round objects sink deep into the pads, 
 LEAST = 3  # fewest objects on the table
 MARGIN = 0.003  # [m] between an open hand and the nearest object
 OPEN = 1.5  # opening of the hand in widths of the widest object: a wider hand would collide with the clutter
-QUICK = 0.3  # [s] least closing time of the fingers
 FOOT = 0.1  # [m] least distance of objects from the robot's axis
 LIFTED = 0.005  # [m] held: at least this far above where the largest object of its shape rests
 AWAY = 4.0  # [m] distance of parked objects from the table's centre
@@ -119,7 +118,7 @@ def fitted(robot: RobotCfg, names: Iterable[str] = SHAPES) -> ClutterSetup:
             "lowest": grasp.lowest(robot.pad),
             "beyond": grasp.beyond(robot, edge),
             "aside": tuple(grasp.aside(robot, SIZES[1] * across(item) + 2 * grasp.BESIDE) for item in objects.values()),
-            "closing": round(max(QUICK, grasp.closing_time(robot, thinnest)), 3),
+            "closing": grasp.closing(robot, thinnest, grasp.QUICK),
         },
         grasp_radius=regions.near(there),
     )
@@ -219,6 +218,4 @@ def _fits(scene: SceneCfg) -> dict[str, tuple[int, ...]]:
     }
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default, "four": four}
+PRESETS: Presets = {"default": default, "four": four}

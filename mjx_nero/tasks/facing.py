@@ -4,12 +4,11 @@ import dataclasses
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjx_nero.envs import regions
 from mjx_nero.mdp.handover import Hands
-from mjx_nero.sim import grasp
+from mjx_nero.sim import grasp, quats
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks.building import working
@@ -20,7 +19,6 @@ ALONG, HALF = 0.09, 0.13  # [m] from the bar's middle to a hand, and to its end
 SIDE = math.pi / 2  # [rad] how far each arm turns between its own side and the meeting point
 YAW = 0.25  # [rad] greatest turn of the bar at the start; unturned, it points straight away from the first arm
 WIDER = 2.0  # opening of the hands, in widths of the bar
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 AWAY = 0.05  # [m] distance from the bar's axis beyond which a hand has left it
 JOINTS = 6  # fewest joints of an arm that can point its hand down all around itself
 
@@ -68,8 +66,7 @@ def _side(robot: RobotCfg, edge: float, faces: float, aside: float) -> Side:
     quarter = round(float(np.arctan2(*pick.mean(1)[1::-1])) / SIDE)  # direction of its front, in quarter turns
     front = np.sort(np.abs(pick[quarter % 2]))
     half = (faces - quarter * SIDE) / 2
-    quat = np.zeros(4)
-    mujoco.mju_mulQuat(quat, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array(robot.base_quat))
+    quat = quats.product([math.cos(half), 0.0, 0.0, math.sin(half)], robot.base_quat)
     w, x, y, z = (round(float(v), 6) for v in quat)
     robot = dataclasses.replace(working(grasp.opened(robot, WIDER * edge)), base_quat=(w, x, y, z))
     ahead = regions.turn_to(robot, math.cos(faces), math.sin(faces))
@@ -177,7 +174,7 @@ class Pair:
             "turns": tuple(side.turn for side in sides),
             "lowest": tuple(round(grasp.lowest(side.robot.pad), 4) for side in sides),
             "beyond": tuple(grasp.beyond(side.robot, edge) for side in sides),
-            "closing": tuple(round(max(CLOSING, grasp.closing_time(side.robot, edge)), 3) for side in sides),
+            "closing": tuple(grasp.closing(side.robot, edge) for side in sides),
             **ik,
         }
 

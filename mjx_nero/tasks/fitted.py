@@ -136,17 +136,17 @@ def _presets(fit: Callable, **factories: Callable) -> Presets:
 # These tasks take all they need from the robot, so ``nero_place`` and ``place --robot nero`` are the same task. For the other
 # tasks an arm may have its own numbers, as ``nero_lift`` has those of its recipe.
 FITTING: dict[str, Presets] = {
-    "clutter": clutter.presets(),
-    "open_drawer": open_drawer.presets(),
-    "open_door": open_door.presets(),
-    "turn_knob": turn_knob.presets(),
-    "lift_any": lift_any.presets(),
-    "insert_peg": insert_peg.presets(),
-    "hang_ring": hang_ring.presets(),
-    "reorient": reorient.presets(),
-    "push": push.presets(),
-    "place": _presets(_tower, **place.presets()),
-    "stack": _presets(_tower, **stack.presets()),
+    "clutter": clutter.PRESETS,
+    "open_drawer": open_drawer.PRESETS,
+    "open_door": open_door.PRESETS,
+    "turn_knob": turn_knob.PRESETS,
+    "lift_any": lift_any.PRESETS,
+    "insert_peg": insert_peg.PRESETS,
+    "hang_ring": hang_ring.PRESETS,
+    "reorient": reorient.PRESETS,
+    "push": push.PRESETS,
+    "place": _presets(_tower, **place.PRESETS),
+    "stack": _presets(_tower, **stack.PRESETS),
 }
 
 
@@ -179,5 +179,5 @@ ENVS: Envs = {
     "reach_obstacles": (None, reach_obstacles.presets()),
     "lift_obstacles": (None, lift_obstacles.presets()),
     **{name: (None, presets) for name, presets in FITTING.items()},
-    "handover": (None, handover.presets()),
+    "handover": (None, handover.PRESETS),
 }

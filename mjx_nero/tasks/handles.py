@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import PositiveRange, Range
@@ -15,7 +14,7 @@ from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, SuccessCfg, 
 from mjx_nero.mdp import commands, fixtures, observations, randomization, rewards, terminations
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
-from mjx_nero.sim import contacts, grasp
+from mjx_nero.sim import contacts, grasp, quats
 from mjx_nero.sim import fixtures as models
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -24,31 +23,11 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 OPEN = 0.06  # [m] greatest opening of the hand: handles are less than 2 cm wide
 NEAR = 0.04  # [m] distance from the grasp point within which the handle counts as in the hand
-CLOSING = 0.4  # [s] least closing time of the script's fingers
+TILT = math.radians(15)  # of the hand from level, fingertips down
 SPEED = 0.02  # [m/s] speed above which the handle counts as moved
 OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] offsets of the fixture
 HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
 LIMIT: PositiveRange = (0.9, 1.1)  # factor of the upper limit
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """A place where a robot can take hold of a handle in front of it and pull it by 16 cm.
-
-    Attributes:
-        at: the handle, ``x``, ``y`` and ``z`` in the robot's root frame [m].
-        pitch: tilt of the hand from level, fingertips down [rad].
-    """
-
-    at: tuple[float, float, float]
-    pitch: float = 0.0
-
-
-def place(robot: RobotCfg) -> Place:
-    """Derives the place from the robot's ``workspace``: beyond its middle, in its upper half."""
-    box = np.array(regions.box(robot, "workspace", "where it can work"))
-    (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
-    return Place((round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)), math.radians(15))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,17 +39,23 @@ class Task:
         handle: what to take hold of, without ``grip``, which ``held`` adds.
         middle: offset of the handle along y from ``place`` at the start, so that its path lies in front of the robot [m].
         follow, beyond: see ``FollowJointCfg``.
-        level: the hand stays level, whatever ``place`` says.
+        level: the hand stays level, in place of tilted by ``TILT``.
     """
 
     robot: RobotCfg
-    place: Place
     file: str
     handle: Handle
     middle: float = 0.0
     follow: float = 1.0
     beyond: float = 0.0
     level: bool = False
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Where the robot can take hold of a handle and pull it by 16 cm: beyond its workspace's middle, in its upper half."""
+        box = np.array(regions.box(self.robot, "workspace", "where it can work"))
+        (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
+        return round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)
 
     @functools.cached_property
     def builder(self) -> RobotCfg:
@@ -80,14 +65,15 @@ class Task:
     @functools.cached_property
     def held(self) -> Handle:
         """The handle with the grip of the robot's hand."""
-        tilt = 0.0 if self.level else self.place.pitch
+        tilt = 0.0 if self.level else TILT
         # From pointing down with the fingers opening along y: forward, then down by the tilt.
-        forward = _turn((0.0, 1.0, 0.0), tilt - math.pi / 2)
+        forward = quats.about((0.0, 1.0, 0.0), tilt - math.pi / 2)
         _, site = models.at_rest(self.file, self.handle.site)
         # The bar lies along the site's z axis. If that is horizontal, the hand makes a quarter turn about its approach.
         lies = abs(1 - 2 * (site[1] ** 2 + site[2] ** 2)) < 0.5
-        hand = _product(forward, _product(_turn((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0), self.robot.down))
-        grip = _product(site * [1, -1, -1, -1], hand)
+        about = quats.about((0.0, 0.0, 1.0), math.pi / 2 if lies else 0.0)
+        hand = quats.product(forward, quats.product(about, self.robot.down))
+        grip = quats.product(site * [1, -1, -1, -1], hand)
         w, x, y, z = (round(float(part), 6) + 0.0 for part in grip)
         return dataclasses.replace(self.handle, grip=(w, x, y, z))
 
@@ -95,7 +81,7 @@ class Task:
     def scene(self) -> SceneCfg:
         """The scene, with the fixture placed so that the robot can move its handle."""
         at, _ = models.at_rest(self.file, self.handle.site)
-        wanted = np.array(self.robot.base_pos) + self.place.at + [0.0, self.middle, 0.0]
+        wanted = np.array(self.robot.base_pos) + self.place + [0.0, self.middle, 0.0]
         x, y, z = (round(float(v), 4) + 0.0 for v in wanted - at)
         scene = scenes.around(
             self.robot, SceneCfg(objects={}, fixtures={self.file: FixtureCfg(self.file, (x, y, z))}, goal="none")
@@ -111,7 +97,7 @@ class Task:
             **{f"handle.{name}": value for name, value in dataclasses.asdict(self.held).items()},
             "beyond": self.beyond,
             "follow": self.follow,
-            "closing": round(max(CLOSING, grasp.closing_time(self.builder, 0.0)), 3),
+            "closing": grasp.closing(self.builder, 0.0),
         }
         return {"follow_joint": {**fields, **regions.ik(self.robot, "ik.")}}
 
@@ -187,15 +173,3 @@ class Task:
             training=CALM,
             budget=Budget(steps=60_000_000, steps_on_cpu=5_000_000),
         )
-
-
-def _turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(quat, np.array(axis), angle)
-    return quat
-
-
-def _product(a: Any, b: Any) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_mulQuat(quat, np.asarray(a, float), np.asarray(b, float))
-    return quat

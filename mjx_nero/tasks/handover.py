@@ -7,7 +7,18 @@ import functools
 from collections.abc import Callable
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import SHOWN, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, arm_state, nearer, stays_on_table
+from mjx_nero.envs.task import (
+    SHOWN,
+    Budget,
+    CurriculumCfg,
+    EnvCfg,
+    Presets,
+    SuccessCfg,
+    arm_state,
+    nearer,
+    on_table,
+    stays_on_table,
+)
 from mjx_nero.mdp import actions, commands, events, handover, metrics, observations, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import contacts
@@ -93,10 +104,10 @@ def _goal(two: Pair) -> CommandTerm:
 def _start(two: Pair) -> dict[str, Term]:
     """The bar: beside the giver, out from its base."""
     (x, y, _), (across, out) = two.giver.robot.base_pos, two.ways(two.giver)
-    place = {"x": regions.span(x + across[0], x + across[1]), "y": regions.span(y - out[1], y - out[0]), "z": (0.0, 0.0)}
+    place = regions.span(x + across[0], x + across[1]), regions.span(y - out[1], y - out[0])
     yaw = regions.span(-SIDE - YAW, YAW - SIDE)
     return {
-        "reset_object_position": Term(events.object_position_uniform, params={**place, "object": BAR}),
+        **on_table(*place, object=BAR),
         "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, "object": BAR}),
     }
 
@@ -144,9 +155,7 @@ def default(robot: RobotCfg, taker: RobotCfg | None = None) -> EnvCfg:
     )
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}
 
 
 def taken_by(taker: RobotCfg) -> Presets:

@@ -45,6 +45,4 @@ def default(robot: RobotCfg) -> EnvCfg:
     return task.cfg({"put_thing": put})
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}

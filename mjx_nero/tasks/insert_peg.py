@@ -59,11 +59,9 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
     return task.cfg({"put_in": put})
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {
-        "default": inserting,
-        "tight": functools.partial(inserting, clearance=TIGHT),
-        "round": functools.partial(inserting, square=False),
-        "round_tight": functools.partial(inserting, clearance=TIGHT, square=False),
-    }
+PRESETS: Presets = {
+    "default": inserting,
+    "tight": functools.partial(inserting, clearance=TIGHT),
+    "round": functools.partial(inserting, square=False),
+    "round_tight": functools.partial(inserting, clearance=TIGHT, square=False),
+}

@@ -15,18 +15,18 @@ from mjx_nero.envs.task import (
     arm_state,
     joint_actions,
     nearer,
+    on_table,
+    stays_on_table,
     step_weights,
     velocity_actions,
 )
-from mjx_nero.mdp import commands, events, metrics, observations, rewards, terminations
-from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, groups
+from mjx_nero.mdp import commands, metrics, observations, rewards, terminations
+from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, groups
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks import sim2real as sim2reals
-
-CLOSING = 0.3  # [s] least closing time of the script's fingers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ class LiftSetup:
         fields = {
             "lowest": grasp.lowest(robot.pad),
             "beyond": grasp.beyond(robot, edge),
-            "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+            "closing": grasp.closing(robot, edge, grasp.QUICK),
         }
         return {"pick_up": {**fields, **regions.ik(robot, "ik.")}}
 
@@ -71,6 +71,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
     Kept for comparison. Its lifting reward has a loophole: a cube knocked into the air scores like a held one. The recipe
     switches observation corruption on but gives no term a noise range, so none applies.
     """
+    ends = stays_on_table(setup.scene)
     return EnvCfg(
         robot=robot,
         episode_length_s=5.0,
@@ -93,12 +94,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
                 }
             ),
         },
-        events={
-            "reset_object_position": Term(
-                events.object_position_uniform,
-                params={"x": setup.cube[0], "y": setup.cube[1], "z": (0.0, 0.0)},
-            ),
-        },
+        events=on_table(*setup.cube),
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.05}),
             "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=setup.lifted),
@@ -111,13 +107,10 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
         },
         curriculum=CurriculumCfg(weights=step_weights(10_000, action_rate=-1e-1, joint_vel=-1e-1)),
         terminations={
-            "time_out": DoneTerm(terminations.time_out, time_out=True),
+            "time_out": ends["time_out"],
             "object_dropping": DoneTerm(terminations.object_below, params={"minimum_height": -0.05}),
             # The simulated table has no edge to fall from, so leaving the drawn table counts as a fall.
-            "object_off_table": DoneTerm(
-                terminations.object_off_table,
-                params={"center": setup.scene.table_center, "size": setup.scene.table_size},
-            ),
+            "object_off_table": ends["object_off_table"],
         },
     )
 

@@ -18,10 +18,11 @@ from mjx_nero.envs.task import (
     arm_state,
     object_at_goal,
     observed,
+    on_table,
     stays_on_table,
     velocity_actions,
 )
-from mjx_nero.mdp import commands, events, metrics, observations
+from mjx_nero.mdp import commands, metrics, observations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, objects
 from mjx_nero.sim import scene as scenes
@@ -69,9 +70,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         metrics=metrics.grasping(**held),
         observations=observed(state, **one),
         events={
-            "reset_object_position": Term(
-                events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}
-            ),
+            **on_table(*there.cube, **one),
             "reset_object_shape": Term(thing_events.at_rest, params={"files": files, **one}),
         },
         rewards=carrying(held, **one),
@@ -82,7 +81,5 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
     )
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    kinds = {"default": SEEN, "held_out": HELD_OUT, "all": (*SEEN, *HELD_OUT)}
-    return {name: functools.partial(lifting, files=files) for name, files in kinds.items()}
+_KINDS = {"default": SEEN, "held_out": HELD_OUT, "all": (*SEEN, *HELD_OUT)}
+PRESETS: Presets = {name: functools.partial(lifting, files=files) for name, files in _KINDS.items()}

@@ -4,9 +4,9 @@ import dataclasses
 import functools
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
-from mjx_nero.mdp import commands, events, metrics, observations, rewards, success, terminations
-from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets, on_table, stays_on_table
+from mjx_nero.mdp import commands, metrics, observations, rewards, success
+from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 
@@ -55,24 +55,14 @@ def default(robot: RobotCfg, setup: PickPlaceSetup) -> EnvCfg:
                 }
             ),
         },
-        events={
-            "reset_object_position": Term(
-                events.object_position_uniform, params={"x": setup.cube[0], "y": setup.cube[1], "z": (0.0, 0.0)}
-            ),
-        },
+        events=on_table(*setup.cube),
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
             "goal_tracking": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.3}),
             "goal_tracking_fine": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.05}),
             "joint_vel": RewardTerm(rewards.joint_vel_l2, weight=-1e-4),
         },
-        terminations={
-            "time_out": DoneTerm(terminations.time_out, time_out=True),
-            "object_off_table": DoneTerm(
-                terminations.object_off_table,
-                params={"center": setup.scene.table_center, "size": setup.scene.table_size},
-            ),
-        },
+        terminations=stays_on_table(setup.scene),
     )
 
 

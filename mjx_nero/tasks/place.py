@@ -75,6 +75,4 @@ def _lifted(box: ObjectCfg) -> float:
     return round((math.hypot(long, high) - high) / 2 + high / 20, 4)
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, observed, stays_on_table
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, observed, on_table, stays_on_table
 from mjx_nero.mdp import commands, events, observations, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -31,7 +31,7 @@ def default(robot: RobotCfg) -> EnvCfg:
     x, y, _ = regions.box(robot, "pick", "where on the table it can point down")
     dx, dy, dz = robot.base_pos
     box, object = _box(robot), {"object": "box"}
-    start = {"x": regions.span(x[0] + dx, x[1] + dx), "y": regions.span(y[0] + dy, y[1] + dy), "z": (0.0, 0.0)}
+    start = regions.span(x[0] + dx, x[1] + dx), regions.span(y[0] + dy, y[1] + dy)
     scene = scenes.around(robot, SceneCfg(objects={"box": box}, goal="box"))
     hand = dataclasses.replace(robot.gripper, home=robot.gripper.close)
     back = round(box.size[0] / 2 + robot.pad[0] / 2, 4)  # distance of the hand from the centre, when beside the box
@@ -62,7 +62,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         ),
         observations=observed(state, **object),
         events={
-            "reset_object_position": Term(events.object_position_uniform, params={**start, **object}),
+            **on_table(*start, **object),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": TURN, **object}),
         },
         rewards={
@@ -90,6 +90,4 @@ def default(robot: RobotCfg) -> EnvCfg:
     )
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}

@@ -18,7 +18,6 @@ from mjx_nero.tasks.building import Tower
 from mjx_nero.types import UserError
 
 OPEN = 0.06  # [m] greatest opening of the hand
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 LENGTH = 15.0  # [s] of an episode: with velocity actions, which only approach the script's targets, the script is slow
 APART = 0.08  # [m] least distance from the object's start to the fixture, along the table
 WRIST = {"offset": (0.5, 0.5, 0.5, 0.02, 0.02, 0.02), "noise": (0.2, 0.2, 0.2, 0.01, 0.01, 0.01), "scale": 0.05, "delay": (0, 1)}
@@ -181,7 +180,7 @@ def picking(robot: RobotCfg, width: float, lowest: float, above: float, **own: A
         "lowest": round(lowest, 4),
         "beyond": grasp.beyond(robot, width),
         "aside": (grasp.aside(robot, width + 2 * grasp.BESIDE),),
-        "closing": round(max(CLOSING, grasp.closing_time(robot, width)), 3),
+        "closing": grasp.closing(robot, width),
         "above": round(above, 4),
         **TIGHT,
         **regions.ik(robot, "ik."),

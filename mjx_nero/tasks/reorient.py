@@ -15,9 +15,10 @@ from mjx_nero.envs.task import (
     SuccessCfg,
     arm_state,
     observed,
+    on_table,
     stays_on_table,
 )
-from mjx_nero.mdp import events, metrics, observations, rewards, sides, towers
+from mjx_nero.mdp import metrics, observations, rewards, sides, towers
 from mjx_nero.mdp.sides import Lying
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
@@ -33,7 +34,6 @@ STILL = 0.005  # [m/s]
 LIFTED = 0.01  # [m] height of a held box above the highest that it reaches when tipped over an edge
 AWAY = 0.02  # [m] clearance of the pads beside a box that the hand has left
 YAW = (-0.3, 0.3)  # [rad] heading of the box at the start
-CLOSING = 0.4  # [s] least closing time of the script's fingers
 JOINTS = 6  # fewest joints of an arm whose hand can lean in any direction
 # How the script moves with six joints. With seven, inverse kinematics also turns the other joints when it lifts the hand.
 ROUND = {"clear": 0.02, "rises": 0.15}
@@ -81,7 +81,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "beyond": grasp.beyond(robot, edge),
         "lift": round(1.2 * edge, 4),
         "before": round(lying.clearance + LIFTED, 4),
-        "closing": round(max(CLOSING, grasp.closing_time(robot, edge)), 3),
+        "closing": grasp.closing(robot, edge),
         **(ROUND if len(robot.arm.joints) == JOINTS else {}),
         **regions.ik(robot, "ik."),
     }
@@ -100,9 +100,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         metrics=metrics.grasping(minimal_height=lying.minimal_height, grasp_radius=lying.grasp_radius, **one),
         observations=observed(state, **one),
         events={
-            "reset_object_position": Term(
-                events.object_position_uniform, params={"x": there.cube[0], "y": there.cube[1], "z": (0.0, 0.0), **one}
-            ),
+            **on_table(*there.cube, **one),
             "reset_object_side": Term(sides.other_side_up, params={"base": robot.base_pos, "yaw": YAW, **one}),
         },
         rewards={
@@ -125,6 +123,4 @@ def default(robot: RobotCfg) -> EnvCfg:
     )
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default}
+PRESETS: Presets = {"default": default}

@@ -73,6 +73,4 @@ def _each(objects, name, func, noise=0.0) -> dict[str, ObservationTerm]:
     return {name.format(each): ObservationTerm(func, params={"object": each}, noise=noise) for each in objects}
 
 
-def presets() -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": default, "three": three}
+PRESETS: Presets = {"default": default, "three": three}

@@ -1,6 +1,5 @@
 """Turn a knob to a commanded angle. For any robot with a gripper."""
 
-import functools
 import math
 
 from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg
@@ -8,17 +7,16 @@ from mjx_nero.mdp import commands, fixtures
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.mdp.terms import RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.tasks import handles
-from mjx_nero.tasks.handles import Place, Task
+from mjx_nero.tasks.handles import Task
 
 WITHIN = math.radians(5)
 ANGLES = (math.radians(30), math.radians(70))  # of the command, to either side
 HANDLE = Handle("knob", "knob", "knob", lever=0.03)
 
 
-def default(robot: RobotCfg, place: Place | None = None) -> EnvCfg:
+def default(robot: RobotCfg) -> EnvCfg:
     """Success: the knob is within 5 degrees of the commanded angle, 30 to 70 degrees to either side."""
-    task = Task(robot, place or handles.place(robot), "knob", HANDLE, level=True)
+    task = Task(robot, "knob", HANDLE, level=True)
     held = {"handle": task.held}
     within = {"within": round(WITHIN, 5), **held}
     return task.cfg(
@@ -36,6 +34,4 @@ def default(robot: RobotCfg, place: Place | None = None) -> EnvCfg:
     )
 
 
-def presets(place: Place | None = None) -> Presets:
-    """Maps preset -> robot -> config, the default first."""
-    return {"default": functools.partial(default, place=place)}
+PRESETS: Presets = {"default": default}

@@ -59,8 +59,7 @@ def main(argv: Sequence[str]) -> None:
             files.write_json(args.json, held)  # each time: a killed process leaves what it has measured
             print(f"{name}: {row.get('reason') or _said(row)}", file=sys.stderr)
     if args.markdown:
-        with files.whole(args.markdown) as part:
-            part.write_text(markdown(commits, robots, held))
+        files.write(args.markdown, markdown(commits, robots, held).encode())
 
 
 def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:

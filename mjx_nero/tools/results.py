@@ -87,8 +87,7 @@ def main(argv: Sequence[str]) -> None:
         table.add(*line)
     console.screen().print(table)
     if args.markdown:
-        with files.whole(args.markdown) as part:
-            part.write_text(page(cells, args.json.name, args.markdown.name))
+        files.write(args.markdown, page(cells, args.json.name, args.markdown.name).encode())
 
 
 def learnable() -> list[str]:

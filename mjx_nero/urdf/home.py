@@ -13,6 +13,7 @@ from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.primitives import Primitive
 from mjx_nero.urdf.regions import Place, Quat
 from mjx_nero.urdf.report import Notes
+from mjx_nero.urdf.rest import seen
 from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
 from mjx_nero.urdf.workspace import Box
 
@@ -209,8 +210,7 @@ def _touching(
     out = np.zeros(n, bool)
     surfaces: dict[str, Points] = {}
     for body in parts.values():
-        found = [look.points @ at[:3, :3].T + at[:3, 3] for link, at in body.links.items() if (look := _seen(looks[link]))]
-        if found:
+        if found := seen(body, looks):
             points = np.concatenate(found)
             surfaces[body.name] = points[:: 1 + len(points) // POINTS]
     for link, shape, _ in shapes:
@@ -234,7 +234,3 @@ def _apart(parts: dict[str, Body], a: str, b: str) -> int:
 
 def _line(parts: dict[str, Body], name: str) -> list[str]:
     return [name, *_line(parts, parts[name].parent)] if name else []
-
-
-def _seen(look: Look) -> Look | None:
-    return look if look.points is not None and not look.guessed else None

@@ -7,8 +7,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
+from mjx_nero.sim import quats
 from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
 from mjx_nero.urdf import chain as chain_of
@@ -21,7 +21,7 @@ from mjx_nero.urdf.drawing import Visual
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.geometry import Looks
 from mjx_nero.urdf.report import Notes, Report
-from mjx_nero.urdf.tree import Body, Pose, Tree, bodies, positions
+from mjx_nero.urdf.tree import Body, Tree, bodies, positions
 from mjx_nero.urdf.tree import poses as body_poses
 from mjx_nero.urdf.units import METRES, Units, check_lengths
 
@@ -197,7 +197,7 @@ def _robot(
         ee_site=made.site,
         base_link=made.tree.root,
         base_pos=_floats(stand.mount[:3, 3]),
-        base_quat=_floats(_quat(stand.mount)),
+        base_quat=_floats(quats.of_matrix(stand.mount[:3, :3])),
         down=down,
         gravity_compensation=True,
         workspace=boxes[0],
@@ -288,12 +288,6 @@ def _joint_rows(
 
 def free(name: str, taken: Sequence[str]) -> str:
     return name if name not in taken else free(f"{name}_site", taken)
-
-
-def _quat(pose: Pose) -> Float[np.ndarray, "4"]:
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).reshape(-1))
-    return quat
 
 
 def _floats(values: np.ndarray) -> Any:

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterable, Mapping
 
-import mujoco
 import numpy as np
 from lxml import etree
 
+from mjx_nero.sim import quats
 from mjx_nero.urdf import primitives
 from mjx_nero.urdf.drawing import Visual
 from mjx_nero.urdf.tree import Body, Joint, Mass, Pose
@@ -127,8 +127,7 @@ def _drawn(element: etree._Element, item: Visual, at: Pose) -> None:
 
 def _pose(pose: Pose) -> dict[str, str]:
     """Writes ``pos`` and ``quat``, omitted where they are zero."""
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(pose[:3, :3]).reshape(-1))
+    quat = quats.of_matrix(pose[:3, :3])
     out = {} if not pose[:3, 3].any() else {"pos": _text(pose[:3, 3])}
     return out if np.array_equal(np.abs(quat), [1, 0, 0, 0]) else {**out, "quat": _text(quat)}
 

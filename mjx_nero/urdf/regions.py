@@ -4,11 +4,10 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_nero.sim import grasp
+from mjx_nero.sim import grasp, quats
 from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.primitives import Primitive
@@ -148,9 +147,7 @@ def _half_turn(down: Quat) -> Quat:
 
 def opening(down: Quat) -> Vec:
     """Direction in the grasp point's frame that lies along y when the hand has the orientation ``down``."""
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, np.array(down))
-    return turn.reshape(3, 3).T @ np.array([0.0, 1.0, 0.0])
+    return quats.matrix(down).T @ np.array([0.0, 1.0, 0.0])
 
 
 def _text(box: Box) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Body, Pose, body_of
+from mjx_nero.urdf.tree import Body, Points, Pose, body_of
 
 SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal on the floor beside the table
 UPRIGHT = 0.99  # least cosine of a base's tilt on the table
@@ -34,7 +34,7 @@ def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: 
     table's height. A hanging robot hangs where the table is within reach.
     """
     base = next(iter(parts.values()))
-    points = [(look.points @ at[:3, :3].T + at[:3, 3]) for link, at in base.links.items() if (look := _seen(looks[link]))]
+    points = seen(base, looks)
     low = min(float((p @ mount[2, :3]).min()) for p in points) if points else 0.0
     chain = _chain(parts, hand)
     shoulder = float((mount[:3, :3] @ _pose(parts, chain[0].name)[:3, 3])[2]) if chain else 0.0
@@ -104,5 +104,7 @@ def _pose(parts: dict[str, Body], name: str) -> Pose:
     return _pose(parts, parts[name].parent) @ parts[name].frame if parts[name].parent else parts[name].frame
 
 
-def _seen(look: Look) -> Look | None:
-    return look if look.points is not None and not look.guessed else None
+def seen(body: Body, looks: Mapping[str, Look]) -> list[Points]:
+    """Surface points [n, 3] of each of a body's links whose collision meshes were read, in the body's frame."""
+    known = [(looks[link], at) for link, at in body.links.items()]
+    return [look.points @ at[:3, :3].T + at[:3, 3] for look, at in known if look.points is not None and not look.guessed]

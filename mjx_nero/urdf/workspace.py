@@ -3,11 +3,11 @@
 import itertools
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 from jaxtyping import Bool, Int
 
 from mjx_nero import config
+from mjx_nero.sim import quats
 from mjx_nero.types import UserError
 from mjx_nero.urdf.cloud import Cloud
 from mjx_nero.urdf.fingers import Hand
@@ -203,11 +203,10 @@ def down(cloud: Cloud, hand: Hand, box: Box | None, home: Mapping[str, float]) -
     turned = (first @ opening)[1]
     if (first @ approach)[2] < -DOWNWARD and abs(turned) > TURNED:
         votes = [turned > 0, turned < 0]
-    quats = []
+    found = []
     for turn in turns:
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(turn).reshape(-1))
-        quats.append(quat * (np.sign(quat[np.argmax(np.abs(quat))]) or 1.0))
-    better = int(votes[1] > votes[0]) if votes[0] != votes[1] else int(abs(quats[1][1]) > abs(quats[0][1]))
-    w, x, y, z = (float(round(v, 9)) + 0.0 for v in quats[better])
+        quat = quats.of_matrix(turn)
+        found.append(quat * (np.sign(quat[np.argmax(np.abs(quat))]) or 1.0))
+    better = int(votes[1] > votes[0]) if votes[0] != votes[1] else int(abs(found[1][1]) > abs(found[0][1]))
+    w, x, y, z = (float(round(v, 9)) + 0.0 for v in found[better])
     return w, x, y, z

@@ -9,7 +9,7 @@ import pytest
 import slides
 
 from mjx_nero import UserError
-from mjx_nero.sim import forces, scene
+from mjx_nero.sim import readings, scene
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -105,13 +105,13 @@ def test_the_wrist_is_where_the_hand_is_mounted(robot, hand, pads):
     model = scene.build(robot, SceneCfg(sensors=("wrist", "fingers")), SimCfg(), visuals=False, fuse=True)
     body, last = model.site_bodyid[model.site("wrist").id], model.joint(robot.arm.joints[-1]).bodyid[0]
     assert model.body_parentid[body] == last and (hand is None or model.body(body).name == hand)
-    gauges = forces.gauges(model)
-    assert gauges["wrist"].size == 6 and gauges["fingers"].size == pads
+    found = readings.of(model)
+    assert found["wrist"].size == 6 and found["fingers"].size == pads
 
 
 def test_a_scene_without_them_has_none():
     model = scene.build(NERO, SceneCfg(), SimCfg(), visuals=False, fuse=True)
-    assert forces.gauges(model) == {} and model.nsensor == 0
+    assert readings.of(model) == {} and model.nsensor == 0
 
 
 def test_a_robot_without_pads_is_told():

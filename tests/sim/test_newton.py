@@ -98,7 +98,7 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), n))
     warp = WarpPhysics(env.physics_model, env.cfg.sim)
     warp.prepare(n)
-    loaded = dict(warp._made)
+    loaded = dict(warp._get._made)
     warp_step, targets = jax.jit(jax.vmap(warp.step)), jax.jit(jax.vmap(env.targets))
     for t in range(100):
         action = trained.act(state.obs)
@@ -113,7 +113,7 @@ def test_a_control_step_is_mujocos_while_cubes_are_held():
             np.testing.assert_allclose(ours.time, sim.time + 0.02, atol=1e-6)
         state = step(state, action)
     assert (state.pipeline_state.qpos[:, 11] > 0.05).sum() >= n // 2  # most cubes are in the air
-    assert warp._made == loaded and len(loaded) == 1  # the steps have taken what was loaded before them
+    assert warp._get._made == loaded and len(loaded) == 1  # the steps have taken what was loaded before them
 
     # The same without a batch, and with two batch axes.
     one = jax.tree.map(lambda x: x[0], (sim, ctrl))

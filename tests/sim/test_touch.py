@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_nero.sim import scene, touch
+from mjx_nero.sim import readings, scene, touch
 from mjx_nero.sim.obstacles import FIELDS, Obstacles
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.physics.native import NativePhysics
@@ -150,8 +150,8 @@ def test_what_the_robot_presses_an_object_with_is_read_and_nothing_else():
     """A cube on the table, an arm's length away; the same on the inside of a finger."""
     model = scene.build(NERO, SceneCfg(sensors=("hand",)), SimCfg(), visuals=False, fuse=True)
     plain = scene.build(NERO, SceneCfg(), SimCfg(), visuals=False, fuse=True)
-    (name, reader), data = next(iter(touch.readers(model).items())), mujoco.MjData(model)
-    assert name == touch.HAND and len(touch.readers(model)) == 1 and not touch.readers(plain)
+    (name, reader), data = next(iter(readings.of(model).items())), mujoco.MjData(model)
+    assert name == touch.HAND and len(readings.of(model)) == 1 and not readings.of(plain)
     for joint, at in zip(NERO.joints, NERO.home, strict=True):
         data.joint(joint).qpos = at
     data.joint("cube").qpos = [0.3, 0.3, 0.0149, 1, 0, 0, 0]

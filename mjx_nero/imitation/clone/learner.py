@@ -22,7 +22,8 @@ from mjx_nero.data import open_dataset
 from mjx_nero.data.episode import DONE_BY, SEEN, Dataset
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.clone.cfg import PRESETS, CloneCfg
-from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn import learner
+from mjx_nero.learn.learner import HELD, Kind, Observation
 from mjx_nero.learn.ppo.cfg import differing
 from mjx_nero.learn.ppo.networks import ACTOR, from_meta, init_params, make_act, make_networks
 from mjx_nero.types import Bank, Key, Shown
@@ -40,7 +41,7 @@ class CloneState:
     slow: Array  # factor of the learning rate
 
 
-class Learner:
+class Learner(learner.Learner):
     """A ``learner.Learner`` that learns from demonstrations.
 
     Args:
@@ -83,10 +84,6 @@ class Learner:
         opt_state = self._optimizer.init(params.policy)
         return CloneState(normalizer, params, opt_state, jnp.zeros((), jnp.int32), seed, jnp.ones(()))
 
-    def place(self, state: CloneState) -> CloneState:
-        """Returns the state: there is only one device."""
-        return state
-
     def run(self, state: CloneState, iterations: int) -> tuple[CloneState, dict[str, Array]]:
         """See ``learner.Learner``."""
         state, losses = jax.lax.scan(lambda s, _: self._iterate(s), state, length=iterations)
@@ -118,14 +115,6 @@ class Learner:
         """Mean squared error of the deterministic action."""
         params = state.normalizer, state.params.replace(policy=policy)
         return jnp.mean((make_act(self._networks, params)({ACTOR: seen}) - done) ** 2)
-
-    def policy(self, state: CloneState) -> tuple:
-        """Returns normalizer and network parameters."""
-        return state.normalizer, state.params
-
-    def with_policy(self, state: CloneState, params: tuple) -> CloneState:
-        """Returns a new state that starts from a policy."""
-        return dataclasses.replace(state, normalizer=params[0], params=params[1])
 
     def slower(self, state: CloneState) -> CloneState:
         """Returns the state with a tenth of the learning rate, and other random draws."""
@@ -176,10 +165,4 @@ def _same(path: pathlib.Path, found: Dataset, what: str, name: str, size: int) -
         raise UserError(f"{path} holds no episode yet")
 
 
-KIND = Kind(
-    make=Learner,
-    presets=PRESETS,
-    policy=from_meta,
-    held={"[0]": ".normalizer", "[1]": ".params"},
-    differing=differing,
-)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, held=HELD, differing=differing)

@@ -28,8 +28,8 @@ from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import graph, teachers
 from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
 from mjx_nero.imitation.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
-from mjx_nero.learn import device_memory
-from mjx_nero.learn.learner import Kind, Observation, repeated
+from mjx_nero.learn import device_memory, learner
+from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
@@ -57,7 +57,7 @@ class Batch:
     label: jax.Array
 
 
-class Learner:
+class Learner(learner.Learner):
     """A student on a batch of environments.
 
     Args:
@@ -95,19 +95,6 @@ class Learner:
             normalizer, params, self._optimizer.init(params), env_state, key, jnp.zeros((), jnp.int32), jnp.ones(())
         )
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)  # none weakly typed, as ``run`` gives none back
-
-    def place(self, state: TrainState) -> TrainState:
-        """Returns the state: there is only one device."""
-        return state
-
-    def policy(self, state: TrainState) -> tuple[Any, Any]:
-        """Returns statistics and parameters."""
-        return state.normalizer, state.params
-
-    def with_policy(self, state: TrainState, params: tuple[Any, Any]) -> TrainState:
-        """Returns a new state that starts from a student."""
-        normalizer, params = params
-        return dataclasses.replace(state, normalizer=normalizer, params=params)
 
     def slower(self, state: TrainState) -> TrainState:
         """Returns the state with a tenth of the learning rate, and other random draws."""
@@ -214,8 +201,6 @@ class Learner:
         return params, opt_state, {name: jnp.mean(value) for name, value in metrics.items()}
 
 
-_HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
-
 _PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=_HELD, graph=graph)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=HELD, graph=graph)

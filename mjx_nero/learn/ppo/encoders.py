@@ -21,11 +21,9 @@ class Encoder(Protocol):
 
     def init(self, key: Key, x: jax.Array, /) -> Any:
         """Makes new variables. ``x``: a term [batch, *shape]."""
-        ...
 
     def apply(self, variables: Any, x: jax.Array, /) -> Any:
         """Computes features [..., n] from a term [..., *shape]."""
-        ...
 
 
 class Flat(linen.Module):

@@ -42,8 +42,8 @@ from jaxtyping import Array, Float, Int
 from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import device_memory, machines
-from mjx_nero.learn.learner import Kind, Observation, repeated
+from mjx_nero.learn import device_memory, learner, machines
+from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
@@ -91,7 +91,7 @@ class Batch:
     advantages: jax.Array
 
 
-class Learner:
+class Learner(learner.Learner):
     """PPO on a batch of environments.
 
     Args:
@@ -167,13 +167,8 @@ class Learner:
 
     def policy(self, state: TrainState) -> tuple:
         """Returns normalizer and network parameters from the first device, for programs that run only there."""
-        params = state.normalizer, state.params
+        params = super().policy(state)
         return jax.tree.map(lambda x: x.addressable_data(0), params) if self._axis else params
-
-    def with_policy(self, state: TrainState, params: tuple) -> TrainState:
-        """Returns a new state that starts from a policy."""
-        normalizer, networks = params
-        return dataclasses.replace(state, normalizer=normalizer, params=networks)
 
     def slower(self, state: TrainState) -> TrainState:
         """Returns the state with a tenth of the learning rate, and other random draws."""
@@ -376,6 +371,4 @@ def _bound_std(policy: dict[str, Any], low: float, high: float) -> dict[str, Any
     return {**policy, "params": {**layers, name: jax.tree.map(lambda x: jnp.clip(x, *bounds), layers[name])}}
 
 
-_HELD = {"[0]": ".normalizer", "[1]": ".params"}  # of ``TrainState``
-
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit, held=_HELD, differing=differing)
+KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, fit=fit, held=HELD, differing=differing)

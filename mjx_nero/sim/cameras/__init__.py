@@ -14,7 +14,8 @@ import mujoco
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.sim.cameras.cfg import CameraCfg
-from mjx_nero.sim.cameras.look import nominal, rows
+from mjx_nero.sim.cameras.look import rows
+from mjx_nero.sim.fields import nominal
 from mjx_nero.types import Picture, Scenery
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
@@ -34,15 +35,13 @@ class Drawer(Protocol):
             fields: fields of the drawn model that differ from world to world, by MuJoCo's names.
             due: False where a camera's picture is not used, and may be anything. None: all are used.
         """
-        ...
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics.prepare``."""
-        ...
 
     def bytes(self) -> int:
         """Returns the memory of one world outside JAX's [bytes]."""
-        ...
+        return 0
 
 
 class Cameras:
@@ -62,7 +61,7 @@ class Cameras:
         model = copy.copy(model)
         model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
         self._model, self._names = model, tuple(cfg)
-        self._nominal = {name: nominal(model, name) for name in fields}
+        self._nominal = nominal(model, fields)
         module, kind = _DRAWERS[renderer]
         self.draw: Drawer = getattr(importlib.import_module(f"{__name__}.{module}"), kind)(model, cfg, tuple(self._nominal))
 

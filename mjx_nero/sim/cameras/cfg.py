@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import Bounds
+from mjx_nero.sim import quats
 from mjx_nero.types import UserError
 
 KINDS = ("rgb", "depth", "segmentation")
@@ -66,6 +67,4 @@ def look_at(pos, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
     back = np.subtract(pos, target) / np.linalg.norm(np.subtract(pos, target))
     right = np.cross(up, back)
     right /= np.linalg.norm(right)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).flatten())
-    return quat
+    return quats.of_matrix(np.column_stack([right, np.cross(back, right), back]))

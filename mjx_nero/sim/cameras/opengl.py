@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool
 
+from mjx_nero.sim.cameras import Drawer
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.render import NO_GL
 from mjx_nero.types import Picture, UserError
@@ -24,7 +25,7 @@ _FAR = 0.999  # share of the farthest distance beyond which a pixel counts as em
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # switched off: the ray tracer has neither
 
 
-class OpenGL:
+class OpenGL(Drawer):
     """See ``cameras.Drawer``. One thread owns OpenGL's context and draws everything."""
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
@@ -57,13 +58,6 @@ class OpenGL:
         shapes = [jax.ShapeDtypeStruct((*lead, *s.shape), s.dtype) for s in self._shapes]
         images = iter(jax.pure_callback(self._draw_all, shapes, packed, vmap_method="broadcast_all"))
         return {name: Picture(**dict(zip(c.kinds, images, strict=False))) for name, c in self._cfg.items()}
-
-    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Does nothing: the context exists already."""
-
-    def bytes(self) -> int:
-        """Returns 0: only one picture is drawn at a time."""
-        return 0
 
     def _open(self) -> None:
         self._data = mujoco.MjData(self._model)
@@ -103,11 +97,14 @@ class OpenGL:
                         image[i] = self._shot(self._renderers[cfg.shape], MARK + name, kind)
 
     def _shot(self, renderer: mujoco.Renderer, camera: str, kind: str) -> np.ndarray:
-        with _mode(renderer, kind):
-            renderer.update_scene(self._data, camera)
-            for flag in _PLAIN:
-                renderer.scene.flags[flag] = False
-            image = renderer.render()
+        renderer.disable_depth_rendering()
+        renderer.disable_segmentation_rendering()
+        if kind != "rgb":
+            getattr(renderer, f"enable_{kind}_rendering")()
+        renderer.update_scene(self._data, camera)
+        for flag in _PLAIN:
+            renderer.scene.flags[flag] = False
+        image = renderer.render()
         if kind == "depth":
             return np.where(image < _FAR * self._far, image, 0.0)
         if kind == "segmentation":
@@ -121,15 +118,3 @@ def _close(thread: concurrent.futures.ThreadPoolExecutor, renderers: Mapping[Any
         for renderer in renderers.values():
             thread.submit(renderer.close)
         thread.shutdown()
-
-
-@contextlib.contextmanager
-def _mode(renderer: mujoco.Renderer, kind: str):
-    if kind == "rgb":
-        yield
-        return
-    getattr(renderer, f"enable_{kind}_rendering")()
-    try:
-        yield
-    finally:
-        getattr(renderer, f"disable_{kind}_rendering")()

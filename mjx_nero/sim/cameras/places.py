@@ -6,6 +6,7 @@ import itertools
 import mujoco
 import numpy as np
 
+from mjx_nero.sim import quats
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.cameras.cfg import CameraCfg, look_at
 from mjx_nero.sim.robot import RobotCfg
@@ -51,7 +52,7 @@ def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
     for far in np.arange(0.2, 5.0, 0.01):
         pos = center + far * ahead
         quat = look_at(pos, center)
-        x, y, z = _rotation(quat).T @ (corners - pos).T
+        x, y, z = quats.matrix(quat).T @ (corners - pos).T
         if (z < 0).all() and (np.abs(y) <= -z * half).all() and (np.abs(x) <= -z * half * size[0] / size[1]).all():
             break
     return CameraCfg(pos=_tuple(pos), quat=_tuple(quat), fovy=fovy, size=size, kinds=kinds)
@@ -70,16 +71,13 @@ def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 @functools.cache
 def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
     """Link, position and orientation of the wrist's camera, which do not depend on its pictures."""
-    model = scenes.robot_model(robot, whole=True)
+    model, data = scenes.at_home(robot, whole=True)
     site = model.site(robot.ee_site).id
     body = int(model.site_bodyid[site])
-    grasp, turn = model.site_pos[site], _rotation(model.site_quat[site])
-    straight = turn @ _rotation(np.array(robot.down)).T  # from the world's axes with the hand pointing down to the link's
+    grasp, turn = model.site_pos[site], quats.matrix(model.site_quat[site])
+    straight = turn @ quats.matrix(robot.down).T  # from the world's axes with the hand pointing down to the link's
     side, across, back = straight.T  # rows: columns of ``straight``
-    data, found = mujoco.MjData(model), []
-    for joint, position in zip(robot.joints, robot.home, strict=True):
-        data.joint(joint).qpos[0] = position
-    mujoco.mj_kinematics(model, data)
+    found = []
     up = data.xmat[body].reshape(3, 3)[2]  # the world's vertical, in the link's frame
     for aside, behind, angle in itertools.product(_ASIDE, _BEHIND, np.arange(8) * np.pi / 4):
         out = np.cos(angle) * side + np.sin(angle) * across
@@ -108,12 +106,6 @@ def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, gr
                 return -1
             count += first < 0 or first > far - _CLEAR
     return count
-
-
-def _rotation(quat: np.ndarray) -> np.ndarray:
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quat, float) / np.linalg.norm(quat))
-    return out.reshape(3, 3)
 
 
 def _tuple(values) -> tuple:

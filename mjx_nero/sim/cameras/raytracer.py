@@ -15,16 +15,17 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool
 
+from mjx_nero.sim.cameras import Drawer
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
-from mjx_nero.sim.cameras.look import nominal
+from mjx_nero.sim.fields import nominal
 from mjx_nero.sim.physics import kernels, possible
-from mjx_nero.sim.physics.mujoco_warp import WARP, world_fields
+from mjx_nero.sim.physics.mujoco_warp import world_fields
 from mjx_nero.types import Picture
 
 _SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
 
 
-class RayTracer:
+class RayTracer(Drawer):
     """See ``cameras.Drawer``. The first call with a batch size on a device makes the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
@@ -33,7 +34,7 @@ class RayTracer:
         self._pixels = {
             kind: sum(math.prod(c.size) for c in cfg.values() if kind in c.kinds) for kind in ("rgb", "depth", "segmentation")
         }
-        self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any]] = {}  # by device and batch size
+        self._get = kernels.Programs(self._make)
         self._batched = self._as_jax()
         self._where_due = self._as_jax(sometimes=True)
 
@@ -62,12 +63,7 @@ class RayTracer:
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``cameras.Drawer``."""
-        import warp as wp
-
-        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
-            with WARP, wp.ScopedDevice(device):
-                self._get(num_envs)
-                wp.synchronize_device(device)
+        self._get.prepare(num_envs, num_devices)
 
     def bytes(self) -> int:
         """Returns the size of the pictures, of the poses, and of the tree of bounding boxes."""
@@ -104,31 +100,17 @@ class RayTracer:
         }
         call = kernels.as_jax(draw, outputs=3)
 
-        @jax.custom_batching.custom_vmap
         def batched(given, *due):
             lead, rows = given.shape[:-1], given.reshape(-1, given.shape[-1])
             sizes = {f"{kind}_out": (len(rows), max(1, count)) for kind, count in self._pixels.items()}
             drawn = functools.partial(call, output_dims=sizes)
             if not sometimes:
                 return tuple(x.reshape(lead + x.shape[1:]) for x in drawn(rows))
-            shapes = jax.eval_shape(drawn, rows)
-            found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: _zeros(shapes), rows)
+            shapes = tuple(jax.eval_shape(drawn, rows))
+            found = jax.lax.cond(due[0].any(), lambda x: tuple(drawn(x)), lambda x: jax.tree.map(jnp.zeros_like, shapes), rows)
             return tuple(x.reshape(lead + x.shape[1:]) for x in found)
 
-        @batched.def_vmap
-        def _(size, is_batched, *given):
-            wide = (x if own else jnp.broadcast_to(x, (size, *x.shape)) for x, own in zip(given, is_batched, strict=True))
-            return batched(*wide), (True,) * 3
-
-        return batched
-
-    def _get(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
-        import warp as wp
-
-        key = (str(wp.get_device()), n)
-        if key not in self._made:
-            self._made[key] = self._make(n)
-        return self._made[key]
+        return kernels.batched(batched, outputs=3)
 
     def _make(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any]:
         """Makes what ``n`` worlds need on the current device.
@@ -168,16 +150,10 @@ class RayTracer:
         if not wp.get_device().is_cuda:  # there are no graphs on a CPU
             return data, drawn, seen, run, model
         if drawn is not None:  # orientations of zero would make no bounding boxes
-            given = [np.ravel(nominal(self._model, name)).view(np.float32) for name in self._fields]
+            given = [np.ravel(x).view(np.float32) for x in nominal(self._model, self._fields).values()]
             drawn.assign(np.tile(np.concatenate(given), (n, 1)))
         run()  # loads the kernels, which cannot be done while a graph is captured
-        with wp.ScopedCapture() as capture:
-            run()
-        return data, drawn, seen, functools.partial(wp.capture_launch, capture.graph), (model, run)
-
-
-def _zeros(shapes: Any) -> tuple:
-    return tuple(jnp.zeros(x.shape, x.dtype) for x in shapes)
+        return data, drawn, seen, kernels.captured(run), (model, run)
 
 
 def _bits(values: Array) -> Array:

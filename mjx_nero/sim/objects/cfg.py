@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import NonNegative, Positive
+from mjx_nero.sim import quats
 from mjx_nero.sim.objects import store
 from mjx_nero.sim.objects.solid import Solid
 
@@ -69,9 +70,7 @@ class ObjectCfg:
         """Height of its centre when it rests on the table [m]."""
         if self.shape == "mesh":
             return self.solids[0].height(np.array(self.quat))
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, np.asarray(self.quat) / np.linalg.norm(self.quat))
-        up, (first, *rest) = turn[6:], self.size
+        up, (first, *rest) = quats.matrix(self.quat)[2], self.size
         if self.shape == "box":
             return float(np.abs(up) @ np.asarray(self.size) / 2)
         if self.shape in ("cylinder", "can"):

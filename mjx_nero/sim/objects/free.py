@@ -158,7 +158,10 @@ class Objects(Part):
 
     def view(self, sim: Sim, carry: Carry) -> dict[str, Any]:
         """Returns the objects, the commanded one also as ``TARGET``, and its index."""
-        seen = {name: self._view(name, sim) for name in self._at}
+        seen = {}
+        for name, at in self._at.items():
+            pose, speed = sim.qpos[at:][:7], sim.qvel[self._dofs[name] :][:6]
+            seen[name] = ObjectView(pose[:3], pose[3:], speed[:3], speed[3:])
         for name, table in self._shapes.items():
             index = carry.memory.get(SHAPE, {}).get(name, jnp.zeros((), jnp.int32))
             shape = ShapeView(index, *(jnp.asarray(values)[index] for values in table))
@@ -169,10 +172,6 @@ class Objects(Part):
         each = [dataclasses.replace(seen[name], shape=None) for name in self._targets]
         seen[TARGET] = jax.tree.map(lambda *each: jnp.stack(each)[target], *each)
         return {"objects": seen, "target": target}
-
-    def _view(self, name: str, sim: Sim) -> ObjectView:
-        pose, speed = sim.qpos[self._at[name] :][:7], sim.qvel[self._dofs[name] :][:6]
-        return ObjectView(pos_w=pose[:3], quat_w=pose[3:], linvel_w=speed[:3], angvel_local=speed[3:])
 
     @property
     def _differ(self) -> bool:

@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjx_nero.sim import quats
+
 LEAST_SHARE = 0.02  # least share of throws that end in a resting pose
 MAX_RESTS = 8
 ALIKE, MOST_ALIKE = 0.02, 2  # share by which the heights of alike poses may differ; how many alike poses are kept
@@ -48,9 +50,7 @@ def find(hull: Points, inertia: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndar
 
 def up(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3"]:
     """The vertical, in the frame of a thing with this orientation (wxyz)."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float) / np.linalg.norm(quat))
-    return matrix[6:]
+    return quats.matrix(quat)[2]
 
 
 def _settled(hull: Points, inertia: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, float]:

@@ -42,7 +42,7 @@ class Physics(Protocol):
     @property
     def compiler_options(self) -> dict[str, str | bool]:
         """Options of ``jax.jit`` to train with this physics."""
-        ...
+        return fusion()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step (``decimation`` physics steps). Pure; takes one environment, vmap it for many.
@@ -50,7 +50,6 @@ class Physics(Protocol):
         Returns:
             the state, and 1.0 if a full buffer lost contacts or constraint rows (Warp only), else 0.0.
         """
-        ...
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """Prepares what ``step`` needs for ``num_envs`` environments on each of the first devices. A thread may call it.
@@ -58,11 +57,9 @@ class Physics(Protocol):
         ``step`` would prepare it, too, but inside a JAX program; while that runs, XLA's autotuner lets no other program for the
         device compile.
         """
-        ...
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the memory that one environment needs on each of the first devices."""
-        ...
 
 
 # (model from ``scene.build(..., visuals=False, fuse=True)``, options and buffer sizes, fields that differ between worlds)

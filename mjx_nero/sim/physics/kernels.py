@@ -1,10 +1,18 @@
 """Warp kernels, made from sources in this folder and compiled side by side."""
 
+import functools
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+# Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
+# makes anything meanwhile: kernels with arrays on another device than their own end the process.
+WARP = threading.Lock()
 
 
 def make(
@@ -19,13 +27,7 @@ def make(
     """
     import warp as wp
 
-    types: dict[str, Any] = {
-        key: int if isinstance(x, int) else wp.array(dtype=x.dtype, ndim=x.ndim) for key, x in values.items()
-    }
-    Problem = wp.struct(type("Problem", (), {"__annotations__": types}))
-    problem = Problem()
-    for key, x in values.items():
-        setattr(problem, key, x)
+    Problem, problem = packed("Problem", values)
 
     @wp.func_native("".join(map(_constant, constants, constants.values())) + source(name))
     def work(tid: int, problem: Problem): ...  # type: ignore[valid-type]
@@ -36,6 +38,20 @@ def make(
 
     block = 32 if wp.get_device().is_cuda else 1
     return lambda: wp.launch(environments, dim=n * threads, inputs=[problem], block_dim=block)
+
+
+def packed(name: str, values: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Whole numbers and arrays as one argument of kernels: its type, called ``name``, and itself."""
+    import warp as wp
+
+    types: dict[str, Any] = {
+        key: int if isinstance(x, int) else wp.array(dtype=x.dtype, ndim=x.ndim) for key, x in values.items()
+    }
+    Packed = wp.struct(type(name, (), {"__annotations__": types}))
+    made = Packed()
+    for key, x in values.items():
+        setattr(made, key, x)
+    return Packed, made
 
 
 def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
@@ -56,6 +72,53 @@ def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
         graph_mode=wp.JaxCallableGraphMode.NONE,
         module_preload_mode=wp.JaxModulePreloadMode.NONE,
     )
+
+
+def batched(function: Callable[..., tuple], outputs: int) -> Callable[..., tuple]:
+    """A function of batches that ``jax.vmap`` calls once, with one more leading axis on all that it is given."""
+    whole = jax.custom_batching.custom_vmap(function)
+
+    @whole.def_vmap
+    def _(size, is_batched, *given):
+        wide = (x if own else jnp.broadcast_to(x, (size, *x.shape)) for x, own in zip(given, is_batched, strict=True))
+        return whole(*wide), (True,) * outputs
+
+    return whole
+
+
+class Programs:
+    """What batches need on a device, made at their first call by ``make(number of worlds)`` and then kept."""
+
+    def __init__(self, make: Callable[[int], Any]):
+        self._make = make
+        self._made: dict[tuple[str, int], Any] = {}  # by device and number of worlds
+
+    def __call__(self, n: int) -> Any:
+        """Returns what ``n`` worlds need on Warp's current device."""
+        import warp as wp
+
+        key = (str(wp.get_device()), n)
+        if key not in self._made:
+            self._made[key] = self._make(n)
+        return self._made[key]
+
+    def prepare(self, n: int, num_devices: int) -> None:
+        """Makes it on each of the first devices. A thread may call this."""
+        import warp as wp
+
+        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
+            with WARP, wp.ScopedDevice(device):
+                self(n)
+                wp.synchronize_device(device)
+
+
+def captured(run: Callable[[], None]) -> Callable[[], None]:
+    """Runs a function's launches as one CUDA graph. The function was called before: loading kernels cannot be captured."""
+    import warp as wp
+
+    with wp.ScopedCapture() as capture:
+        run()
+    return functools.partial(wp.capture_launch, capture.graph)
 
 
 def source(name: str) -> str:

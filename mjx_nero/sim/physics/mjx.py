@@ -10,8 +10,8 @@ import mujoco
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from mjx_nero.sim import forces, touch
-from mjx_nero.sim.physics import Footprint, possible
+from mjx_nero.sim import readings
+from mjx_nero.sim.physics import Footprint, Physics, possible
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim, UserError
 
@@ -20,7 +20,7 @@ from mjx_nero.types import Sim, UserError
 LINE_SEARCH = 20
 
 
-class JaxPhysics:
+class JaxPhysics(Physics):
     """See ``physics.Physics``."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
@@ -34,7 +34,7 @@ class JaxPhysics:
             self._template = mjx.make_data(self._mx)
         self._qpos_ids = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._dof_ids = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-        self._readers, self._gauges = touch.readers(model), forces.gauges(model)
+        self._readings = readings.of(model)
         self._touches = bool(model.geom_contype.any())
 
     def step(self, sim: Sim, ctrl: Float[Array, " nu"]) -> tuple[Sim, Float[Array, ""]]:
@@ -47,12 +47,12 @@ class JaxPhysics:
             now = before + (i + 1) / self.decimation * (ctrl - before) if self._ramp else ctrl
             data = self._template.replace(qpos=sim.qpos, qvel=sim.qvel, ctrl=now, qacc_warmstart=sim.warmstart, time=sim.time)
             data = mjx.step(mx if self._touches else self._saturated(mx, data), data)
-            readings = {name: jnp.maximum(sim.readings[name], read(data.sensordata)) for name, read in self._readers.items()}
-            readings |= {name: gauge(data.sensordata) for name, gauge in self._gauges.items()}
+            measured = {name: read(data.sensordata) for name, read in self._readings.items()}
+            measured |= {n: jnp.maximum(sim.readings[n], measured[n]) for n, read in self._readings.items() if read.strongest}
             after = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart, "time": data.time}
-            return dataclasses.replace(sim, readings=readings, **after)
+            return dataclasses.replace(sim, readings=measured, **after)
 
-        blank = dict.fromkeys(self._readers, jnp.zeros(())) | {name: jnp.zeros(g.size) for name, g in self._gauges.items()}
+        blank = {name: jnp.zeros(read.shape) for name, read in self._readings.items()}
         sim = dataclasses.replace(sim, ctrl=ctrl, readings=blank)
         # A loop compiles in half the time of two unrolled steps.
         return jax.lax.fori_loop(0, self.decimation, physics_step, sim), jnp.zeros(())
@@ -61,9 +61,6 @@ class JaxPhysics:
     def compiler_options(self) -> dict[str, str | bool]:
         """Empty, because the package's own options suit MJX-JAX (see ``physics.fusion``)."""
         return {}
-
-    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Does nothing: the compiled program holds everything."""
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the memory of a step: a few times MJX's data."""

@@ -8,18 +8,16 @@ arrays are copied out. The engine recomputes everything else from them, so the f
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_nero.sim import forces, touch
-from mjx_nero.sim.physics import Footprint, dynamics, fusion, kernels, newton, possible
+from mjx_nero.sim import readings
+from mjx_nero.sim.physics import Footprint, Physics, dynamics, kernels, newton, possible, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -29,20 +27,16 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 # Fields of MuJoCo's C library alone. A mesh that a world lacks has no contact bits there; here its geom has no mesh.
 _OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
 
-# Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
-# makes anything meanwhile: kernels with arrays on another device than their own end the process.
-WARP = threading.Lock()
 
-
-class WarpPhysics:
+class WarpPhysics(Physics):
     """See ``physics.Physics``. The first step with a batch size on a device makes the buffers, which are kept."""
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name not in _OF_C}
-        self._readers, self._gauges = touch.readers(model), forces.gauges(model)
-        self._numbers = len(self._readers) + sum(gauge.size for gauge in self._gauges.values())  # of all readings
-        self._made: dict[tuple[str, int], tuple[Any, Any, Any, Callable[[], None], Any, Any]] = {}  # by device and batch size
+        self._readings = readings.of(model)
+        self._numbers = readings.size(self._readings)
+        self._get = kernels.Programs(self._make)
         self._batched = self._as_jax()
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
@@ -57,10 +51,7 @@ class WarpPhysics:
         time = sim.time + self.decimation * self._cfg.dt
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, time=time)
         if self._numbers:
-            readings, end = {name: force[..., i] for i, name in enumerate(self._readers)}, len(self._readers)
-            for name, gauge in self._gauges.items():
-                readings[name], end = force[..., end : end + gauge.size], end + gauge.size
-            after = dataclasses.replace(after, readings=readings)
+            after = dataclasses.replace(after, readings=readings.split(self._readings, force))
         return after, ((overflow & _LOST) != 0).astype(jnp.float32)
 
     def _as_jax(self) -> Callable:
@@ -92,7 +83,6 @@ class WarpPhysics:
         call = kernels.as_jax(control_step, outputs=5)
         nq, nv = self.model.nq, self.model.nv
 
-        @jax.custom_batching.custom_vmap
         def batched(*inputs):
             lead = inputs[0].shape[:-1]
             inputs = tuple(x.reshape(-1, x.shape[-1]) for x in inputs)
@@ -101,18 +91,7 @@ class WarpPhysics:
             sizes["force_out"] = n, max(1, self._numbers)
             return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
 
-        @batched.def_vmap
-        def _(size, is_batched, *inputs):
-            pairs = zip(inputs, is_batched, strict=True)
-            inputs = tuple(x if there else jnp.broadcast_to(x, (size, *x.shape)) for x, there in pairs)
-            return batched(*inputs), (True,) * 5
-
-        return batched
-
-    @property
-    def compiler_options(self) -> dict[str, str | bool]:
-        """See ``physics.fusion``."""
-        return fusion()
+        return kernels.batched(batched, outputs=5)
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the size of MuJoCo Warp's data, and the free memory."""
@@ -133,26 +112,13 @@ class WarpPhysics:
             return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
 
         cfg, fields = self._cfg, 4 * sum(math.prod(shape) for shape in self._fields.values())
-        with WARP, wp.ScopedDevice("cpu"):
+        with kernels.WARP, wp.ScopedDevice("cpu"):
             one = mujoco_warp.make_data(self.model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env)
         return size(one) + fields
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics``."""
-        import warp as wp
-
-        for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
-            with WARP, wp.ScopedDevice(device):
-                self._get(num_envs)
-                wp.synchronize_device(device)
-
-    def _get(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any, Any]:
-        import warp as wp
-
-        key = (str(wp.get_device()), n)
-        if key not in self._made:
-            self._made[key] = self._make(n)
-        return self._made[key]
+        self._get.prepare(num_envs, num_devices)
 
     def _make(self, n: int) -> tuple[Any, Any, Any, Callable[[], None], Any, Any]:
         """Makes what ``n`` environments need on the current device.
@@ -187,94 +153,41 @@ class WarpPhysics:
             return data, wanted, drawn, run, strongest, run
         kernels.load(run)
         run()  # allocates what kernels keep between launches, which cannot be done while a graph is captured
-        with wp.ScopedCapture() as capture:
-            run()
-        return data, wanted, drawn, lambda: wp.capture_launch(capture.graph), strongest, run
+        return data, wanted, drawn, kernels.captured(run), strongest, run
 
     def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
         """Makes the function of one physics step, which is told if it is the last one, and the array of readings."""
         from mujoco.mjx.third_party import mujoco_warp
 
-        strongest, sense, measure = self._sense(model, data)
+        out, each, at_last = sensing.make(self.model, model, data)
         own = self._cfg.solver == "newton"
         solve = newton.make(model, data) if own else functools.partial(mujoco_warp.solve, model, data)
+
+        def constrained(last: bool):
+            solve()
+            for measure in (*each, *at_last) if last else each:
+                measure()
 
         def engines(last: bool):
             mujoco_warp.fwd_position(model, data, factorize=False)
             mujoco_warp.fwd_velocity(model, data)
             mujoco_warp.fwd_actuation(model, data)
             mujoco_warp.fwd_acceleration(model, data, factorize=True)
-            solve()
-            sense()
-            if last:
-                measure()
+            constrained(last)
             mujoco_warp.implicit(model, data)
 
         if not own or dynamics.missing(self.model) or not newton.fits(model, data):
-            return engines, strongest
+            return engines, out
         before, after = dynamics.make(self.model, model, data)
 
         def ours(last: bool):
             before()
             mujoco_warp.collision(model, data)
             mujoco_warp.make_constraint(model, data)
-            solve()
-            sense()
-            if last:
-                measure()
+            constrained(last)
             after()
 
-        return ours, strongest
-
-    def _sense(self, model: Any, data: Any) -> tuple[Any, Callable[[], None], Callable[[], None]]:
-        """Makes the array of each world's readings, and two functions that fill it.
-
-        The first one updates the strongest contacts [N], which come first in the array. The second one measures the rest
-        (``sim.forces``). After the solver the first one equals MuJoCo's contact sensors, for each of which MuJoCo Warp would
-        search all contacts once more.
-        """
-        import warp as wp
-        from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
-
-        if not self._numbers:
-            return None, lambda: None, lambda: None
-        readings: Any = wp.zeros((data.nworld, self._numbers), dtype=float)
-        count = len(self._readers)
-        measure = forces.on_warp(self.model, model, data, readings[:, count:]) if self._gauges else lambda: None
-        if not self._readers:
-            return readings, lambda: None, measure
-        strongest: Any = readings[:, :count]
-        pairs = np.stack([reader.pairs for reader in self._readers.values()])
-        found, inputs = data.contact, [model.opt.cone, wp.array(pairs, dtype=bool)]
-        inputs += [found.frame, found.friction, found.dim, found.efc_address, found.adhesion, found.geom, found.worldid]
-        inputs += [data.efc.force, data.njmax, data.nacon, strongest]
-
-        @wp.kernel(module="unique", enable_backward=False)
-        def keep(
-            cone: int,
-            counts: wp.array3d(dtype=bool),  # type: ignore
-            frame: wp.array(dtype=wp.mat33),  # type: ignore
-            friction: wp.array(dtype=found.friction.dtype),  # type: ignore
-            dim: wp.array(dtype=int),  # type: ignore
-            address: wp.array2d(dtype=int),  # type: ignore
-            adhesion: wp.array(dtype=float),  # type: ignore
-            geom: wp.array(dtype=wp.vec2i),  # type: ignore
-            worldid: wp.array(dtype=int),  # type: ignore
-            forces: wp.array2d(dtype=float),  # type: ignore
-            njmax: int,
-            nacon: wp.array(dtype=int),  # type: ignore
-            strongest: wp.array2d(dtype=float),  # type: ignore
-        ):
-            i = wp.tid()
-            if i >= nacon[0]:
-                return
-            world = worldid[i]
-            for k in range(strongest.shape[1]):
-                if counts[k, geom[i][0], geom[i][1]]:
-                    force = contact_force_fn(cone, frame, friction, dim, address, adhesion, forces, njmax, nacon, world, i, False)
-                    wp.atomic_max(strongest, world, k, wp.length(wp.spatial_top(force)))
-
-        return readings, lambda: wp.launch(keep, dim=data.naconmax, inputs=inputs), measure
+        return ours, out
 
 
 def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:

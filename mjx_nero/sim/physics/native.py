@@ -22,8 +22,8 @@ from jaxtyping import Array, Float, Float32
 from mujoco import rollout
 
 from mjx_nero import cores
-from mjx_nero.sim import forces, touch
-from mjx_nero.sim.physics import Footprint, fusion, host
+from mjx_nero.sim import readings
+from mjx_nero.sim.physics import Footprint, Physics, host
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -34,7 +34,7 @@ _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDi
 _KEPT = 8
 
 
-class NativePhysics:
+class NativePhysics(Physics):
     """See ``physics.Physics``. The first step with a batch size makes the work arrays, which are kept for a while.
 
     The C library does not return the solver's last acceleration, so ``Sim.warmstart`` holds the change of velocity over the last
@@ -49,8 +49,8 @@ class NativePhysics:
         self._period, self._ramp = cfg.decimation * cfg.dt, cfg.ramp
         self._fields = {name: getattr(model, name).shape for name in fields}
         self._sizes = np.cumsum([model.nq, model.nv, model.nv, model.nu * (1 + cfg.ramp)])
-        self._readers, self._gauges = touch.readers(model), forces.gauges(model)
-        self._ends = np.cumsum([self._sizes[2] + len(self._readers), *(gauge.size for gauge in self._gauges.values())])
+        self._readings = readings.of(model)
+        self._numbers = int(self._sizes[2]) + readings.size(self._readings)  # of the result
         threads = cores()
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
@@ -60,16 +60,14 @@ class NativePhysics:
         drawn = [sim.fields[name].reshape(*sim.qpos.shape[:-1], -1) for name in self._fields]
         targets = [sim.ctrl, ctrl] if self._ramp else [ctrl]
         packed = jnp.concatenate([sim.qpos, sim.qvel, sim.warmstart, *targets, *drawn], axis=-1)
-        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], int(self._ends[-1])), jnp.float32)
+        shape = jax.ShapeDtypeStruct((*packed.shape[:-1], self._numbers), jnp.float32)
         if jax.default_backend() == "cpu":
             found = host.call(self._key, self._step, shape, packed)
         else:  # an accelerator's program, which JAX does not cache between runs
             found = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
         qpos, qvel, warmstart, read = jnp.split(found, self._sizes[:3], axis=-1)
-        readings = {name: read[..., i] for i, name in enumerate(self._readers)}
-        for name, end, gauge in zip(self._gauges, self._ends[1:], self._gauges.values(), strict=True):
-            readings[name] = found[..., end - gauge.size : end]
-        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=readings)
+        read = readings.split(self._readings, read)
+        after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=read)
         return dataclasses.replace(after, time=sim.time + self._period), jnp.zeros(packed.shape[:-1])
 
     @functools.cached_property
@@ -81,7 +79,7 @@ class NativePhysics:
         return int.from_bytes(told[:8], "little", signed=True)
 
     def _called_back(self, packed: Array) -> Float32[np.ndarray, "*batch n"]:
-        after = np.empty((*packed.shape[:-1], int(self._ends[-1])), np.float32)
+        after = np.empty((*packed.shape[:-1], self._numbers), np.float32)
         self._step(np.asarray(packed), after)
         return after
 
@@ -100,24 +98,14 @@ class NativePhysics:
             if self._ramp:
                 left = 1 - np.arange(1, self.decimation + 1)[:, None] / self.decimation
                 ctrl -= left * (ctrl - given[:, None, nqvv : -self.model.nu])
-            self._rollout(
-                models,
-                self._data,
-                start,
-                ctrl,
-                nstep=self.decimation,
-                initial_warmstart=warmstart,
-                state=states,
-                sensordata=sensors,
-                skip_checks=True,
-            )
+            out: dict[str, Any] = {"initial_warmstart": warmstart, "state": states, "sensordata": sensors}
+            self._rollout(models, self._data, start, ctrl, nstep=self.decimation, skip_checks=True, **out)
             last, before = states[:, -1, 1:], states[:, -2, 1:] if self.decimation > 1 else start[:, 1:]
             after[:, :nqv] = last
             after[:, nqv:nqvv] = (last[:, nq:] - before[:, nq:]) / self.model.opt.timestep
-            for i, read in enumerate(self._readers.values()):
-                after[:, nqvv + i] = read(sensors).max(axis=1)
-            for end, gauge in zip(self._ends[1:], self._gauges.values(), strict=True):
-                after[:, end - gauge.size : end] = gauge(sensors[:, -1])
+            if reads := self._readings.values():
+                each = [read(sensors).max(axis=1) if read.strongest else read(sensors[:, -1]) for read in reads]
+                after[:, nqvv:] = np.column_stack(each)
             # After any warning (a bad state, which it resets, or a full buffer) MuJoCo takes no further step: time stops short.
             after[states[:, -1, 0] < 1 + 0.999 * self._period] = np.nan
 
@@ -130,14 +118,6 @@ class NativePhysics:
                 getattr(models[i], name)[:] = fields[i, at : at + size].reshape(shape)
                 at += size
         present[:] = fields
-
-    @property
-    def compiler_options(self) -> dict[str, str | bool]:
-        """See ``physics.fusion``."""
-        return fusion()
-
-    def prepare(self, num_envs: int, num_devices: int = 1) -> None:
-        """Does nothing: the first step is as quick as any."""
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the host memory of an environment: a model of its own if fields are drawn, and the arrays of a step."""

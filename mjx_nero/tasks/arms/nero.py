@@ -96,6 +96,6 @@ ENVS: Envs = fitted.envs(
     reach_obstacles=REACH_NERO,
 )
 ENVS |= {
-    "nero_handover": (NERO, handover.presets()),
+    "nero_handover": (NERO, handover.PRESETS),
     "nero_cobotta_handover": (NERO, handover.taken_by(cobotta_pro_900.ROBOT)),
 }

@@ -9,13 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 
 import mjx_nero
-from mjx_nero import files
 from mjx_nero.config.values import short
 from mjx_nero.data import Episode, Schema, writer
 from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
-from mjx_nero.identify.log import number
+from mjx_nero.identify.log import number, numbered
 from mjx_nero.tasks import registry
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg
@@ -101,11 +100,7 @@ def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 def _table(path: pathlib.Path, joints: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     """The rows of a log by their columns, and the line that each is in."""
-    try:
-        text = files.read_bytes(path, MAX_BYTES).decode()
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = numbered(path, MAX_BYTES)
     rows = list(csv.reader(line for _, line in lines))
     head = rows[0] if rows else []
     for name in ["time", "inferred", *(f"{what}.{joint}" for what in ("target", "position") for joint in joints)]:

@@ -50,8 +50,7 @@ def checked(arm: Guarded, limits: Limits, metadata: Mapping[str, Any], clock: Cl
     if fault:
         print(f"NO-GO the arm holds: {fault.text}")
         return True
-    with files.whole(out) as part:
-        part.write_text(check.yaml_of(metadata["robot"], found, [n for n in limits.names if n not in grips]))
+    files.write(out, check.yaml_of(metadata["robot"], found, [n for n in limits.names if n not in grips]).encode())
     bad = any(joint.wrong(joint.name in grips) for joint in found)
     print(f"drives: {out}")
     print("no-go: mend that first" if bad else "go: next --dry-run, then --speed 0.3 --seconds 5 with nothing in reach")

@@ -51,11 +51,8 @@ def save(path: pathlib.Path, robot: str, log: str, joints: Sequence[str], fit: F
 
     rows = {j: {name: number(name, i) for name in (*POSITIVE, "offset")} for i, j in enumerate(joints)}
     content = {"robot": robot, "delay": number("delay"), "joints": rows}
-    text = _HEAD.format(robot=robot, log=" ".join(log.split())) + yaml.safe_dump(
-        content, sort_keys=False, default_flow_style=None
-    )
-    with files.whole(path) as part:
-        part.write_text(text)
+    head = _HEAD.format(robot=robot, log=" ".join(log.split()))
+    files.write(path, (head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)).encode())
 
 
 def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> None:

@@ -227,10 +227,7 @@ def _bounds(pair) -> Range:
 
 def _extent(robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box around the robot at home, world frame [m]."""
-    model = scene.robot_model(robot)
-    data = mujoco.MjData(model)
-    data.qpos[[model.joint(j).qposadr[0] for j in robot.joints]] = robot.home
-    mujoco.mj_kinematics(model, data)
+    model, data = scene.at_home(robot)
     reach = np.minimum(model.geom_rbound, 0.1)[:, None]  # bounding spheres of long shapes would say too much
     points = data.geom_xpos if model.ngeom else data.xpos
     reach = reach if model.ngeom else 0.05

@@ -16,8 +16,8 @@ from mjx_nero.learn import policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.mdp import actions, sensors
 from mjx_nero.mdp.terms import Term
-from mjx_nero.sim.cameras.look import Look, nominal
-from mjx_nero.sim.fields import Randomization
+from mjx_nero.sim.cameras.look import Look
+from mjx_nero.sim.fields import Randomization, nominal
 from mjx_nero.sim.physics import make_physics
 from mjx_nero.tools.robustness import seen
 from mjx_nero.tools.robustness.sweeps import LONGEST, Point, varied
@@ -71,7 +71,7 @@ class Bench:
         given = {"fields": fields, "lag": rng.integers(point.delay[0], point.delay[1] + 1, n).astype(np.int32), "offset": offset}
         if self._sees:
             model = self.env.mj_model
-            every = {name: jnp.asarray(nominal(model, name)) for name in self.env.state_shape.info["carry"].memory[LOOK]}
+            every = {n: jnp.asarray(x) for n, x in nominal(model, self.env.state_shape.info["carry"].memory[LOOK]).items()}
             every = {name: jnp.broadcast_to(value, (n, *value.shape)) for name, value in every.items()}
             drawn = jax.jit(jax.vmap(Look(model, point.look.terms)))(jax.random.split(keys[1], n))
             given |= {"look": every | drawn, "late": np.full(n, point.look.late, np.int32)}

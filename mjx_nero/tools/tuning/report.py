@@ -81,5 +81,5 @@ def save_plot(tuning: Tuning, path: pathlib.Path) -> None:
 def save_gains(tuning: Tuning, path: pathlib.Path) -> None:
     """Writes the proposed gains as YAML."""
     units = "stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], effort [N m or N], speed [rad/s or m/s]"
-    with files.whole(path) as part:
-        part.write_text(f"# Drives of {tuning.robot.name}: {units}\n{yaml.safe_dump(gains(tuning.tuned), sort_keys=False)}")
+    text = f"# Drives of {tuning.robot.name}: {units}\n{yaml.safe_dump(gains(tuning.tuned), sort_keys=False)}"
+    files.write(path, text.encode())

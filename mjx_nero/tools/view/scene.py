@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import trimesh
 
+from mjx_nero.sim import quats
 from mjx_nero.sim.touch import OBSTACLE
 from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.orders import Orders
@@ -154,9 +155,7 @@ def meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, t
                 continue
             rgba = (*rgba[:3], 1.0) if shape else rgba
             pose = np.eye(4)
-            rotation = np.empty(9)
-            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-            pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+            pose[:3, :3], pose[:3, 3] = quats.matrix(model.geom_quat[geom]), model.geom_pos[geom]
             found.setdefault((shape, rgba), []).append(make(model, int(geom)).apply_transform(pose))
         for i, ((shape, rgba), meshes) in enumerate(found.items()):
             yield (
