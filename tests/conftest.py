@@ -56,6 +56,7 @@ from batches import Batch  # noqa: E402
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import __main__, control  # noqa: E402
 from mjx_nero.learn import learner  # noqa: E402
+from mjx_nero.learn.ppo import imitation  # noqa: E402
 from mjx_nero.sim import physics  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tasks import registry  # noqa: E402
@@ -137,9 +138,13 @@ MAINS |= {name: functools.partial(lambda name, argv: __main__.main([name, *argv]
 
 @pytest.fixture
 def call(monkeypatch, capfd, tmp_path):
-    """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone."""
+    """``call("eval", "--env", ...) -> (exit status, stdout, stderr)``, in an empty working folder, settings of JAX left alone.
+
+    A training clones its expert in a few steps: the 2,000 of a program take half a minute of a core.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cli, "setup_jax", lambda: None)
+    monkeypatch.setattr(imitation, "STEPS", 20)
     monkeypatch.setattr(cli.os, "_exit", sys.exit)  # the end of an interrupted program, not of the tests
     monkeypatch.setenv("COLUMNS", "200")
 

@@ -22,8 +22,9 @@ ARM_STEPS = 122_880  # 40 with the third's 128: every reach succeeds
 
 
 def _run(path: pathlib.Path, folder: pathlib.Path, steps: int = STEPS) -> list:
-    """All outputs of one run, on the CPU, whose kernel shares the tests' compilation cache."""
+    """All outputs of one run, on the CPU, whose kernel shares the tests' compilation cache and clones no longer than they do."""
     notebook = nbformat.read(path, as_version=4)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("from mjx_nero.learn.ppo import imitation; imitation.STEPS = 20"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MJX_NERO_NOTEBOOK_STEPS", str(steps))
         patch.setenv("MJX_NERO_NOTEBOOK_EPISODES", "3")

@@ -74,6 +74,9 @@ Worlds = Annotated[int, Bounds(1, 2**24)]  # environments stepped together
 Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # all that JAX's generators take: beyond, seeds would repeat
 
 
+_PLAIN, _BY_KEY = (int, float, str, type(None)), (dict, types.MappingProxyType)
+
+
 def check(value: Any, hint: Any = Any, name: str = "") -> None:
     """Checks all of a config: every number is finite and within the bounds that its field declares.
 
@@ -85,28 +88,54 @@ def check(value: Any, hint: Any = Any, name: str = "") -> None:
     Raises:
         UserError: a value is not; the message has its dotted name.
     """
-    if isinstance(value, float) and not math.isfinite(value):
-        raise UserError(f"{name} must be a finite number, got {value!r}")
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        hint = next((h for h in typing.get_args(hint) if h is not type(None)), Any) if value is not None else Any
+    # A loop: a task has 700 values, and all are checked whenever one of them is replaced.
+    waiting: list[tuple[Any, Any, str]] = [(value, hint, name)]
+    while waiting:
+        value, hint, name = waiting.pop()
+        if isinstance(hint, tuple):  # the bounds of what has been checked inside
+            for bound in hint:
+                if fault := bound.fault(value):
+                    raise UserError(f"{name} {fault}, got {value!r}")
+            continue
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UserError(f"{name} must be a finite number, got {value!r}")
+        by_key = isinstance(hint, _BY_KEY)
+        optional, bounds, inner = (False, (), ()) if by_key else _parts(hint)
+        if bounds and not (optional and value is None):
+            waiting.append((value, bounds, name))
+        if isinstance(value, _PLAIN):
+            continue
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            hints = {**_hints(type(value)), **getattr(value, "hints", dict)()}
+            start = f"{name}." if name else ""
+            parts = [(getattr(value, f), hints.get(f, Any), start + f) for f in _names(type(value))]
+        elif isinstance(value, Mapping):
+            named = hint if by_key else dict.fromkeys(value, (*inner, Any, Any)[1])
+            parts = [(item, named.get(key, Any), f"{name}.{key}") for key, item in value.items()]
+        elif isinstance(value, tuple):
+            each = inner[:1] * len(value) if inner[1:] == (...,) else inner if len(inner) == len(value) else (Any,) * len(value)
+            parts = [(item, one, name) for item, one in zip(value, each, strict=True)]
+        else:
+            continue
+        waiting += reversed(parts)
+
+
+@functools.cache
+def _names(kind: type) -> tuple[str, ...]:
+    """Names of a config's fields."""
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
+@functools.cache
+def _parts(hint: Any) -> tuple[bool, tuple, tuple]:
+    """Whether a type may be None as well, its bounds, and the types within it."""
+    optional = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+    if optional:
+        hint = next((h for h in typing.get_args(hint) if h is not type(None)), Any)
     bounds: tuple = ()
     if typing.get_origin(hint) is Annotated:
         bounds, hint = hint.__metadata__, typing.get_args(hint)[0]
-    inner = typing.get_args(hint)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        hints = {**_hints(type(value)), **getattr(value, "hints", dict)()}
-        for field in dataclasses.fields(value):
-            check(getattr(value, field.name), hints.get(field.name, Any), f"{name}.{field.name}" if name else field.name)
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            check(item, hint.get(key, Any) if isinstance(hint, Mapping) else (*inner, Any, Any)[1], f"{name}.{key}")
-    elif isinstance(value, tuple):
-        each = inner[:1] * len(value) if inner[1:] == (...,) else inner if len(inner) == len(value) else (Any,) * len(value)
-        for item, one in zip(value, each, strict=True):
-            check(item, one, name)
-    for bound in bounds:
-        if fault := bound.fault(value):
-            raise UserError(f"{name} {fault}, got {value!r}")
+    return optional, bounds, typing.get_args(hint)
 
 
 @functools.cache

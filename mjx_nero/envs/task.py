@@ -311,12 +311,17 @@ class EnvCfg:
         return {f"{group}.{name}": term for group, terms in groups.items() for name, term in terms.items()}
 
 
+def takes_targets(cfg: EnvCfg) -> bool:
+    """Returns whether the task's actions are drive targets: a controller's, not a policy's."""
+    return any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values())
+
+
 def for_controllers(cfg: EnvCfg) -> EnvCfg:
     """Returns the task for controllers.
 
     Drive targets replace the actions that policies learn, and the arm carries its own weight, as real arms' controllers do.
     """
-    if any(bounds.unwrapped(term.func) is actions.DriveTargets for term in cfg.actions.values()):
+    if takes_targets(cfg):
         return cfg
     return compensated(dataclasses.replace(cfg, actions=drive_targets()))
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from mjx_nero import files
-from mjx_nero.envs.task import for_controllers
+from mjx_nero.envs.task import takes_targets
 from mjx_nero.errors import UserError
 from mjx_nero.learn import bundled
 from mjx_nero.runs import console
@@ -59,12 +59,12 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes a policy (default: %(default)s)")
     args, _ = parser.parse(argv)
     whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
+    files.check_writable(args.json)
+    held = read(args.json)
     envs = cli.choices(args.envs, "env", registry.list_envs()) if args.envs else learnable()
     envs = [env for env in envs if args.preset in registry.list_presets(env)]
     if not envs:
         raise UserError(f"none of these environments has the preset {args.preset!r}")
-    files.check_writable(args.json)
-    held = read(args.json)
     cli.setup_jax()
     from mjx_nero.tools.benchmark import machine
 
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> None:
 def learnable() -> list[str]:
     """Lists the environments that have a robot of their own and actions for policies."""
     cfgs = {name: registry.env_cfg(name) for name in registry.list_envs() if registry.robot_of(name) is not None}
-    return [name for name, cfg in cfgs.items() if for_controllers(cfg) is not cfg]
+    return [name for name, cfg in cfgs.items() if not takes_targets(cfg)]
 
 
 def named(env: str, preset: str) -> str:

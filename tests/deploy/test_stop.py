@@ -74,7 +74,7 @@ def test_a_signal_ends_a_run_in_hold(lift, tmp_path):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
-    said = process.communicate(timeout=20)[0]
+    said = process.communicate(timeout=50)[0]
     assert process.returncode == 0 and "the arm holds: SIGTERM came" in said
     with open(log) as file:
         rows = [row for row in csv.DictReader(line for line in file if line[0] != "#") if row["target.shoulder_pan"]]

@@ -68,7 +68,7 @@ def _once(picture):
     return lambda: left.pop() if left else None
 
 
-def _wait(found, seconds=10.0):
+def _wait(found, seconds=60.0):
     end = time.monotonic() + seconds
     while True:
         try:

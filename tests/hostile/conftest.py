@@ -26,7 +26,7 @@ def server():
         **_without_cache(),
         "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]),
     }
-    env |= {"PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "JAX_PLATFORMS": "cpu"}
+    env |= {"OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "JAX_PLATFORMS": "cpu"}
     server = subprocess.Popen(
         [sys.executable, HERE / "server.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env
     )

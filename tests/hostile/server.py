@@ -26,6 +26,7 @@ def child(call: Callable[[], None], folder: pathlib.Path, seconds: float) -> Non
     What Python writes outside of ``folder`` is noted in ``folder/outside``, and so is what it opens of ``folder/mine``.
     """
     os.setsid()
+    sys.dont_write_bytecode = True  # what Python compiles of its own modules is no effect of a command
     resource.setrlimit(resource.RLIMIT_AS, (_BACKSTOP, _BACKSTOP))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))

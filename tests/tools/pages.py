@@ -74,7 +74,7 @@ def look(shown, client):
     wait(lambda: set(shown.server.get_clients()) - before)
 
 
-def wait(condition, seconds=30):
+def wait(condition, seconds=120):
     deadline = time.monotonic() + seconds
     while not (found := condition()):
         assert time.monotonic() < deadline, "waited in vain"

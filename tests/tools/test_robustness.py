@@ -79,8 +79,9 @@ def test_the_dark_is_seen(monkeypatch):
     bench = measure.Bench("nero_lift", "rgb", cfg, None, 4, "native", 1)
     points = dict(sweeps(cfg)["light [factor]"])
     dark = dataclasses.replace(points[0.2].look.terms["lights"], params={"turn": 0.0, "brightness": (0.01, 0.01), "tint": 0.0})
+    begun = jax.jit(jax.vmap(bench.env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
     states = [
-        jax.jit(bench._start)(bench._given(point), jax.vmap(bench.env.reset)(jax.random.split(jax.random.PRNGKey(0), 4)))
+        jax.jit(bench._start)(bench._given(point), begun)
         for point in (
             points[1.0],
             Point(look=seen.Look({"lights": dark})),

@@ -7,6 +7,7 @@ import time
 import mujoco
 import numpy as np
 import pytest
+from pages import wait
 
 import mjx_nero
 from mjx_nero.deploy.arm import ArmError
@@ -53,13 +54,6 @@ def arm(tmp_path):
     over.set()
     thread.join()
     port.close()
-
-
-def wait(condition):
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
 
 
 def bent(plant, robot, by):
