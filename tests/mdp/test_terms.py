@@ -210,7 +210,7 @@ def test_every_observation_is_tested():
 def test_what_is_not_measured_is_said():
     with pytest.raises(UserError, match="measures no 'wrist': its readings are hand "):
         observations.reading(dataclasses.replace(view(), readings={"hand": 2.5}), name="wrist")
-    with pytest.raises(UserError, match="the shape of a mesh, and 'cube' is none"):
+    with pytest.raises(UserError, match="the shape of a mesh, but 'cube' is not a mesh"):
         observations.object_shape(view())
 
 
