@@ -73,9 +73,9 @@ def observed(state: Mapping[str, ObservationTerm], **object: str) -> dict[str, O
     return groups(state, {"object_velocity": velocity})
 
 
-def on_table(x: Range, y: Range, **object: str) -> dict[str, Term]:
-    """Lists the event that puts the object on the table, at uniform ``x`` and ``y`` in the world [m]."""
-    place = {"x": x, "y": y, "z": (0.0, 0.0), **object}
+def on_table(ranges: tuple[Range, Range], **object: str) -> dict[str, Term]:
+    """Lists the event that puts the object on the table, at uniform x and y in the world [m]."""
+    place = {"x": ranges[0], "y": ranges[1], "z": (0.0, 0.0), **object}
     return {"reset_object_position": Term(events.object_position_uniform, params=place)}
 
 

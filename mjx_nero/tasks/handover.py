@@ -107,7 +107,7 @@ def _start(two: Pair) -> dict[str, Term]:
     place = regions.span(x + across[0], x + across[1]), regions.span(y - out[1], y - out[0])
     yaw = regions.span(-SIDE - YAW, YAW - SIDE)
     return {
-        **on_table(*place, object=BAR),
+        **on_table(place, object=BAR),
         "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": yaw, "object": BAR}),
     }
 

@@ -94,7 +94,7 @@ def isaac(robot: RobotCfg, setup: LiftSetup) -> EnvCfg:
                 }
             ),
         },
-        events=on_table(*setup.cube),
+        events=on_table(setup.cube),
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.05}),
             "lifting_object": RewardTerm(rewards.object_is_lifted, weight=15.0, params=setup.lifted),

@@ -70,7 +70,7 @@ def lifting(robot: RobotCfg, files: tuple[str, ...]) -> EnvCfg:
         metrics=metrics.grasping(**held),
         observations=observed(state, **one),
         events={
-            **on_table(*there.cube, **one),
+            **on_table(there.cube, **one),
             "reset_object_shape": Term(thing_events.at_rest, params={"files": files, **one}),
         },
         rewards=carrying(held, **one),

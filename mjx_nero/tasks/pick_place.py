@@ -55,7 +55,7 @@ def default(robot: RobotCfg, setup: PickPlaceSetup) -> EnvCfg:
                 }
             ),
         },
-        events=on_table(*setup.cube),
+        events=on_table(setup.cube),
         rewards={
             "reaching_object": RewardTerm(rewards.object_ee_distance, weight=1.0, params={"std": 0.1}),
             "goal_tracking": RewardTerm(rewards.goal_distance, weight=10.0, params={"std": 0.3}),

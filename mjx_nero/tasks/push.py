@@ -62,7 +62,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         ),
         observations=observed(state, **object),
         events={
-            **on_table(*start, **object),
+            **on_table(start, **object),
             "reset_object_yaw": Term(events.object_yaw_uniform, params={"yaw": TURN, **object}),
         },
         rewards={

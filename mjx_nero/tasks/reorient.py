@@ -100,7 +100,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         metrics=metrics.grasping(minimal_height=lying.minimal_height, grasp_radius=lying.grasp_radius, **one),
         observations=observed(state, **one),
         events={
-            **on_table(*there.cube, **one),
+            **on_table(there.cube, **one),
             "reset_object_side": Term(sides.other_side_up, params={"base": robot.base_pos, "yaw": YAW, **one}),
         },
         rewards={

@@ -65,8 +65,8 @@ class NativePhysics(Physics):
             found = host.call(self._key, self._step, shape, packed)
         else:  # an accelerator's program, which JAX does not cache between runs
             found = jax.pure_callback(self._called_back, shape, packed, vmap_method="broadcast_all")
-        qpos, qvel, warmstart, read = jnp.split(found, self._sizes[:3], axis=-1)
-        read = readings.split(self._readings, read)
+        qpos, qvel, warmstart, numbers = jnp.split(found, self._sizes[:3], axis=-1)
+        read = readings.split(self._readings, numbers)
         after = dataclasses.replace(sim, qpos=qpos, qvel=qvel, ctrl=ctrl, warmstart=warmstart, readings=read)
         return dataclasses.replace(after, time=sim.time + self._period), jnp.zeros(packed.shape[:-1])
 

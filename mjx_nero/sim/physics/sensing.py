@@ -3,6 +3,9 @@
 The package's own kernels leave out what only sensors need, and for each contact sensor MuJoCo Warp would search all contacts.
 """
 
+# The type of the contacts, an argument of the kernels, is made when they are.
+# mypy: disable-error-code="attr-defined"
+
 from collections.abc import Callable
 from typing import Any
 
@@ -51,7 +54,7 @@ def _contacts(model: Any, data: Any) -> tuple[Any, Any, Any]:
     Contacts, found = kernels.packed("Contacts", values | {"force": data.efc.force, "count": data.nacon})
 
     @wp.func
-    def force(c: Contacts, i: int, in_world: bool) -> wp.vec3:  # type: ignore[valid-type]
+    def force(c: Contacts, i: int, in_world: bool):  # type: ignore[valid-type]
         wrench = contact_force_fn(
             c.cone, c.frame, c.friction, c.dim, c.efc_address, c.adhesion, c.force, c.njmax, c.count, c.worldid[i], i, in_world
         )
