@@ -52,7 +52,7 @@ class Task:
 
     @property
     def place(self) -> tuple[float, float, float]:
-        """Where the robot can take hold of a handle and pull it by 16 cm: beyond its workspace's middle, in its upper half."""
+        """Place where the robot can grasp a handle and pull it by 16 cm: beyond its workspace's middle, in its upper half."""
         box = np.array(regions.box(self.robot, "workspace", "where it can work"))
         (x, y, z), (deep, _, high) = box.mean(1), np.ptp(box, axis=1)
         return round(float(x + deep / 2 + 0.02), 4), round(float(y), 4), round(float(z + 0.3 * high), 4)

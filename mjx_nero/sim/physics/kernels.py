@@ -87,7 +87,7 @@ def batched(function: Callable[..., tuple], outputs: int) -> Callable[..., tuple
 
 
 class Programs:
-    """What batches need on a device, made at their first call by ``make(number of worlds)`` and then kept."""
+    """Kept parts of batches: made by ``make(number of worlds)`` at the first call with that number on a device."""
 
     def __init__(self, make: Callable[[int], Any]):
         self._make = make
