@@ -132,14 +132,24 @@ def _queued(pid: int) -> float:
         return 0.0
 
 
-def main() -> None:
-    """Serves until stdin ends."""
+def preload() -> None:
+    """Imports what commands import, so that no child has to."""
     import mjx_nero.control.rmpflow
+    import mjx_nero.learn.ppo.learner
+    import mjx_nero.runs.evaluation
+    import mjx_nero.runs.training
     import mjx_nero.tools.eval
     import mjx_nero.tools.import_urdf
     import mjx_nero.tools.inspect
-    import mjx_nero.tools.train  # noqa: F401
+    import mjx_nero.tools.inspection
+    import mjx_nero.tools.self_test
+    import mjx_nero.tools.train
+    import mjx_nero.tools.train_run  # noqa: F401
 
+
+def main() -> None:
+    """Serves until stdin ends."""
+    preload()
     print("ready", flush=True)
     for line in sys.stdin:
         order = json.loads(line)

@@ -161,6 +161,7 @@ def main() -> int:
     parser.add_argument("--kind", choices=(*SHARES, "signals"), action="append", help="again for more (default: all)")
     parser.add_argument("--finds", type=pathlib.Path, default=pathlib.Path("finds.txt"), help="where finds are written")
     args = parser.parse_args()
+    server.preload()
     kinds = args.kind or [*SHARES, "signals"]
     total, found, file = 0, 0, args.finds.resolve().open("a")
     for kind in kinds:

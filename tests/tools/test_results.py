@@ -14,6 +14,11 @@ LEARNT |= {"env_steps_median": 2_400_000, "env_steps_worst": None, "version": "9
 PLAYED = {"success_rate": 0.9, "success_rate_95": [0.8, 0.95], "episodes": 1000, "version": "9.9", "machine": "a CPU"}
 
 
+@pytest.fixture(scope="module")
+def learnable() -> list[str]:
+    return results.learnable()
+
+
 def test_cells():
     assert list(results.rows({"x_lift": {"learning": LEARNT, "native": PLAYED}, "y_reach": {"warp": PLAYED}})) == [
         (
@@ -40,9 +45,9 @@ def test_the_page_has_a_table_for_each_task():
     assert "--json docs/r.json --markdown docs/r.md" in page
 
 
-def test_every_environment_has_a_task():
+def test_every_environment_has_a_task(learnable):
     """Those that are to be learnt belong to tasks of any robot."""
-    assert {results.task_of(name) for name in results.learnable()} <= set(registry.list_envs())
+    assert {results.task_of(name) for name in learnable} <= set(registry.list_envs())
     assert results.task_of("drag") == "drag"  # a guest's
     assert results.task_of(results.named("so101_lift_obstacles", "default")) == "lift_obstacles"
     assert results.task_of(results.named("so101_lift", "sim2real")) == "lift sim2real"
@@ -54,10 +59,9 @@ def test_the_page_of_the_documentation_is_what_its_figures_give():
     assert (docs / "benchmarks.md").read_text() == results.page(cells, "benchmarks.json", "benchmarks.md")
 
 
-def test_environments_to_learn():
-    names = results.learnable()
-    assert {"nero_lift", "so101_reach", "cobotta_stack"} <= set(names)
-    assert "nero_pick_place" not in names and "reach" not in names  # a controller's, and any robot's
+def test_environments_to_learn(learnable):
+    assert {"nero_lift", "so101_reach", "cobotta_stack"} <= set(learnable)
+    assert "nero_pick_place" not in learnable and "reach" not in learnable  # a controller's, and any robot's
 
 
 @pytest.mark.slow
