@@ -45,7 +45,7 @@ def lights(key: Key, model: Model, *, turn: NonNegative, brightness: PositiveRan
     factor = jax.random.uniform(k_bright, (len(rows), 1), minval=brightness[0], maxval=brightness[1])
     factor *= 1 - jax.random.bernoulli(k_dark, dark, (len(rows), 1))
     color = model.fields["light_diffuse"][rows] * factor * (1 + tint * _within(k_tint, (len(rows), 3)))
-    return {"light_dir": (rows, direction), "light_diffuse": (rows, color)}
+    return {"light_diffuse": (rows, color), "light_dir": (rows, direction)}
 
 
 def colors(key: Key, model: Model, *, geoms: tuple[str, ...], change: Share, shade: PositiveRange = (1.0, 1.0)) -> Drawn:
