@@ -56,8 +56,8 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
     [
         (("--arm", "so101"), "--arm so101 needs --port, or --emulate"),
         (("--arm", "toaster"), "--arm"),
-        (("--arm", "sim", "--emulate"), "--arm sim is simulated already"),
-        (("--arm", "lerobot", "--emulate"), "--arm lerobot is LeRobot's"),
+        (("--arm", "sim", "--emulate"), "leave it out with --arm sim, which is simulated already"),
+        (("--arm", "lerobot", "--emulate"), "--emulate cannot emulate --arm lerobot"),
         (("--arm", "sim", "--check", "found.yaml", "--dry-run"), "--check moves the arm"),
         (("--arm", "sim", "--identified", "none.yaml"), "none.yaml"),
         (("--arm", "sim", "--goal", "1,2"), "--goal takes 3 or 7 numbers"),

@@ -258,7 +258,7 @@ def test_list_envs(call, monkeypatch):
     [
         ([], "name a robot, an environment or the folder of an imported robot"),
         (["nerro"], "no robot or environment 'nerro' (did you mean 'nero'?)"),
-        (["nero", "--preset", "isaac"], "nero is a robot: --preset and --robot go with an environment"),
+        (["nero", "--preset", "isaac"], "nero is a robot: leave out --preset and --robot, which are for environments"),
         (["nero_lift", "--preset", "x"], "unknown preset of nero_lift 'x'"),
         (["reach"], "reach is for any robot: pass one"),
         (["."], ". holds no robot.yaml"),

@@ -54,7 +54,7 @@ MISTAKES = [
     ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--json", "."], "--json takes a name that ends in .json, got '.'"),
-    ("eval", ["--failures"], "--failures chooses what a video shows: give --video FILE.mp4, too"),
+    ("eval", ["--failures"], "--failures selects the episodes of a video: pass --video FILE.mp4, too"),
     ("eval", ["--video", "v.zzz"], "--video takes a name that ends in .mp4, got 'v.zzz'"),
     ("eval", ["--episodes", "1e12"], "--episodes must be at least 1 and at most 1000000, got '1e12'"),
     ("eval", ["--seed", "18446744073709551616"], "--seed takes a whole number, got '18446744073709551616'"),

@@ -157,7 +157,7 @@ def test_what_the_hand_did_is_played_again_in_physics(shown, tmp_path, call):
     session.recorders.clear()
     code, out, err = call("mjx_nero", "demos", "--replay", tmp_path / "d")
     assert code == 0 and "episode 0 (number 0): 10 steps, succeeds" in out, err
-    assert float(out.split("differs by at most ")[1].split()[0]) < 0.02
+    assert float(out.split("differs from the recording by at most ")[1].split()[0]) < 0.02
 
 
 def test_corrections_are_recorded_while_the_user_steers(tmp_path):
