@@ -183,11 +183,11 @@ def test_one_command_starts_goes_on_and_is_done(train, at_row, undisturbed, tmp_
     (run / "summary.json").unlink()  # killed between the last checkpoint and the summary
     for _ in range(2):
         code, out, err = train(*command)
-        assert code == 0 and "has made its 640 steps already" in err and "nothing is left to do" in err
+        assert code == 0 and "has already made its 640 steps" in err and "nothing is left to do" in err
         assert "640 env steps" in out
     assert json.loads((run / "summary.json").read_text())["env_steps"] == STEPS
     code, _, err = train("--restore", "run", steps=0)
-    assert code == 2 and "has made its 640 steps already: pass a larger --num-timesteps" in err
+    assert code == 2 and "has already made its 640 steps: pass a larger --num-timesteps" in err
 
 
 def stopping_at(steps, save):
@@ -243,7 +243,7 @@ def test_minutes_go_on(train, at_row, tmp_path, monkeypatch):
     (tmp_path / "before").write_text((tmp_path / "run" / "summary.json").read_text())
     before = json.loads((tmp_path / "before").read_text())["train_s"]
     code, _, err = train("--restore", "run", "--max-minutes", 1e-9, steps=0)
-    assert code == 2 and "has used its 1e-09 minutes already: pass a larger --max-minutes" in err
+    assert code == 2 and "has already used its 1e-09 minutes: pass a larger --max-minutes" in err
     assert train("--restore", "run", steps=0)[0] == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["train_s"] >= before and rows(tmp_path / "run")[-1]["wall_s"] == pytest.approx(summary["train_s"], abs=0.06)

@@ -172,7 +172,7 @@ def test_files_elsewhere_are_asked_for_once(theirs, stored, names, tmp_path, mon
     asked = {"robot": None, "env": {}, "learner": {}} | json.loads(json.dumps(names).replace("KEYS", str(keys)))
     run, text = theirs / "run", json.dumps({**stored, "asked": asked})
     message = refused(run, text)
-    assert "pass --trust if you know who made the run" in message and "secret" not in message
+    assert "pass --trust if you trust whoever made it" in message and "secret" not in message
     for trusted in (True, False):  # the second time without being asked
         try:  # a robot is read at once, and this is none
             resume.same_run(run, run_cfg.resolve("nero_reach", "default", None, {}, {}), (), {}, trusted)

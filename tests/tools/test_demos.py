@@ -200,4 +200,4 @@ def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(cal
     assert code == 0 and "pictures: sheet.png" in out
     assert imageio.imread(tmp_path / "sheet.png").shape[1] % (6 * 64) == 0  # three moments by two cameras
     code, _, err = call("mjx_nero", "demos", *argv[:-1], "e", "--cameras", "ceiling")
-    assert code == 2 and "ceiling: no camera of this environment: choose from front, wrist, side" in err
+    assert code == 2 and "this environment has no camera ceiling: choose from front, wrist, side" in err

@@ -139,7 +139,7 @@ def test_a_tape_shows_what_was_recorded(shown, tmp_path):
     with pytest.raises(UserError, match="has 1 episodes: --episode takes a number from 0 to 0"):
         tape.of_dataset(tmp_path / "d", 1, live)
     other = dataclasses.replace(live, qpos=live.qpos[:, :5])
-    with pytest.raises(UserError, match="scenes of 16 positions, and this environment 5: pass its --env"):
+    with pytest.raises(UserError, match="has 16 positions, but this environment has 5: pass the data set's --env"):
         tape.of_dataset(tmp_path / "d", 0, other)
     session.recorders.clear()
 
