@@ -154,7 +154,7 @@ def test_what_is_damaged_is_told(form, tmp_path):
         out.put([episode(0)])
     data = next((tmp_path / "data").rglob("*.*"))
     data.write_bytes(data.read_bytes()[:100])
-    with pytest.raises(UserError, match="is damaged (its steps of action cannot be read): write the data set again"):
+    with pytest.raises(UserError, match=r"is damaged \(its steps of action cannot be read\): write the data set again"):
         open_dataset(tmp_path).column("action")
     (tmp_path / "meta/mjx_nero.json").write_text('{"fps": 50}')
     with pytest.raises(UserError, match="does not describe demonstrations of mjx_nero, or it is damaged"):
