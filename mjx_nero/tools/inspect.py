@@ -22,19 +22,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--robot", help="robot in the environment, or to inspect alone: a name, or the folder of an imported one")
     parser.add_argument("--object", metavar="FILE", help="show a mesh object instead: a file, a folder or a name")
     parser.add_argument(
-        "--scale",
-        type=cli.positive_float,
-        default=1.0,
-        help="with --object: scale of the lengths in the file (default: %(default)s)",
+        "--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths (default: %(default)s)"
     )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="write a PNG of the robot at home")
     parser.add_argument(
-        "--cameras",
-        type=cli.path(".png"),
-        metavar="FILE",
-        help="write a PNG of what the environment's cameras see; takes --env.* fields",
+        "--cameras", type=cli.path(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
     )
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, dotted = parser.parse(argv, ("env",))

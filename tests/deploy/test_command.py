@@ -66,9 +66,9 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
         (("--arm", "sim", "--speed", "2"), "--speed"),
         (("--arm", "sim", "--hottest", "1000"), "--hottest"),
         (("--arm", "sim", "--log", "nowhere/log.csv"), "the folder nowhere does not exist"),
-        (("--arm", "piper", "--emulate"), "the policy is for so_arm101, and --arm piper is a piper"),
+        (("--arm", "piper", "--emulate"), "the policy is for so_arm101, but --arm piper is a piper"),
         (("--arm", "so101", "--port", "/dev/nothing", "--object", "0.2,0,0.015"), "needs --calibration"),
-        (("--arm", "sim", "--object", "udp://x"), "an address is udp://HOST:PORT"),
+        (("--arm", "sim", "--object", "udp://x"), "an object's address takes udp://HOST:PORT"),
     ],
 )
 def test_mistakes_are_one_line(call, policy, flags, message):

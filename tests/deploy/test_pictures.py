@@ -37,9 +37,9 @@ def test_the_whole_height_where_the_field_is_the_same():
 
 
 def test_cameras_that_see_too_little_are_refused():
-    with pytest.raises(UserError, match="'front' sees 40 degrees from top to bottom, the policy 45"):
+    with pytest.raises(UserError, match="'front' has a fovy of 40 degrees, but the policy needs 45"):
         pictures.View("front", TOLD["front"], 40.0)
-    with pytest.raises(UserError, match="gives 300 x 480 pixels: the policy sees further to the sides"):
+    with pytest.raises(UserError, match="gives 300 x 480 pixels, but the policy needs a wider one"):
         pictures.View("front", TOLD["front"], 45.0)(board(480, 300))
 
 

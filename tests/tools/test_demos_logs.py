@@ -69,13 +69,13 @@ def test_logs_become_a_data_set_once(call, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "needs one column time"),
-        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "needs one column target.wrist_roll"),
+        ("", "needs exactly one column time"),
+        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "needs exactly one column target.wrist_roll"),
         (table(ROWS[:4]), "has 0 policy steps, and an episode needs two: give a log of 'deploy --log'"),
         (table(ROWS).replace("0.4,0.4", "0.4,nan"), "log.csv line 10 takes a number up to 10000, got 'nan'"),
         (table(ROWS).replace("0.4,0.4", "0.4,", 1), "log.csv line 10 takes a number up to 10000, got ''"),
         (table(ROWS).replace("0.06,,", "0.06,"), "line 9 has"),
-        ("\x00", "needs one column time"),
+        ("\x00", "needs exactly one column time"),
     ],
 )
 def test_what_is_wrong_with_a_log(text, message, call, tmp_path):
