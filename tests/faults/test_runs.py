@@ -303,7 +303,7 @@ def test_divergence_goes_back_once(train, monkeypatch, tmp_path):
 
 def test_a_folder_has_one_owner(tmp_path):
     with run_folder.claim(tmp_path / "run", "x", goes_on=False) as path:
-        with pytest.raises(run_folder.UserError, match=f"is in use by process {os.getpid()} on .*: wait for its end"):
+        with pytest.raises(run_folder.UserError, match=f"is in use by process {os.getpid()} on .*: wait until it ends"):
             with run_folder.claim(tmp_path / "run", "x", goes_on=True):
                 pass
         assert path.exists()

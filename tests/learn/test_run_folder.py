@@ -49,7 +49,7 @@ def test_nothing_outside_is_reached(theirs, name, kind):
     run, mine = theirs / "run", theirs / "mine"
     put(run / name, kind, mine)
     before = listing(mine)
-    with pytest.raises(UserError, match="is (a link|no file), which is neither read nor written here") as error:
+    with pytest.raises(UserError, match="is (a link|not a regular file) and will not be read or written") as error:
         with run_folder.claim(run, "x", goes_on=True):
             pass
     assert "\n" not in str(error.value)
