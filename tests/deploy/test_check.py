@@ -148,8 +148,8 @@ def test_offsets_are_subtracted(told):
     [
         ("[]", "is not a file of identify or deploy --check"),
         ("robot: so_arm101\ndelay: {value: 0}\njoints: 3\n", "is not a file of identify or deploy --check"),
-        ("robot: nero\ndelay: {value: 0.01}\njoints: {}\n", "is of nero with joints"),
-        ("robot: so_arm101\ndelay: {value: 0.01}\njoints: {elbow: {offset: {value: 0}}}\n", "is of so_arm101 with joints elbow"),
+        ("robot: nero\ndelay: {value: 0.01}\njoints: {}\n", "is for nero with joints"),
+        ("robot: so_arm101\ndelay: {value: 0.01}\njoints: {elbow: {offset: {value: 0}}}\n", "is for so_arm101 with joints elbow"),
         ("robot: so_arm101\ndelay: {value: 3}\njoints: {}\n", "the delay must be 0 to 1 s"),
         ("robot: so_arm101\ndelay: {value: .nan}\njoints: {}\n", "is not a file of identify"),
     ],

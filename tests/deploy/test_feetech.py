@@ -330,11 +330,11 @@ def test_files_that_are_no_calibration(tmp_path, told, text, message):
     ("field", "value", "message"),
     [
         ("id", 1, "two joints have the same id"),
-        ("id", True, "no calibration file"),
+        ("id", True, "not a calibration file of LeRobot"),
         ("range_max", 5000, "elbow_flex has no range within 0 to 4095"),
         ("range_min", 4000, "elbow_flex has no range within 0 to 4095"),
-        ("drive_mode", 1, "elbow_flex has a drive_mode of its own"),
-        ("homing_offset", "x", "no calibration file"),
+        ("drive_mode", 1, "elbow_flex has a drive_mode other than 0"),
+        ("homing_offset", "x", "not a calibration file of LeRobot"),
     ],
 )
 def test_calibrations_that_are_wrong(tmp_path, told, field, value, message):

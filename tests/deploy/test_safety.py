@@ -404,7 +404,7 @@ def test_a_start_far_from_home_is_refused(so101, joint):
     at = safety.limits.home.copy()
     at[joint] += 0.4 if at[joint] + 0.4 < safety.limits.upper[joint] else -0.4
     name = safety.limits.names[joint]
-    with pytest.raises(UserError, match=rf"far from home: {name} by 0\.40, .* move it home slowly with --go-home"):
+    with pytest.raises(UserError, match=rf"far from home: {name} by 0\.40 .*: move it home slowly with --go-home"):
         safety.begin(Feedback(0.0, at, np.zeros(6)), 0.0)
     safety.begin(Feedback(0.0, at, np.zeros(6)), 0.0, anywhere=True)
 

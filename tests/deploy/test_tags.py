@@ -103,7 +103,7 @@ def test_quaternions_of_any_turn():
         ({"tags": {"x": {}}}, "needs camera"),
         ({"tags": {}}, "tags must name at least one"),
         ({"quaternion": [2, 0, 0, 0]}, "quaternion four of length 1"),
-        ({"size": 0}, "size [m] must be above 0"),
+        ({"size": 0}, r"size \[m\] must be above 0"),
     ],
 )
 def test_files_that_say_something_else(tmp_path, change, message):
