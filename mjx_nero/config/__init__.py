@@ -136,7 +136,9 @@ def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> An
     if rest:
         new = _replace(old, kind, rest, value, name)
     elif dataclasses.is_dataclass(old) and not isinstance(value, type(old)):
-        raise UserError(f"{name} takes a {type(old).__name__}: set its fields one by one ({name}.{next(iter(hints(type(old))))})")
+        raise UserError(
+            f"{name} takes {type(old).__name__}: pass one, or set its fields singly ({name}.{next(iter(hints(type(old))))})"
+        )
     else:
         new = read(kind, value, name)
     if dataclasses.is_dataclass(node):

@@ -28,7 +28,7 @@ class Registry(dict[str, Thing]):
             UserError: the name is taken.
         """
         if name in self:
-            raise UserError(f"there already is a{'n' * (self.kind[0] in 'aeiou')} {self.kind} {name!r}: choose another name")
+            raise UserError(f"there is already a{'n' * (self.kind[0] in 'aeiou')} {self.kind} {name!r}: choose another name")
         self[name] = thing
 
     def find(self, name: str) -> Thing:

@@ -80,8 +80,8 @@ def same_run(
     def refuse(flag: str, own: Any, other: Any) -> None:
         if own != other:
             raise UserError(
-                f"--{flag} is {other}, but {folder} is a run with {own}: leave the flag out to resume that run, or start a new "
-                "one with another --out"
+                f"--{flag} is {other}, but {folder} is a run with {own}: leave the flag out to resume that run, or start a "
+                "new one with another --out"
             )
 
     for flag, name in (("env", "env_name"), ("preset", "preset"), ("learner", "learner"), ("seed", "seed")):

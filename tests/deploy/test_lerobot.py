@@ -131,7 +131,7 @@ def test_a_robot_by_its_type(told, monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
     arm = lerobot.of(told, arms.Clock(), "fake:port=/dev/ttyACM0", None)
     assert arm._robot.config.port == "/dev/ttyACM0"
-    with pytest.raises(UserError, match=r"the robot has no shoulder_pan\.pos, .* it has other\.pos: say which joint is which"):
+    with pytest.raises(UserError, match=r"the robot has no shoulder_pan\.pos, .* it has other\.pos: pass --calibration"):
         arm.connect()
     with pytest.raises(UserError, match="LeRobot has no robot 'none'"):
         lerobot.of(told, arms.Clock(), "none", None)

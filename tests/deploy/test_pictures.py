@@ -89,7 +89,7 @@ def test_no_picture_and_no_camera_are_said(tmp_path):
 @pytest.mark.parametrize("text", ["", "[]", '{"side": {"camera": 0}}', '{"front": 1}', '{"front": {"camera": 0, "fovy": 200}}'])
 def test_files_that_say_something_else(tmp_path, text):
     (tmp_path / "c.json").write_text(text)
-    with pytest.raises(UserError, match='c.json is to say, as JSON, a "camera"'):
+    with pytest.raises(UserError, match='c.json must be JSON with a "camera"'):
         pictures.read(tmp_path / "c.json", TOLD)
 
 

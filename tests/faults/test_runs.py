@@ -215,7 +215,7 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
 REFUSED = [
     (
         ["--seed", 4],
-        "--seed is 4, and run is a run with 0: leave the flag out to resume that run, or start another with",
+        "--seed is 4, and run is a run with 0: leave the flag out to resume that run, or start a new one with",
     ),
     (["--env", "nero_reach"], "--env is nero_reach, and run is a run with nero_lift"),
     (["--num-envs", 16], "--num-envs is 16, and run is a run with 8"),

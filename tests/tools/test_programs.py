@@ -112,7 +112,7 @@ def test_shared_flags_read_alike_in_every_command(call):
         code, out, _ = call(*program, "--help")
         said = " ".join(out.split())
         assert code == 0 and "--load FILE_OR_MODULE Python code that registers its own environments" in said
-        assert "--env ENV environment; list-envs names them all (default: nero_lift)" in said
+        assert "--env ENV environment; list-envs lists them all (default: nero_lift)" in said
         assert "--preset PRESET preset of the environment (default: default)" in said
         assert "--robot ROBOT name of another robot, or folder of an imported one (default: the environment's own)" in said
 
