@@ -77,7 +77,7 @@ def open_dataset(path: pathlib.Path) -> Dataset:
     """Opens the data set in a folder.
 
     Raises:
-        UserError: there is none, or it is damaged.
+        UserError: there is no data set, or it is damaged.
     """
     schema, form = folder.schema_of(path), _held(path)
     if form is None:

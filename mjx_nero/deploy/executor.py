@@ -16,7 +16,7 @@ LARGEST = 1e6  # largest number in a description
 
 
 def numbers(found: Any, name: str, size: int | None = None, above: float = -np.inf) -> np.ndarray:
-    """Reads a field of a description, which may come from a stranger: finite numbers [size], or one for all.
+    """Reads a field of an untrusted description: finite numbers [size], or one for all.
 
     Args:
         size: required number of values; None: a single number.

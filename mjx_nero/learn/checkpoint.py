@@ -1,4 +1,4 @@
-"""Checkpoints: arrays and a JSON description in one safetensors file. No pickle, so a stranger's file runs no code."""
+"""Checkpoints: arrays and a JSON description in one safetensors file. No pickle, so reading an untrusted file runs no code."""
 
 import json
 import pathlib

@@ -1,4 +1,4 @@
-"""The header of a policy or checkpoint, which may be a stranger's: read with limits, before any library sees the file."""
+"""The header of a policy or checkpoint. The file is untrusted, so this is read with limits before any library sees the file."""
 
 import math
 import pathlib

@@ -70,7 +70,7 @@ def same_run(
         trust: the user vouches for the run, so files that it names outside its folder may be read.
 
     Raises:
-        UserError: a flag differs from the run's own; or the config is damaged, names files that a stranger may have chosen, or
+        UserError: a flag differs from the run's own; or the config is damaged, names untrusted files outside the folder, or
             comes from a version that this one cannot continue.
     """
     run = _rebuilt(folder, trust)

@@ -1,4 +1,4 @@
-"""Trust: a stranger's run may name any file in its config, so reading such a file needs the user's consent once.
+"""Trust: someone else's run may name any file in its config, so reading such a file needs the user's consent once.
 
 A run that this user started here, or has trusted once, is marked in the user's cache folder by the fingerprint of its config.
 """

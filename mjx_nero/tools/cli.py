@@ -93,7 +93,9 @@ class Parser(argparse.ArgumentParser):
 
     def add_video(self) -> None:
         """Adds the flags of videos. Their defaults give the best video that the machine draws within half a minute."""
-        self.add_argument("--video-size", type=size, help="size in pixels, such as 1280x720 (default: by the machine's speed)")
+        self.add_argument(
+            "--video-size", type=size, help="size in pixels, such as 1280x720 (default: depends on the machine's speed)"
+        )
         text = "frames per second (default: 25, or fewer on a slow machine)"
         self.add_argument("--video-fps", type=positive_float, default=0.0, help=text)
         text = "number of robots side by side in one picture (default: 1)"
@@ -307,7 +309,7 @@ def choices(text: str, what: str, valid: Collection[str]) -> list[str]:
     """Reads a comma-separated list of names and drops repeated ones.
 
     Raises:
-        UserError: a name is not among the valid ones, or there is none.
+        UserError: a name is not valid, or the list is empty.
     """
     chosen = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     unknown = [name for name in chosen if name not in valid]

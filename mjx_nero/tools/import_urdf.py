@@ -74,7 +74,7 @@ def _parser() -> cli.Parser:
         ends=_EPILOG,
     )
     parser.add_argument("file", type=cli.path(), help="URDF or xacro file")
-    parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to make")
+    parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to create")
     parser.add_argument(
         "--package", action="append", default=[], metavar="[NAME=]DIR", help="folder for package://NAME/; repeatable"
     )

@@ -120,7 +120,7 @@ class Player:
         return dataclasses.replace(made, pictures=films)
 
     def _begin_all(self, numbers: Array, key: Key) -> tuple:
-        """Starts an episode in every slot: state, the agent's memory, noise, number of steps, and whether it goes on."""
+        """Starts an episode in every slot: state, the agent's memory, noise, number of steps, and whether it continues."""
         state = jax.vmap(self.env.reset)(_keys(numbers, key))
         n = self.size
         return state, self.agent.init(state), jnp.zeros((n, self._arm)), jnp.zeros(n, jnp.int32), jnp.ones(n)

@@ -1,4 +1,4 @@
-"""``deploy --check``: moves an arm's joints one by one, and reports what it found and whether to go on."""
+"""``deploy --check``: moves an arm's joints one by one, and reports what it found and whether to continue."""
 
 import pathlib
 import sys

@@ -8,7 +8,7 @@ _LONGEST = 160  # characters
 
 
 class _Rarely(logging.Filter):
-    """Lets one line through per ``EVERY_S``, escaped (it may hold what strangers send) and without its traceback."""
+    """Lets one line through per ``EVERY_S``, escaped (it may quote untrusted requests) and without its traceback."""
 
     def __init__(self) -> None:
         super().__init__()
