@@ -99,7 +99,7 @@ def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str)
             if not callable(value):
                 yield prefix + name, text
         elif name == "params" and callable(func := getattr(node, "func", None)):
-            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"of {docs.summary(func)}")
+            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"parameter of: {docs.summary(func)}")
         elif dataclasses.is_dataclass(value):
             yield from _described(value, f"{prefix}{name}.", docs.fields(type(value)), "")
         else:

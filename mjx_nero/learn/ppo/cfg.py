@@ -107,7 +107,7 @@ class PpoCfg:
     value_loss: NonNegative = 1.0  # weight of the critic's loss
     max_grad_norm: Positive = 1.0  # maximum norm of the gradient
     reward_scaling: Positive = 1.0  # factor of rewards
-    matmul_precision: str = "tensorfloat32"  # of the networks' matrix products on a GPU; the environment's are always full
+    matmul_precision: str = "tensorfloat32"  # precision of networks' matrix products on a GPU; always full in environments
     network: NetworkCfg = NetworkCfg()
 
     def __post_init__(self):
