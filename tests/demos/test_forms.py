@@ -36,7 +36,7 @@ def test_what_is_written_in_pieces_is_read(form, tmp_path):
         for name in own.arrays:
             assert back.arrays[name].dtype == own.arrays[name].dtype
             np.testing.assert_array_equal(back.arrays[name], own.arrays[name])
-    with pytest.raises(UserError, match="the data set has no 'pictures': it has observation.state, action"):
+    with pytest.raises(UserError, match="the data set has no 'pictures': choose from observation.state, action"):
         found.column("pictures")
 
 

@@ -78,7 +78,7 @@ def test_a_video_is_a_camera(tmp_path):
 
 
 def test_no_picture_and_no_camera_are_said(tmp_path):
-    with pytest.raises(UserError, match="no camera '/dev/nothing'"):
+    with pytest.raises(UserError, match="cannot open camera '/dev/nothing'"):
         pictures.opened("/dev/nothing")
     pictures._FIRST, before = 0.1, pictures._FIRST
     with pytest.raises(UserError, match="'front' gives no picture"):

@@ -438,5 +438,5 @@ def test_all_bundled_robots_limits_are_an_arms(robot):
 
 def test_files_of_older_versions_are_refused(so101):
     old = {name: value for name, value in so101.items() if name != "body"}
-    with pytest.raises(UserError, match="does not say body: export the policy again"):
+    with pytest.raises(UserError, match="lacks body: export the policy again"):
         setup.check(old)

@@ -215,12 +215,12 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
 REFUSED = [
     (
         ["--seed", 4],
-        "--seed is 4, and run is a run with 0: leave the flag out to resume that run, or start a new one with",
+        "--seed is 4, but run is a run with 0: leave the flag out to resume that run, or start a new one with",
     ),
-    (["--env", "nero_reach"], "--env is nero_reach, and run is a run with nero_lift"),
-    (["--num-envs", 16], "--num-envs is 16, and run is a run with 8"),
-    (["--ppo.learning_rate", 0.1], "--ppo.learning_rate is 0.1, and run is a run with 0.0003"),
-    (["--env.sim.iterations", 7], "--env.sim.iterations is 7, and run is a run with 10"),
+    (["--env", "nero_reach"], "--env is nero_reach, but run is a run with nero_lift"),
+    (["--num-envs", 16], "--num-envs is 16, but run is a run with 8"),
+    (["--ppo.learning_rate", 0.1], "--ppo.learning_rate is 0.1, but run is a run with 0.0003"),
+    (["--env.sim.iterations", 7], "--env.sim.iterations is 7, but run is a run with 10"),
 ]
 
 

@@ -137,7 +137,7 @@ def test_policy_of_another_preset(path):
 
 def test_policy_of_the_same_terms_of_other_sizes(path):
     longer = make("nero_lift", impl="native", **{"observations.state.joint_pos.history": 2})
-    with pytest.raises(UserError, match=r"of size \[47\], here it is \[56\]: pass the --preset \(it had default\) and the"):
+    with pytest.raises(UserError, match=r"of size \[47\], but here it is \[56\]: pass the --preset \(it had default\) and the"):
         policy.load_for(longer, "nero_lift", path)
 
 

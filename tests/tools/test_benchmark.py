@@ -36,7 +36,7 @@ MISTAKES = [
     (["--json", "nowhere/rows.json"], "cannot write nowhere/rows.json"),
     (["--plot", "nowhere/rows.png"], "cannot write nowhere/rows.png"),
     (["--plot", "rows.jpeg"], "--plot takes a name that ends in .png, got 'rows.jpeg'"),
-    (["--plot", "ik.png", "--what", "ik"], "--plot draws physics, step, ppo, control, reset: name one of them in --what"),
+    (["--plot", "ik.png", "--what", "ik"], "--plot draws only physics, step, ppo, control, reset: name one of them in --what"),
     (["--faster"], "unknown argument '--faster'"),
     (["--what", "learning", "--ppo.learning_rte", "1"], "learning_rte"),
     (["--what", "ppo", "--ppo.max_learning_rate", "2"], "max_learning_rate"),

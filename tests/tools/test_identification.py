@@ -190,7 +190,7 @@ def test_identified_drives_take_the_place_of_a_robots_own(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"robot": "piper"}, "is of piper with joints"),
+        ({"robot": "piper"}, "is for piper with joints"),
         ({"delay": {"value": 1.0, "low": 2.0, "high": 3.0}}, "delay takes low <= value <= high"),
         ({"delay": {"value": "x", "low": 2.0, "high": 3.0}}, "delay.value takes a finite number"),
         ({"more": 1}, "no key 'more'"),
