@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __version__ = "0.6.0.dev0"
 __all__ = ["EnvCfg", "ManipulationEnv", "UserError", "env_cfg", "list_envs", "list_presets", "list_robots", "make", "register"]
 
-# Public name -> the module that has it. Loaded at its first use: JAX, MuJoCo and Brax take seconds.
+# Public name -> its module, which is imported at first use: JAX, MuJoCo and Brax take seconds to load.
 _HOME = {
     "EnvCfg": "mjx_nero.envs.task",
     "ManipulationEnv": "mjx_nero.envs.env",
@@ -46,25 +46,25 @@ def __dir__() -> list[str]:
 
 
 def cores() -> int:
-    """Number of processors that this process may use."""
+    """Returns the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _prepare() -> None:
-    """Sets what JAX and MuJoCo read from the environment when they start."""
-    # Two traps of XLA's CPU compiler in JAX before 0.11: its fusion recomputes an unrolled kinematic tree without end (one
+    """Sets the environment variables that JAX and MuJoCo read when they start."""
+    # XLA's CPU compiler in JAX before 0.11 has two traps. Its fusion recomputes an unrolled kinematic tree over and over (one
     # batched step takes seconds instead of milliseconds), and its concurrent scheduler can deadlock where physics and networks
-    # share a loop. Later versions fuse MJX well and have no such scheduler, and the newest abort on the first flag, so both are
-    # set for the old ones alone, before the first JAX computation. Our own chains have barriers (``sim.kinematics``).
+    # share a loop. Later versions fuse MJX well and have no such scheduler, and the newest abort on the first flag. So set both
+    # flags for old versions only, before the first JAX computation. Our own chains have barriers (``sim.kinematics``).
     with contextlib.suppress(metadata.PackageNotFoundError):
         if tuple(int(x) for x in metadata.version("jaxlib").split(".")[:2]) < (0, 11):
             for flag in ("xla_cpu_use_fusion_emitters", "xla_cpu_enable_concurrency_optimized_scheduler"):
                 if flag not in os.environ.get("XLA_FLAGS", ""):
                     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --{flag}=false".strip()
-    # With a single processor XLA has a single thread, and a program that calls the C library back waits for itself, now and then.
+    # With one processor XLA has one thread, and a program that calls back into the C library sometimes waits for itself.
     if cores() == 1:
         os.environ.setdefault("NPROC", "2")
-    # MuJoCo picks its OpenGL when it is first imported. Without a display the way is EGL, else OSMesa (software).
+    # MuJoCo chooses its OpenGL when it is first imported. Without a display it needs EGL, or else OSMesa (software).
     if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
         for gl, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8"), ("osmesa", "libOSMesa.so.6")):
             with contextlib.suppress(OSError):

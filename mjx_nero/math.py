@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Python traces such a function once for each shape, and puts its operations where it is called: no trace calls others as often.
+# JAX traces such a function once per shape and inlines its operations where it is called. These are the most often called ones.
 _traced_once = functools.partial(jax.jit, inline=True)
 
 
 @_traced_once
 def quat_mul(a: Float[Array, "4 *many"], b: Float[Array, "4 *many"]) -> Float[Array, "4 *many"]:
-    """Hamilton product: the rotation ``b`` first, then ``a``. One of each, or many with the components in front."""
-    # Written out: XLA fuses plain products into one kernel, but not the reductions and slices of dot and cross.
+    """Returns the Hamilton product: rotation ``b`` first, then ``a``. One of each, or many with components on the first axis."""
+    # Written out, since XLA fuses plain products into one kernel, but not the reductions and slices of dot and cross.
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return jnp.stack(
@@ -28,7 +28,7 @@ def quat_mul(a: Float[Array, "4 *many"], b: Float[Array, "4 *many"]) -> Float[Ar
 
 @_traced_once
 def rotate(quat: Float[Array, "4 *many"], vec: Float[Array, "3 *many"]) -> Float[Array, "3 *many"]:
-    """``vec`` turned by ``quat``. One of each, or many with the components in front."""
+    """Rotates ``vec`` by ``quat``. One of each, or many with components on the first axis."""
     w, x, y, z = quat
     vx, vy, vz = vec
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
@@ -36,30 +36,30 @@ def rotate(quat: Float[Array, "4 *many"], vec: Float[Array, "3 *many"]) -> Float
 
 
 def axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """Quaternion of a turn by ``angle`` [rad] about the unit vector ``axis``."""
+    """Returns the quaternion of a rotation by ``angle`` [rad] about the unit vector ``axis``."""
     return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])
 
 
 def quat_from_euler(roll: Float[Array, ""], pitch: Float[Array, ""], yaw: Float[Array, ""]) -> Float[Array, "4"]:
-    """Turns about the fixed axes x, y, z, in this order [rad]: URDF's and Isaac Lab's roll, pitch, yaw."""
+    """Returns the quaternion of rotations about the fixed axes x, y, z, in this order [rad], as in URDF and Isaac Lab."""
     x, y, z = jnp.eye(3)
     return quat_mul(axis_angle(z, yaw), quat_mul(axis_angle(y, pitch), axis_angle(x, roll)))
 
 
 def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
-    """The turn about the vertical of a frame that stands upright, or nearly so [rad]."""
+    """Returns the rotation about the vertical of a frame that is upright, or nearly so [rad]."""
     w, x, y, z = quat
     return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def quat_conj(quat: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The inverse rotation."""
+    """Returns the inverse rotation."""
     return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
 
 
 def quat_log(quat: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Rotation vector (axis times angle, angle in 0 to pi) [rad]; smooth at the identity."""
-    quat = jnp.where(quat[0] < 0, -quat, quat)  # q and -q are one rotation: take the short way
+    """Returns the rotation vector (axis times angle, angle from 0 to pi) [rad]; smooth at the identity."""
+    quat = jnp.where(quat[0] < 0, -quat, quat)  # q and -q are the same rotation: take the shorter way
     v = quat[1:]
     square = v @ v
     small = square < 1e-8
@@ -68,7 +68,7 @@ def quat_log(quat: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def quat_exp(vec: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The quaternion of a rotation vector (axis times angle) [rad]: the inverse of ``quat_log``."""
+    """Returns the quaternion of a rotation vector (axis times angle) [rad]: the inverse of ``quat_log``."""
     square = vec @ vec
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -78,7 +78,7 @@ def quat_exp(vec: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 def rotation_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Columns are the frame's axes in the outer frame."""
+    """Returns the rotation matrix: its columns are the frame's axes in the outer frame."""
     w, x, y, z = quat
     return jnp.array(
         [
@@ -90,10 +90,10 @@ def rotation_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 
 def solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solves ``a x = b`` for a small positive definite matrix by Cholesky's factors.
+    """Solves ``a x = b`` for a small positive definite matrix by Cholesky factorization.
 
-    Unrolled: for thousands of tiny systems side by side, plain arithmetic that the compiler fuses is many times quicker than a
-    batched call of a linear algebra library.
+    It is unrolled: for thousands of tiny systems, plain arithmetic that the compiler fuses is many times faster than a batched
+    call of a linear algebra library.
     """
     n = len(b)
     low: list[list[Array]] = [[] for _ in range(n)]
@@ -112,11 +112,11 @@ def solve_spd(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n
 def box_distance(
     point: Float[Array, "3"], pos: Float[Array, "3"], quat: Float[Array, "4"], size: Float[Array, "3"]
 ) -> Float[Array, ""]:
-    """Distance from a point to the surface of a box, negative inside [m].
+    """Returns the distance from a point to the surface of a box [m], negative inside.
 
     Args:
-        pos, quat: where the box's centre is, and how it is turned (wxyz).
-        size: its edges [m].
+        pos, quat: position of the box's centre [m], and its orientation (wxyz).
+        size: lengths of its edges [m].
     """
     beyond = jnp.abs(rotate(quat_conj(quat), point - pos)) - size / 2
     outside = jnp.maximum(beyond, 0.0)

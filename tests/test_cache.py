@@ -49,7 +49,7 @@ def test_truncated_entries_go(tmp_path):
 
 def test_too_few_addresses(monkeypatch):
     monkeypatch.setattr(cache.resource, "getrlimit", lambda _: (1_500_000_000, -1))
-    with pytest.raises(UserError, match=r"^this process may use 1.5 GB of addresses, and JAX needs 2.5: raise the limit"):
+    with pytest.raises(UserError, match=r"^this process may use 1.5 GB of address space, JAX needs 2.5: raise the limit"):
         cache.check_addresses()
     monkeypatch.setattr(cache.resource, "getrlimit", lambda _: (-1, -1))
     cache.check_addresses()

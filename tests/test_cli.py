@@ -202,7 +202,7 @@ def test_help_takes_its_texts_from_where_the_fields_are():
     assert about["robot.arm.stiffness"] == "[N m/rad] or [N/m]"  # under Attributes
     assert about["sim.dt"] == "physics step [s]"  # behind the field
     assert about["rewards.reaching_object.weight"] == "multiplies the function, per second of simulated time"  # of a term
-    assert about["rewards.goal_tracking.params.std"].startswith("of 1 - tanh(d / std) while held")
+    assert about["rewards.goal_tracking.params.std"].startswith("parameter of: 1 - tanh(d / std) while held")
     lines = cli.fields_help({"env": env_cfg("nero_lift")}).splitlines()
     assert lines[lines.index("  --env.sim.dt 0.01") + 1] == "        physics step [s]"
 

@@ -140,9 +140,9 @@ def test_several_overrides_at_once():
 
 def test_a_group_is_replaced_by_one_of_its_kind():
     assert config.override(CFG, {"inner": Inner(steps=1)}).inner.steps == 1
-    with pytest.raises(UserError, match="inner takes Inner, or set its fields one by one"):
+    with pytest.raises(UserError, match="inner takes Inner: pass one, or set its fields singly"):
         config.override(CFG, {"inner": 3})
-    with pytest.raises(UserError, match="inner takes Inner, or set its fields"):
+    with pytest.raises(UserError, match="inner takes Inner: pass one"):
         config.override(CFG, {"inner": "3"})
 
 

@@ -94,10 +94,10 @@ def test_fields_of_a_guest_are_overridden_by_dotted_name(drag):
     ("text", "message"),
     [
         ("1 / 0\n", r"^cannot load .*guest.py: ZeroDivisionError: division by zero \(.*guest.py:1\)$"),
-        ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is an env 'nero_lift'"),
+        ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is already an env 'nero_lift'"),
         ("import mjx_nero\nmjx_nero.register(envs={'new': (None, {})})\n", "the environment 'new' has no preset"),
-        ("import mjx_nero\nmjx_nero.register(controllers={'ik': (None, None)})\n", "there is a controller 'ik' already"),
-        ("import mjx_nero\nmjx_nero.register(physics_backends={'jax': None})\n", "there is a physics 'jax' already"),
+        ("import mjx_nero\nmjx_nero.register(controllers={'ik': (None, None)})\n", "there is already a controller 'ik'"),
+        ("import mjx_nero\nmjx_nero.register(physics_backends={'jax': None})\n", "there is already a physics 'jax'"),
     ],
 )
 def test_what_a_guest_does_wrong_is_one_line(call, tmp_path, text, message):

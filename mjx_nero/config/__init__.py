@@ -1,8 +1,8 @@
-"""Frozen configs: dotted names, overrides with clear errors, JSON. ``bounds`` says what values are possible, ``values`` reads
-them, ``docs`` finds what is written about them.
+"""Frozen configs: dotted names, overrides with clear errors, JSON. ``bounds`` limits their values, ``values`` reads them, and
+``docs`` finds their descriptions.
 
-Flags are made from the configs themselves, and not by a library for command lines: which there are depends on the environment
-(its terms, by name), and one set of names, readers and messages serves ``make(**fields)`` and the files of robots too.
+Flags are made from the configs themselves, without a command-line library, because the fields depend on the environment (its
+terms, by name). The same names, readers and messages also serve ``make(**fields)`` and the files of robots.
 """
 
 import copyreg
@@ -20,16 +20,16 @@ Cfg = TypeVar("Cfg")
 
 
 def flag(default: Any, **about: Any) -> Any:
-    """A field of a frozen config that programs have a flag for (``cli.Parser.add_fields``).
+    """Declares a field of a frozen config for which programs have a flag (``cli.Parser.add_fields``).
 
     Args:
-        about: kept with the field, for ``marked``.
+        about: marks that are kept with the field, for ``marked``.
     """
     return dataclasses.field(default=default, metadata={"flag": True, **about})
 
 
 def marked(cls: type, mark: str = "flag") -> tuple[str, ...]:
-    """Names of the fields of a config that bear a mark."""
+    """Returns the names of a config's fields that have a mark."""
     return tuple(field.name for field in dataclasses.fields(cls) if field.metadata.get(mark))
 
 
@@ -40,7 +40,7 @@ def _children(node: Any) -> dict[str, Any] | None:
 
 
 def freeze(cfg: Any) -> None:
-    """Makes the mappings of a frozen config read-only copies, those within them, too; for its ``__post_init__``."""
+    """Replaces the mappings of a frozen config, nested ones included, by read-only copies; for its ``__post_init__``."""
     for field in dataclasses.fields(cfg):
         if isinstance(value := getattr(cfg, field.name), Mapping):
             object.__setattr__(cfg, field.name, _read_only(value))
@@ -50,11 +50,13 @@ def _read_only(value: Any) -> Any:
     return types.MappingProxyType({k: _read_only(v) for k, v in value.items()}) if isinstance(value, Mapping) else value
 
 
-copyreg.pickle(types.MappingProxyType, lambda value: (_read_only, (dict(value),)))  # else no config could be copied or sent
+copyreg.pickle(
+    types.MappingProxyType, lambda value: (_read_only, (dict(value),))
+)  # otherwise configs could not be copied or sent
 
 
 def flatten(cfg: Any, prefix: str = "") -> dict[str, Any]:
-    """Dotted name -> value of every field that can be overridden, in order."""
+    """Returns the values of all fields that can be overridden, by dotted name, in order."""
     out: dict[str, Any] = {}
     for name, value in (_children(cfg) or {}).items():
         if _children(value) is not None:
@@ -65,7 +67,7 @@ def flatten(cfg: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def to_dict(cfg: Any) -> Any:
-    """Plain dicts, lists, numbers and strings (functions by name), ready for JSON."""
+    """Converts a config to plain dicts, lists, numbers and strings (functions by name), ready for JSON."""
     children = _children(cfg)
     if children is not None:
         return {name: to_dict(value) for name, value in children.items()}
@@ -76,19 +78,20 @@ def to_dict(cfg: Any) -> Any:
 
 
 def describe(cfg: Any) -> dict[str, str]:
-    """Dotted name -> what the field is, of every field that ``flatten`` lists; empty where its class does not say.
+    """Returns the descriptions of all fields that ``flatten`` lists, by dotted name; empty if a field has none.
 
-    From the lines under ``Attributes:`` in the docstring of a config's class, or the comment behind the field; of a term's
-    parameter from the lines under ``Args:`` in its function's docstring, else from that docstring's first line.
+    A field's description comes from ``Attributes:`` in the docstring of its config's class, or from the comment behind the field.
+    A term's parameter is described under ``Args:`` in the docstring of the term's function, or else by its first line.
     """
     return dict(_described(cfg, "", docs.fields(type(cfg)), ""))
 
 
 def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str) -> Iterator[tuple[str, str]]:
-    """
+    """Yields (dotted name, description) of the fields in ``node``.
+
     Args:
-        texts: of the entries of ``node``, by name.
-        inherited: what the field is that holds ``node``, where ``texts`` lacks an entry.
+        texts: descriptions of the entries of ``node``, by name.
+        inherited: description for entries that ``texts`` lacks: that of the field that holds ``node``.
     """
     for name, value in (_children(node) or {}).items():
         text = texts.get(name, inherited)
@@ -96,7 +99,7 @@ def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str)
             if not callable(value):
                 yield prefix + name, text
         elif name == "params" and callable(func := getattr(node, "func", None)):
-            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"of {docs.summary(func)}")
+            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"parameter of: {docs.summary(func)}")
         elif dataclasses.is_dataclass(value):
             yield from _described(value, f"{prefix}{name}.", docs.fields(type(value)), "")
         else:
@@ -104,10 +107,10 @@ def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str)
 
 
 def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
-    """A copy of ``cfg`` with fields changed by dotted name, old names included; values are read as ``read`` does.
+    """Returns a copy of ``cfg`` with fields changed by dotted name (former names work, too); ``read`` reads their values.
 
     Raises:
-        UserError: no such field (the message names the nearest ones), or a value of another type.
+        UserError: a field does not exist (the message names the valid ones), or a value has the wrong type.
     """
     for name, value in current(cfg, changes).items():
         cfg = _replace(cfg, type(cfg), name.split("."), value, name)
@@ -115,7 +118,7 @@ def override(cfg: Cfg, changes: Mapping[str, Any]) -> Cfg:
 
 
 def current(cfg: Any, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields by the dotted names that they have now: a config whose fields once had others has a method ``current``."""
+    """Returns fields by their present dotted names. A config with renamed fields has a method ``current``."""
     return cfg.current(fields) if hasattr(cfg, "current") else dict(fields)
 
 
@@ -134,7 +137,7 @@ def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> An
         new = _replace(old, kind, rest, value, name)
     elif dataclasses.is_dataclass(old) and not isinstance(value, type(old)):
         raise UserError(
-            f"{name} takes {type(old).__name__}, or set its fields one by one ({name}.{next(iter(hints(type(old))))})"
+            f"{name} takes {type(old).__name__}: pass one, or set its fields singly ({name}.{next(iter(hints(type(old))))})"
         )
     else:
         new = read(kind, value, name)
@@ -144,12 +147,12 @@ def _replace(node: Any, kind: Any, path: list[str], value: Any, name: str) -> An
 
 
 def _kind(node: Any, kind: Any, name: str, old: Any) -> Any:
-    """The declared type of an entry of ``node``, itself of ``kind``; of its present value where nothing is declared."""
+    """Returns the declared type of an entry of ``node``, which has type ``kind``, or else the type of its present value."""
     found: Any = Any
     if dataclasses.is_dataclass(node):
         found = hints(type(node))[name]
         if name == "params" and callable(func := getattr(node, "func", None)):
-            return parameters(func)  # of a term: what its function declares
+            return parameters(func)  # a term's parameters have the types that its function declares
     elif isinstance(kind, dict):
         found = kind.get(name, Any)
     elif isinstance(origin := typing.get_origin(kind), type) and issubclass(origin, Mapping):
@@ -158,10 +161,10 @@ def _kind(node: Any, kind: Any, name: str, old: Any) -> Any:
 
 
 def parameters(func: Callable) -> dict[str, Any]:
-    """Name -> declared type of a function's parameters, of those that can be read."""
+    """Returns the declared types of a function's parameters by name, for the types that ``read`` can read."""
     try:
         found = typing.get_type_hints(bounds.unwrapped(func), include_extras=True)
-    except (TypeError, NameError, SyntaxError, AttributeError):  # no function, or annotations that are none
+    except (TypeError, NameError, SyntaxError, AttributeError):  # not a function, or invalid annotations
         return {}
     return {
         name: kind

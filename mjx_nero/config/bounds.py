@@ -1,4 +1,4 @@
-"""Bounds of values, declared where a config's field or a term's parameter is (``dt: Positive``), and one check of them all."""
+"""Bounds of values, declared with a config's field or a term's parameter (``dt: Positive``), and one check for all of them."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ class Bounds:
 
 
 def _text(bound: Number) -> str:
-    """A bound for a message: whole numbers in full."""
+    """Formats a bound for a message, with whole numbers in full."""
     return f"{bound}" if isinstance(bound, int) else f"{bound:g}"
 
 
@@ -65,24 +65,24 @@ Whole = Annotated[int, Bounds(0)]
 Range = Annotated[tuple[float, float], Ascending()]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]
-Counts = Annotated[tuple[Count, Count], Ascending()]  # a range of whole numbers from 1 on
-LATEST = 256  # control steps that a delay or a history may hold: buffers of every environment are that long
+Counts = Annotated[tuple[Count, Count], Ascending()]  # a range of whole numbers from 1
+LATEST = 256  # maximum control steps of a delay or history, because every environment has a buffer of that length
 Step = Annotated[int, Bounds(0, LATEST)]
 Steps = Annotated[tuple[Step, Step], Ascending()]  # a range of whole steps
-Past = Annotated[int, Bounds(1, LATEST)]  # so many last values
+Past = Annotated[int, Bounds(1, LATEST)]  # number of last values
 Worlds = Annotated[int, Bounds(1, 2**24)]  # environments stepped together
-Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # all that JAX's generators take: beyond, seeds would repeat
+Seed = Annotated[int, Bounds(0, 2**32 - 1)]  # the range of JAX's generators: larger seeds would repeat
 
 
 _PLAIN, _BY_KEY = (int, float, str, type(None)), (dict, types.MappingProxyType)
 
 
 def check(value: Any, hint: Any = Any, name: str = "") -> None:
-    """Checks all of a config: every number is finite and within the bounds that its field declares.
+    """Checks that every number in a config is finite and within the bounds that its field declares.
 
     Args:
         value: a config, or a field's value.
-        hint: the field's type; of a mapping, perhaps types by key.
+        hint: the field's type; for a mapping it may be types by key.
         name: the field's dotted name.
 
     Raises:
@@ -142,7 +142,7 @@ def _parts(hint: Any) -> tuple[bool, tuple, tuple]:
 
 @functools.cache
 def _hints(kind: Any) -> dict[str, Any]:
-    """Annotations of a config or of a function's parameters; none where they name what is not there."""
+    """Returns the annotations of a config or of a function's parameters; empty if they cannot be resolved."""
     try:
         return typing.get_type_hints(kind, include_extras=True)
     except (NameError, TypeError):
@@ -150,12 +150,12 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def unwrapped(function: Any) -> Any:
-    """Returns the function inside a ``functools.partial``; other functions unchanged."""
+    """Returns the function inside a ``functools.partial``; returns other functions unchanged."""
     while isinstance(function, functools.partial):
         function = function.func
     return function
 
 
 def parameter_hints(function: Any) -> dict[str, Any]:
-    """Annotations of a function's parameters, or of a class's fields."""
+    """Returns the annotations of a function's parameters, or of a class's fields."""
     return _hints(unwrapped(function))

@@ -10,12 +10,12 @@ _COMMENT = re.compile(r"    (\w+): [^#]*?  # (.+)")
 
 
 def summary(thing: Any) -> str:
-    """The first line of a docstring, without its full stop."""
+    """Returns the first line of a docstring, without its full stop."""
     return (inspect.getdoc(thing) or "").partition("\n")[0].removesuffix(".")
 
 
 def fields(cls: Any) -> dict[str, str]:
-    """Name -> text of a dataclass's fields: from its docstring's ``Attributes:``, or the comment behind the field."""
+    """Returns the descriptions of a dataclass's fields by name: from its docstring's ``Attributes:``, or the field's comment."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if "__dataclass_fields__" in vars(base):
@@ -24,7 +24,7 @@ def fields(cls: Any) -> dict[str, str]:
 
 
 def entries(thing: type | Callable, title: str) -> dict[str, str]:
-    """Name -> text of the lines under ``title:`` in a docstring; ``a, b: text`` is about both."""
+    """Returns the texts under ``title:`` in a docstring by name; ``a, b: text`` describes both names."""
     found: dict[str, str] = {}
     lines = iter((thing.__doc__ and inspect.cleandoc(thing.__doc__) or "").splitlines())
     names: list[str] = []
@@ -45,6 +45,6 @@ def entries(thing: type | Callable, title: str) -> dict[str, str]:
 def _comments(cls: Any) -> dict[str, str]:
     try:
         source = inspect.getsource(cls)
-    except (OSError, TypeError):  # made without a file
+    except (OSError, TypeError):  # not made from a file
         return {}
     return dict(match.groups() for line in source.splitlines() if (match := _COMMENT.match(line)))  # type: ignore[misc]

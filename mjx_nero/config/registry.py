@@ -1,4 +1,4 @@
-"""Registries: the package's and its guests' things of one kind, by name."""
+"""Registries hold things of one kind by name: the package's own, and those that outside code registers."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -13,8 +13,8 @@ class Registry(dict[str, Thing]):
     """Things of one kind by name.
 
     Args:
-        kind: what messages call one of them.
-        own: the package's own.
+        kind: word for one of them in messages.
+        own: the package's own things.
     """
 
     def __init__(self, kind: str, own: Mapping[str, Thing]):
@@ -28,7 +28,7 @@ class Registry(dict[str, Thing]):
             UserError: the name is taken.
         """
         if name in self:
-            raise UserError(f"there is a{'n' * (self.kind[0] in 'aeiou')} {self.kind} {name!r} already: choose another name")
+            raise UserError(f"there is already a{'n' * (self.kind[0] in 'aeiou')} {self.kind} {name!r}: choose another name")
         self[name] = thing
 
     def find(self, name: str) -> Thing:
@@ -41,10 +41,10 @@ class Registry(dict[str, Thing]):
 
 
 def pick(table: Mapping[str, Thing], name: str, kind: str) -> Thing:
-    """Looks a name up.
+    """Looks up a name.
 
     Raises:
-        UserError: the table lacks it; the message lists the names that it has.
+        UserError: the table does not have it; the message lists the names that it has.
     """
     if read(str, name, kind) not in table:
         raise UserError(f"unknown {kind} {short(name)}{hint(name, table)}: choose one of {', '.join(table)}")

@@ -1,6 +1,6 @@
-"""Values: read as the types that fields declare, wherever they come from, and shown in messages.
+"""Reads values as the types that fields declare, and formats values for messages.
 
-``read`` is the one reader for command lines, YAML files and Python; the others help to say what was wrong.
+``read`` is the one reader for command lines, YAML files and Python. The other functions help to say what was wrong.
 """
 
 import collections.abc
@@ -16,42 +16,42 @@ from typing import Annotated, Any
 
 from mjx_nero.errors import UserError
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # what Python also takes, 1_0 and 0x10, is mostly a slip
-_FINITE = 1e30  # beyond it single precision has no square
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # Python's 1_0 and 0x10 are usually typing errors
+_FINITE = 1e30  # larger numbers overflow single precision when squared
 _WORDS = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a name"}
 UNTYPED = (Any, object)
-_DEEPEST = 8  # lists within lists, of a text
+_DEEPEST = 8  # maximum depth of nested lists in a text
 
 
 def hint(name: str, valid: Iterable[str]) -> str:
-    """The nearest valid name, for the end of a message; empty if none is near."""
+    """Suggests the nearest valid name, for the end of a message; empty if none is near."""
     near = difflib.get_close_matches(name[:100], list(valid), n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def short(value: Any) -> str:
-    """A value for a message, cut short however large it is, in one line."""
+    """Formats a value for a message as one short line, however large the value is."""
     cut = reprlib.Repr()
     cut.maxlevel, cut.maxstring, cut.maxlong, cut.maxother = 2, 60, 40, 60
     try:
         text = cut.repr(value)
-    except ValueError:  # Python writes no whole number of more than some thousand digits
+    except ValueError:  # Python does not print whole numbers of more than some thousand digits
         return f"{type(value).__name__} too long to show"
     text = " ".join(text.split()) if "\n" in text else text  # of arrays
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def read(kind: Any, value: Any, name: str) -> Any:
-    """``value`` as a value of the annotation ``kind``.
+    """Reads ``value`` as the annotation ``kind``.
 
-    Numbers are finite; where no text is wanted, a text is read as what it says: ``"0.5"``, ``"true"``, ``"none"``, ``"(1, 2)"``.
+    Numbers must be finite. If the type is not text, a text is parsed: ``"0.5"``, ``"true"``, ``"none"``, ``"(1, 2)"``.
 
     Args:
         kind: ``float``, ``int``, ``bool``, ``str``, a number with ``bounds``, a tuple, a mapping, a dataclass, ``X | None``, ...
-        name: of the field, for messages.
+        name: the field's name, for messages.
 
     Raises:
-        UserError: it is none; the message says which part, and what it takes.
+        UserError: the value does not fit; the message says which part, and what it takes.
     """
     origin: Any = typing.get_origin(kind) or kind
     args = typing.get_args(kind)
@@ -80,7 +80,7 @@ def read(kind: Any, value: Any, name: str) -> Any:
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
-    """Message: there is no such ``kind``, with a close match and all valid names."""
+    """Returns the message that there is no such ``kind``, with the nearest and all valid names."""
     valid = list(valid)
     return f"no {kind} {short(str(name))}{hint(str(name), valid)}; valid: {', '.join(valid)}"
 
@@ -105,7 +105,9 @@ def _read_tuple(kinds: tuple[Any, ...], value: Any, name: str) -> tuple:
     items = _parts(value) if isinstance(value, str) else value
     size = None if kinds[-1:] == (...,) else len(kinds)
     if not isinstance(items, tuple | list) or size not in (None, len(items)):
-        numbers_only = all(getattr(kind, "__origin__", kind) in (float, int) for kind in kinds)  # __origin__: of an Annotated
+        numbers_only = all(
+            getattr(kind, "__origin__", kind) in (float, int) for kind in kinds
+        )  # __origin__: the type inside Annotated
         _refuse(name, "a list" if size is None else f"a list of {size} {'numbers' if numbers_only else 'entries'}", value)
     wanted = kinds[:1] * len(items) if size is None else kinds
     return tuple(read(kind, item, f"{name}[{i}]") for i, (kind, item) in enumerate(zip(wanted, items, strict=True)))
@@ -126,7 +128,7 @@ def _read_group(cls: Any, value: Any, name: str) -> Any:
 
 
 def hints(cls: Any) -> dict[str, Any]:
-    """The declared types of a dataclass's fields."""
+    """Returns the declared types of a dataclass's fields by name."""
     found = typing.get_type_hints(cls, include_extras=True)
     return {field.name: found[field.name] for field in dataclasses.fields(cls)}
 
@@ -136,7 +138,7 @@ def _float(value: Any) -> float | None:
         value = float(value) if _NUMBER.fullmatch(value.strip()) else None
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return None
-    return float(value) if bool(-_FINITE < value < _FINITE) else None  # type: ignore[operator]  # NaN is not
+    return float(value) if bool(-_FINITE < value < _FINITE) else None  # type: ignore[operator]  # False for NaN
 
 
 def _int(value: Any) -> int | None:
@@ -160,7 +162,7 @@ def _str(value: Any) -> str | None:
 
 
 def _literal(value: Any, depth: int = 0) -> Any:
-    """A text without a type to go by: none, true, false, a number, a list, or the text itself."""
+    """Parses a text whose type is not declared: none, true, false, a number, a list, or the text itself."""
     if not isinstance(value, str) or depth > _DEEPEST:
         return value
     text = value.strip()
@@ -174,9 +176,10 @@ def _literal(value: Any, depth: int = 0) -> Any:
 
 
 def _parts(text: str) -> list[str] | None:
-    """``"(1, 2), 3"`` -> ``["(1, 2)", "3"]``; brackets around all of it may stand or not, quotes around a part too.
+    """Splits a list: ``"(1, 2), 3"`` -> ``["(1, 2)", "3"]``. Brackets around the whole and quotes around parts are optional.
 
-    None where the brackets do not match.
+    Returns:
+        the parts; None if brackets do not match.
     """
     text, depth, parts, begin = text.strip(), 0, [], 0
     for at, letter in enumerate(f"{text},"):
@@ -190,5 +193,5 @@ def _parts(text: str) -> list[str] | None:
         return None
     if len(parts) == 1 and text[:1] in ("(", "["):
         return _parts(f"{text[1:-1].rstrip().removesuffix(',')},") if text[1:-1].strip() else []
-    parts = parts[:-1] if parts and not parts[-1] else parts  # a comma may end it
+    parts = parts[:-1] if parts and not parts[-1] else parts  # a trailing comma is allowed
     return [part[1:-1] if part[:1] in ("'", '"') and part[-1:] == part[:1] else part for part in parts]

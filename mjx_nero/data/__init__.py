@@ -1,4 +1,4 @@
-"""Data sets of episodes on disk: their schema, the forms that they are written in, and one reader. Neither JAX nor MuJoCo."""
+"""Data sets of episodes on disk: their schema, their file formats, and one reader. Imports neither JAX nor MuJoCo."""
 
 from mjx_nero.data.dataset import open_dataset, writer
 from mjx_nero.data.episode import Dataset, Episode, Feature, Schema

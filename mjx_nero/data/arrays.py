@@ -1,4 +1,5 @@
-"""The plain form: a safetensors file a piece, each feature one array, and an index. ``safetensors.numpy.load_file`` reads it."""
+"""The plain format: one safetensors file per piece with one array per feature, and an index. ``safetensors.numpy.load_file``
+reads a piece."""
 
 import json
 import pathlib
@@ -16,7 +17,7 @@ from mjx_nero.data.episode import Dataset, Episode, Feature, Schema, check
 from mjx_nero.errors import UserError
 
 INDEX = "meta/pieces.json"
-_LENGTHS = "lengths"  # of a piece's episodes, beside the features
+_LENGTHS = "lengths"  # array of a piece's episode lengths, beside the features
 
 
 class ArraysForm:
@@ -31,14 +32,14 @@ class ArraysForm:
                 found = files.read_json(index, limit=100_000_000)
                 self._pieces = [{name: read(tuple[int, ...], piece[name], name) for name in _COLUMNS} for piece in found]
             except (KeyError, TypeError):
-                raise UserError(f"{index} is damaged: make the data set anew") from None
+                raise UserError(f"{index} is damaged: write the data set again") from None
 
     def _column(self, name: str) -> np.ndarray:
         return np.array([x for piece in self._pieces for x in piece[name]], int)
 
     @property
     def lengths(self) -> np.ndarray:
-        """Steps of each episode."""
+        """Number of steps of each episode."""
         return self._column("lengths")
 
     @property
@@ -48,22 +49,22 @@ class ArraysForm:
 
     @property
     def success(self) -> np.ndarray:
-        """Success of each episode, bool."""
+        """Whether each episode succeeded, bool."""
         return self._column("success").astype(bool)
 
     def tidy(self) -> None:
-        """Removes a piece that the index does not know of."""
+        """Removes a piece that the index does not list."""
         (self.path / _name(len(self._pieces))).unlink(missing_ok=True)
 
     def put(self, episodes: Sequence[Episode]) -> None:
-        """Adds a piece, whole or not at all.
+        """Adds episodes as a piece, whole or not at all.
 
         Raises:
             UserError: it cannot be written.
         """
         for episode in episodes:
             check(episode, self.schema)
-        arrays = {  # in the order of C: safetensors writes the memory as it lies
+        arrays = {  # C order, because safetensors writes the memory as it is
             name: np.ascontiguousarray(np.concatenate([_array(each, name, feature) for each in episodes]))
             for name, feature in self.schema.features.items()
         }
@@ -84,10 +85,10 @@ class ArraysForm:
         self._pieces = pieces
 
     def finish(self) -> None:
-        """Does nothing: all is written."""
+        """Does nothing: everything is written already."""
 
     def column(self, name: str) -> np.ndarray:
-        """All steps of a feature, one episode after another [steps, numbers], or [steps, height, width, 3]."""
+        """Returns all steps of a feature, episode by episode: [steps, numbers], or [steps, height, width, 3]."""
         feature = self.schema.features[name]
         dtype = "uint8" if feature.picture else feature.dtype
         out = [np.zeros((0, *feature.shape), dtype)]
@@ -99,11 +100,11 @@ class ArraysForm:
             if len(found) != self.lengths.sum():
                 raise ValueError
         except (SafetensorError, OSError, ValueError):
-            raise UserError(f"{self.path} is damaged: its steps of {name} cannot be read, make it anew") from None
+            raise UserError(f"{self.path} is damaged (its steps of {name} cannot be read): write the data set again") from None
         return found
 
     def frames(self, name: str) -> Iterator[np.ndarray]:
-        """A camera's frames, one after another."""
+        """Yields a camera's frames."""
         for i in range(len(self._pieces)):
             with safe_open(files.inside(self.path, *_name(i).split("/")), framework="numpy") as file:
                 part = file.get_slice(name)
@@ -111,14 +112,14 @@ class ArraysForm:
                     yield part[k : k + 1][0]
 
     def dataset(self) -> Dataset:
-        """The data set as it is."""
+        """Returns the data set as it is now."""
         return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
 
 def _save(arrays: dict[str, np.ndarray], path: pathlib.Path) -> None:
     try:
         save_file(arrays, path)
-    except SafetensorError as error:  # a full disk's, too
+    except SafetensorError as error:  # also for a full disk
         raise OSError(str(error)) from None
 
 

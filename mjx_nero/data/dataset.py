@@ -1,4 +1,4 @@
-"""Data sets by their folder, whatever form they are in."""
+"""Opens data sets by their folder, whatever their format."""
 
 import contextlib
 import importlib
@@ -12,7 +12,7 @@ from mjx_nero.data import folder
 from mjx_nero.data.episode import Dataset, Episode, Schema
 from mjx_nero.errors import UserError
 
-# Form -> where it is, and the file that only it has.
+# Form -> module, class, and the file that only this form has.
 FORMS = {
     "lerobot": ("mjx_nero.data.lerobot", "LeRobotForm", "meta/info.json"),
     "arrays": ("mjx_nero.data.arrays", "ArraysForm", "meta/pieces.json"),
@@ -20,13 +20,13 @@ FORMS = {
 
 
 class Form(Protocol):
-    """A data set in a folder that is claimed, or only read. A form is made of the folder and the schema.
+    """A data set in a folder that is claimed, or only read. It is made from the folder and the schema.
 
     Attributes:
-        lengths, success, numbers: of the episodes there, as ``Dataset`` has them.
+        lengths, success, numbers: of the episodes in it, see ``Dataset``.
 
     Raises:
-        UserError: what is there is damaged.
+        UserError: the data set is damaged.
     """
 
     lengths: np.ndarray
@@ -45,40 +45,41 @@ def _make(name: str, path: pathlib.Path, schema: Schema) -> Form:
 
 
 def _held(path: pathlib.Path) -> str | None:
-    """The form of what a folder holds; None: nothing yet."""
+    """Returns the form of the data set in a folder; None if it has no episodes yet."""
     return next((name for name, (_, _, index) in FORMS.items() if (path / index).exists()), None)
 
 
 @contextlib.contextmanager
 def writer(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> Iterator[Form]:
-    """A data set to write to: new, or going on with what the folder holds. It is finished at the end, also after an error.
+    """Opens a data set for writing: a new one, or the one in the folder, to continue it. It is finished at the end, even after
+    an error.
 
     Raises:
-        UserError: the folder holds something else, or cannot be written; a package is missing.
+        UserError: the folder holds something else or cannot be written, or a package is missing.
     """
     held = _held(path)
     if held not in (None, form):
         raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
-    importlib.import_module(FORMS[form][0])  # before the folder is made: it may lack a package
+    importlib.import_module(FORMS[form][0])  # before the folder is made, because a package may be missing
     with folder.claim(path, schema):
         made = _make(form, path, schema)
         made.tidy()
         try:
             yield made
         except BaseException:
-            with contextlib.suppress(UserError):  # the error that comes is the one to tell
+            with contextlib.suppress(UserError):  # report the first error
                 made.finish()
             raise
         made.finish()
 
 
 def open_dataset(path: pathlib.Path) -> Dataset:
-    """The data set in a folder.
+    """Opens the data set in a folder.
 
     Raises:
-        UserError: there is none, or it is damaged.
+        UserError: there is no data set, or it is damaged.
     """
     schema, form = folder.schema_of(path), _held(path)
     if form is None:
-        raise UserError(f"{path} holds no episode yet: give the command that began it again")
+        raise UserError(f"{path} holds no episode yet: repeat the command that started it")
     return _make(form, path, schema).dataset()

@@ -1,4 +1,4 @@
-"""The schema of a recorded step, and episodes of such steps. Every form of a data set holds these, whoever made them."""
+"""The schema of a recorded step, and episodes of such steps. All formats of data sets use them, whoever made the data."""
 
 import dataclasses
 import math
@@ -10,14 +10,14 @@ import numpy as np
 from mjx_nero.errors import UserError
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"  # LeRobot's names
-EXECUTED = "executed"  # what the drives were told; ``action`` is what they ought to have been told
-SEEN, DONE_BY = "mdp.observation", "mdp.action"  # what a policy of the task saw, and the action it ought to have taken
-QPOS = "mdp.qpos"  # the physics' positions, for a viewer
+EXECUTED = "executed"  # targets that the drives received; ``action`` is the label, without noise
+SEEN, DONE_BY = "mdp.observation", "mdp.action"  # the observation of a policy of the task, and its action without noise
+QPOS = "mdp.qpos"  # simulated positions, for a viewer
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
-PICTURES = "observation.images."  # and a camera's name
-VIDEO = "video"  # pictures, uint8 [height, width, 3], which an encoder changes a little
+PICTURES = "observation.images."  # followed by a camera's name
+VIDEO = "video"  # pictures, uint8 [height, width, 3]; encoding changes them slightly
 DTYPES = ("float32", "bool", VIDEO)
-MAX_SIZE = 100_000  # numbers of a feature
+MAX_SIZE = 100_000  # maximum count of a feature's numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Feature:
     """One array of a step.
 
     Attributes:
-        names: of its numbers; of a picture, of its axes.
-        units: of its numbers, as in ``rad``; empty: they have none.
+        names: names of its numbers; for a picture, names of its axes.
+        units: units of its numbers, such as ``rad``; empty: they have none.
         dtype: one of ``DTYPES``.
-        picture: height and width [pixels]; empty: it is none.
+        picture: height and width [pixels]; empty: not a picture.
     """
 
     names: tuple[str, ...]
@@ -38,12 +38,12 @@ class Feature:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of its array in a step."""
+        """Shape of the array in a step."""
         return (*self.picture, 3) if self.picture else (len(self.names),)
 
     @property
     def size(self) -> int:
-        """Count of its numbers."""
+        """Count of numbers in a step."""
         return math.prod(self.shape)
 
 
@@ -52,11 +52,11 @@ class Schema:
     """The contents of a data set's steps.
 
     Attributes:
-        fps: control steps a second.
-        robot: its name.
+        fps: control steps per second.
+        robot: the robot's name.
         task: a sentence that says what the robot does.
-        features: by name.
-        about: what made the data set, as plain JSON. Episodes that something else made do not belong into it.
+        features: features by name.
+        about: how the data set is made, as plain JSON. All its episodes must be made this way.
     """
 
     fps: float
@@ -66,21 +66,23 @@ class Schema:
     about: Mapping[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON, which ``from_json`` reads."""
+        """Converts it to plain JSON, which ``from_json`` reads."""
         return dataclasses.asdict(self) | {"about": dict(self.about)}
 
 
 def from_json(found: Any, where: Any) -> Schema:
-    """A schema from what ``Schema.to_json`` made.
+    """Reads a schema written by ``Schema.to_json``.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not a schema.
     """
     try:
         features = {str(name): _feature(each) for name, each in found["features"].items()}
         return Schema(float(found["fps"]), str(found["robot"]), str(found["task"]), features, dict(found["about"]))
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise UserError(f"{where} does not describe demonstrations of mjx_nero, or it is damaged") from None
+        raise UserError(
+            f"{where} does not describe demonstrations of mjx_nero, or it is damaged: give another data set"
+        ) from None
 
 
 def _feature(found: Mapping[str, Any]) -> Feature:
@@ -94,7 +96,7 @@ def _feature(found: Mapping[str, Any]) -> Feature:
 
 
 def picture(height: int, width: int) -> Feature:
-    """The feature of a camera."""
+    """Makes the feature of a camera's pictures."""
     return Feature(("height", "width", "channels"), dtype=VIDEO, picture=(height, width))
 
 
@@ -103,10 +105,10 @@ class Episode:
     """One episode.
 
     Attributes:
-        arrays: by name, [steps, numbers], as the schema says.
-        success: whether it succeeded.
-        number: draws everything in it, together with the data set's seed.
-        pictures: by name, what gives the frames, uint8 [height, width, 3], one after another: they are drawn when needed.
+        arrays: arrays [steps, numbers] by name, as in the schema.
+        success: whether the episode succeeded.
+        number: determines all random draws of the episode, together with the data set's seed.
+        pictures: by name, functions that yield the frames, uint8 [height, width, 3], which are drawn only when needed.
     """
 
     arrays: Mapping[str, np.ndarray]
@@ -119,10 +121,10 @@ class Episode:
 
 
 def check(episode: Episode, schema: Schema) -> None:
-    """Compares an episode with the schema.
+    """Checks an episode against the schema.
 
     Raises:
-        ValueError: an array is missing, or of another shape or type.
+        ValueError: an array is missing, or has another shape or type.
     """
     for name, feature in schema.features.items():
         if feature.picture:
@@ -130,19 +132,19 @@ def check(episode: Episode, schema: Schema) -> None:
             continue
         found, wanted = episode.arrays[name], (len(episode), feature.size)
         if found.shape != wanted or found.dtype != np.dtype(feature.dtype):
-            raise ValueError(f"{name} is {found.dtype}{list(found.shape)}, and the schema has {feature.dtype}{list(wanted)}")
+            raise ValueError(f"{name} is {found.dtype}{list(found.shape)}, but the schema has {feature.dtype}{list(wanted)}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """A data set that has been opened; arrays are read when they are asked for.
+    """An opened data set. Arrays are read when they are needed.
 
     Attributes:
-        lengths: steps of each episode, int [n].
-        success: bool [n].
-        numbers: of each episode, int [n] (``Episode.number``).
+        lengths: number of steps of each episode, int [n].
+        success: whether each episode succeeded, bool [n].
+        numbers: number of each episode, int [n] (``Episode.number``).
         read: name of a feature -> all its steps [steps, ...].
-        frames: name of a camera's feature -> its frames, uint8 [height, width, 3], one after another.
+        frames: name of a camera's feature -> its frames, uint8 [height, width, 3], in order.
     """
 
     schema: Schema
@@ -156,17 +158,17 @@ class Dataset:
         return len(self.lengths)
 
     def column(self, name: str) -> np.ndarray:
-        """All steps of a feature, one episode after another [steps, numbers], or [steps, height, width, 3].
+        """Returns all steps of a feature, episode by episode: [steps, numbers], or [steps, height, width, 3].
 
         Raises:
-            UserError: there is none of that name.
+            UserError: the data set has no such feature.
         """
         if name not in self.schema.features:
-            raise UserError(f"the data set has no {name!r}: it has {', '.join(self.schema.features)}")
+            raise UserError(f"the data set has no {name!r}: choose from {', '.join(self.schema.features)}")
         return self.read(name)
 
     def episodes(self, names: Sequence[str] = ()) -> list[Episode]:
-        """All episodes, with the named features alone (none named: all but pictures)."""
+        """Returns all episodes with only the named features; without names, with all features but pictures."""
         ends = np.cumsum(self.lengths)[:-1]
         usual = [name for name, feature in self.schema.features.items() if not feature.picture]
         parts = {name: np.split(self.column(name), ends) for name in names or usual}

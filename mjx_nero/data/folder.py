@@ -1,7 +1,7 @@
-"""The folder of a data set: one owner, one maker, and pieces that appear whole or not at all.
+"""The folder of a data set: one process owns it, one command makes it, and its pieces appear whole or not at all.
 
-All files of a piece are written apart, in ``.part``. They go to their places one right after another, and the index, which says
-how much there is, goes last: a process that dies before has written nothing, and the next one clears up after it.
+All files of a piece are first written to ``.part``. They are then moved to their places one right after another. The index, which
+says how many pieces there are, moves last: a process that dies before then has written nothing, and the next one cleans up.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from mjx_nero.data.episode import Schema, from_json
 from mjx_nero.errors import UserError
 
 PART = ".part"
-ABOUT = "meta/mjx_nero.json"  # the schema, and who made the data set
+ABOUT = "meta/mjx_nero.json"  # the schema, and how the data set is made
 _LOCK = ".lock"
 
 Write = Callable[[pathlib.Path], Any]  # writes the file at that path
@@ -25,10 +25,10 @@ Write = Callable[[pathlib.Path], Any]  # writes the file at that path
 
 @contextlib.contextmanager
 def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
-    """The folder of a data set, this process's alone until the end. It is made, or holds episodes of the same schema already.
+    """Claims the folder of a data set for this process until the context ends. It is made if it does not exist.
 
     Raises:
-        UserError: it holds something else, belongs to a process that runs, or cannot be written.
+        UserError: the folder holds something else or another schema, belongs to a running process, or cannot be written.
     """
     _check(path, schema)
     try:
@@ -50,10 +50,10 @@ def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
 
 
 def schema_of(path: pathlib.Path) -> Schema:
-    """The schema of the data set in a folder.
+    """Reads the schema of the data set in a folder.
 
     Raises:
-        UserError: the folder holds none.
+        UserError: the folder holds no data set.
     """
     where = files.inside(path, *ABOUT.split("/"))
     if not where.exists():
@@ -62,7 +62,11 @@ def schema_of(path: pathlib.Path) -> Schema:
 
 
 def _check(path: pathlib.Path, schema: Schema) -> None:
-    """Is the folder free, or of the same maker?"""
+    """Checks that the folder is free, or holds a data set with the same schema.
+
+    Raises:
+        UserError: it holds something else.
+    """
     if not path.exists():
         return
     if not path.is_dir():
@@ -72,8 +76,8 @@ def _check(path: pathlib.Path, schema: Schema) -> None:
         return
     if not files.inside(path, *ABOUT.split("/")).exists():
         if held == ["meta"] and not any(not name.startswith(".") for name in os.listdir(path / "meta")):
-            return  # of a process that was killed before it had written anything
-        raise UserError(f"{path} is not empty, and holds no demonstrations: pass another --out")
+            return  # left by a process that was killed before it wrote anything
+        raise UserError(f"{path} is not empty and holds no demonstrations: pass another --out")
     there, here = _flat(schema_of(path).to_json()), _flat(files.finite(schema.to_json()))
     if other := [name for name in here | there if here.get(name) != there.get(name)]:
         name = next((name for name in other if name.startswith("about.")), other[0])
@@ -85,7 +89,7 @@ def _check(path: pathlib.Path, schema: Schema) -> None:
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Dotted name -> value; tuples as JSON has them."""
+    """Returns values by dotted name, with tuples as lists."""
     if isinstance(value, Mapping):
         return {k: v for name, item in value.items() for k, v in _flat(item, f"{prefix}{name}.").items()}
     return {prefix[:-1]: _plain(value)}
@@ -99,10 +103,10 @@ def commit(path: pathlib.Path, parts: Mapping[str, Write]) -> None:
     """Writes the files of a piece; the last one is the index.
 
     Args:
-        parts: name within the folder -> what writes it.
+        parts: name within the folder -> function that writes the file.
 
     Raises:
-        UserError: it cannot be written; then nothing of it is there.
+        UserError: the piece cannot be written; then nothing of it remains.
     """
     made = []
     try:
@@ -119,13 +123,13 @@ def commit(path: pathlib.Path, parts: Mapping[str, Write]) -> None:
             files.sync(folder)
     except OSError as error:
         raise UserError(
-            f"cannot write to {path}: {_reason(error)}; what was written before is whole: "
-            "make room, and give the same command again to go on"
+            f"cannot write to {path}: {_reason(error)}; everything written before is intact: "
+            "make room, and repeat the command to continue"
         ) from None
     finally:
         shutil.rmtree(path / PART, ignore_errors=True)
 
 
 def _reason(error: OSError) -> str:
-    """Arrow puts a tale of its own around the system's reason."""
+    """Returns the system's reason, around which Arrow puts a long text."""
     return os.strerror(error.errno) if error.errno else str(error)

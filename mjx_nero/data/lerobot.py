@@ -1,8 +1,8 @@
-"""LeRobotDataset v3.0, written and read with Arrow alone.
+"""Writes and reads LeRobotDataset v3.0, with Arrow only.
 
-Format: huggingface/lerobot 0.4.4 and 0.6.1, ``src/lerobot/datasets``. A piece is one Parquet file of steps (``data/``), one of
-its episodes (``meta/episodes/``), and the index (``meta/info.json``). Columns of episodes that LeRobot does not know of are ours:
-``success`` and ``number``.
+Source of the format: huggingface/lerobot 0.4.4 and 0.6.1, ``src/lerobot/datasets``. A piece is a Parquet file of steps
+(``data/``) and one of episodes (``meta/episodes/``); the index is ``meta/info.json``. The episodes' columns ``success`` and
+``number`` are our additions to the format.
 """
 
 import functools
@@ -21,7 +21,7 @@ from mjx_nero.data.episode import Dataset, Episode, Schema, check
 from mjx_nero.data.lerobot_files import pa, parquet
 from mjx_nero.errors import UserError
 
-_PLAIN = {"use_dictionary": False, "write_statistics": False}  # numbers that hardly come twice: both would take most of the time
+_PLAIN = {"use_dictionary": False, "write_statistics": False}  # numbers rarely repeat, and both would take most of the time
 
 
 class LeRobotForm:
@@ -39,7 +39,7 @@ class LeRobotForm:
             self._load(files.read_json(index), index)
 
     def _load(self, found: Any, index: pathlib.Path) -> None:
-        """Reads the pieces up to what the index says."""
+        """Reads as many pieces as the index lists."""
         try:
             total = read(int, found["total_episodes"], "total_episodes")
             while len(self.lengths) < total:
@@ -48,7 +48,7 @@ class LeRobotForm:
             if self.lengths.sum() != found["total_frames"] or len(self.lengths) != total:
                 raise ValueError
         except (KeyError, TypeError, ValueError, OSError, pa.ArrowException):
-            raise UserError(f"{index} does not fit the files beside it: the data set is damaged, make it anew") from None
+            raise UserError(f"{index} does not match the files beside it: the data set is damaged, write it again") from None
 
     def _add(self, lengths: np.ndarray, numbers: np.ndarray, success: np.ndarray) -> None:
         self.lengths = np.concatenate([self.lengths, lengths])
@@ -60,12 +60,12 @@ class LeRobotForm:
         return files.inside(self.path, *lf.name_of(pattern, piece).split("/"))
 
     def tidy(self) -> None:
-        """Removes files of a piece that the index does not know of: their process died between two renames."""
+        """Removes files of a piece that the index does not list, because their process died between two renames."""
         for pattern in (lf.DATA, lf.EPISODES, *map(lf.film, self._pictures)):
             self._place(pattern, self._pieces).unlink(missing_ok=True)
 
     def put(self, episodes: Sequence[Episode]) -> None:
-        """Adds a piece, whole or not at all.
+        """Adds episodes as a piece, whole or not at all.
 
         Raises:
             UserError: it cannot be written.
@@ -95,7 +95,7 @@ class LeRobotForm:
         self._add(*(np.array(x) for x in zip(*((len(each), each.number, each.success) for each in episodes), strict=True)))
 
     def finish(self) -> None:
-        """Writes the statistics of all that is there."""
+        """Writes the statistics of the whole data set."""
         if len(self.lengths):
             found = {name: stats.of(self.column(name)) for name in [*self.schema.features, *lf.OWN] if name not in self._pictures}
             plain = {name: {k: v.tolist() for k, v in each.items()} for name, each in found.items()}
@@ -104,7 +104,7 @@ class LeRobotForm:
             files.write_json(self.path / lf.STATS, plain)
 
     def _of_pictures(self, name: str) -> list[stats.Stats]:
-        """A camera's statistics of each episode."""
+        """Returns a camera's statistics of each episode."""
         wanted = [*stats.QUANTILES, "min", "max", "mean", "std", "count"]
         out = []
         for piece in range(self._pieces):
@@ -113,7 +113,7 @@ class LeRobotForm:
         return out
 
     def column(self, name: str) -> np.ndarray:
-        """All steps of a feature, one episode after another [steps, numbers], or [steps, height, width, 3]."""
+        """Returns all steps of a feature, episode by episode: [steps, numbers], or [steps, height, width, 3]."""
         feature = self.schema.features.get(name)
         dtype, size = (feature.dtype, feature.size) if feature else (lf.OWN[name], 1)
         try:
@@ -129,16 +129,16 @@ class LeRobotForm:
             if len(out) != self.lengths.sum():
                 raise ValueError
         except (OSError, ValueError, KeyError, pa.ArrowException):
-            raise UserError(f"{self.path} is damaged: its steps of {name} cannot be read, make it anew") from None
+            raise UserError(f"{self.path} is damaged (its steps of {name} cannot be read): write the data set again") from None
         return out
 
     def frames(self, name: str) -> Iterator[np.ndarray]:
-        """A camera's frames, one after another."""
+        """Yields a camera's frames."""
         for piece in range(self._pieces):
             yield from video.frames(self._place(lf.film(name), piece))
 
     def dataset(self) -> Dataset:
-        """The data set as it is."""
+        """Returns the data set as it is now."""
         return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
     def _steps(self, episodes: Sequence[Episode]) -> pa.Table:
@@ -153,7 +153,7 @@ class LeRobotForm:
         return pa.table({**columns, **self._own(episodes)})
 
     def _own(self, episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
-        """The columns of ``_OWN``."""
+        """Returns the columns of ``lf.OWN``."""
         lengths = [len(episode) for episode in episodes]
         frame, first = np.concatenate([np.arange(n) for n in lengths]), int(self.lengths.sum())
         return {
@@ -165,7 +165,7 @@ class LeRobotForm:
         }
 
     def _about(self, episodes: Sequence[Episode], of_pictures: Mapping[str, Sequence[stats.Stats]]) -> pa.Table:
-        """A row an episode: where it lies, what it is, and its own statistics, which LeRobot's tools put together."""
+        """Makes one row per episode: its place, its description, and its own statistics, which LeRobot's tools combine."""
         n, lengths = len(episodes), np.array([len(episode) for episode in episodes])
         chunk, file = (np.full(n, x) for x in divmod(self._pieces, lf.CHUNK))
         ends, begin, fps = np.cumsum(lengths), int(self.lengths.sum()), self.schema.fps
@@ -196,7 +196,7 @@ class LeRobotForm:
 
 
 def _frames(length: int, pictures: Callable[[], Iterable[np.ndarray]], found: stats.Stats) -> Iterator[np.ndarray]:
-    """A camera's pictures of an episode, one after another; ``found`` gets their statistics."""
+    """Yields a camera's pictures of an episode, and adds their statistics to ``found``."""
     wanted, kept = stats.sampled(length), []
     for i, frame in enumerate(pictures()):
         if i in wanted:

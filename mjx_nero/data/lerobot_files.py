@@ -14,9 +14,9 @@ try:
     import pyarrow as pa
     from pyarrow import parquet as parquet
 except ModuleNotFoundError:
-    raise UserError("LeRobot's form needs pyarrow, of the extra 'demos': pip install 'mjx-nero[demos]'") from None
+    raise UserError("LeRobot's format needs pyarrow, of the extra 'demos': pip install 'mjx-nero[demos]'") from None
 
-VERSION, CHUNK = "v3.0", 1000  # of the format; files in a folder
+VERSION, CHUNK = "v3.0", 1000  # version of the format; files per folder
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA, EPISODES, VIDEOS = (
@@ -24,7 +24,7 @@ DATA, EPISODES, VIDEOS = (
     f"meta/episodes/{_PLACE}",
     "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
 )
-OWN = {  # columns of every step that the format asks for
+OWN = {  # columns that the format requires for every step
     "timestamp": "float32",
     "frame_index": "int64",
     "episode_index": "int64",
@@ -34,10 +34,11 @@ OWN = {  # columns of every step that the format asks for
 
 
 def statistics(values: Mapping[str, np.ndarray], lengths: np.ndarray) -> dict[str, pa.Array]:
-    """``stats/<feature>/<statistic>`` of each episode, computed of all features at once.
+    """Computes the columns ``stats/<feature>/<statistic>`` of each episode, for all features at once.
 
     Args:
-        values: name -> [steps, numbers], one episode after another.
+        values: name -> [steps, numbers], episode by episode.
+        lengths: number of steps of each episode [n].
     """
     together = stats.of_each(np.concatenate(list(values.values()), axis=1, dtype=np.float32), lengths)
     ends = np.cumsum([x.shape[1] for x in values.values()])[:-1]
@@ -49,13 +50,13 @@ def statistics(values: Mapping[str, np.ndarray], lengths: np.ndarray) -> dict[st
 
 
 def rows(values: np.ndarray) -> pa.Array:
-    """A column of lists [n, numbers]."""
+    """Makes a column of lists from an array [n, numbers]."""
     n, size = values.shape
     return pa.ListArray.from_arrays(np.arange(n + 1, dtype=np.int32) * size, np.ravel(values))
 
 
 def info(schema: Schema, episodes: int, steps: int) -> dict[str, Any]:
-    """The index."""
+    """Returns the content of the index."""
     features: dict[str, Any] = {
         name: {"dtype": feature.dtype, "shape": list(feature.shape), "names": list(feature.names)}
         for name, feature in schema.features.items()
@@ -82,7 +83,7 @@ def info(schema: Schema, episodes: int, steps: int) -> dict[str, Any]:
 
 
 def tasks(sentence: str) -> pa.Table:
-    """The task's number by its sentence: a pandas table, whose index is the sentence."""
+    """Makes the table of tasks: a pandas table of the task's number, whose index is the task's sentence."""
     table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [sentence]})
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
@@ -93,22 +94,22 @@ def tasks(sentence: str) -> pa.Table:
 
 
 def per_channel(found: stats.Stats) -> dict[str, Any]:
-    """Statistics of pictures in LeRobot's shape, [3, 1, 1]."""
+    """Converts statistics of pictures to LeRobot's shape, [3, 1, 1]."""
     return {what: x.tolist() if what == "count" else [[[float(c)]] for c in x] for what, x in found.items()}
 
 
 def film(name: str) -> str:
-    """The pattern of a camera's files."""
+    """Returns the pattern of a camera's file names."""
     return VIDEOS.replace("{video_key}", name)
 
 
 def name_of(pattern: str, piece: int) -> str:
-    """The file of a piece."""
+    """Returns the file name of a piece."""
     chunk, file = divmod(piece, CHUNK)
     return pattern.format(chunk_index=chunk, file_index=file)
 
 
 def flat(column: pa.ChunkedArray) -> np.ndarray:
-    """All its numbers, one after another."""
+    """Returns all numbers of a column as one array."""
     flat = column.combine_chunks()
     return (flat.flatten() if pa.types.is_nested(flat.type) else flat).to_numpy(zero_copy_only=False)

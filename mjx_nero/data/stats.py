@@ -1,16 +1,16 @@
-"""Statistics of features, as LeRobot's readers and learners want them: exact, of all steps."""
+"""Statistics of features as LeRobot's readers and learners expect them, computed exactly from all steps."""
 
 import numpy as np
 from PIL import Image
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-SAMPLES = 100  # pictures of an episode that its statistics are of, at most, as LeRobot has them
-TOGETHER = 16  # episodes of equal length whose statistics are computed at once: they fit into a processor's cache
+SAMPLES = 100  # maximum number of pictures in an episode's statistics, as in LeRobot
+TOGETHER = 16  # episodes of equal length whose statistics are computed at once, so that they fit into a processor's cache
 Stats = dict[str, np.ndarray]
 
 
 def of(values: np.ndarray) -> Stats:
-    """Statistics over the steps: minimum, maximum, mean, standard deviation, number and quantiles.
+    """Computes statistics over the steps: minimum, maximum, mean, standard deviation, count and quantiles.
 
     A quantile is interpolated between the two nearest steps, as ``numpy.quantile`` does.
 
@@ -18,14 +18,14 @@ def of(values: np.ndarray) -> Stats:
         values: [..., steps, numbers].
 
     Returns:
-        name -> [..., numbers], float64; of ``count`` [1], int64.
+        name -> [..., numbers], float64; ``count`` is [1], int64.
     """
-    rows = np.ascontiguousarray(np.asarray(values, np.float32).swapaxes(-1, -2))  # whatever follows goes along memory
+    rows = np.ascontiguousarray(np.asarray(values, np.float32).swapaxes(-1, -2))  # what follows runs along memory
     n = rows.shape[-1]
     at = {name: (int(share * (n - 1)), share * (n - 1) % 1) for name, share in QUANTILES.items()}
     mean = rows.mean(axis=-1, dtype=np.float64)
     out = {"mean": mean, "std": rows.std(axis=-1, dtype=np.float64)}
-    rows.sort(axis=-1)  # a processor's vectors sort sooner than a partition at twelve places
+    rows.sort(axis=-1)  # vectorized sorting is faster than a partition at twelve places
     out |= {"min": rows[..., 0].astype(np.float64), "max": rows[..., -1].astype(np.float64)}
     for name, (low, between) in at.items():
         ends = (rows[..., i].astype(np.float64) for i in (low, min(low + 1, n - 1)))
@@ -35,14 +35,14 @@ def of(values: np.ndarray) -> Stats:
 
 
 def of_each(values: np.ndarray, lengths: np.ndarray) -> Stats:
-    """The same of each episode.
+    """Computes the statistics of ``of`` for each episode.
 
     Args:
-        values: [steps, numbers], one episode after another.
-        lengths: steps of each episode [n].
+        values: [steps, numbers], episode by episode.
+        lengths: number of steps of each episode [n].
 
     Returns:
-        name -> [n, numbers]; of ``count`` [n, 1].
+        name -> [n, numbers]; ``count`` is [n, 1].
     """
     begins, out = np.cumsum(lengths) - lengths, dict[str, np.ndarray]()
     for length in np.unique(lengths):
@@ -56,13 +56,13 @@ def of_each(values: np.ndarray, lengths: np.ndarray) -> Stats:
 
 
 def of_pictures(frames: list[np.ndarray]) -> Stats:
-    """The same of pictures' colours, over all pixels, from 0 to 1.
+    """Computes the statistics of ``of`` for pictures' colours, from 0 to 1, over all pixels.
 
     Args:
         frames: uint8 [height, width, 3] each.
 
     Returns:
-        name -> [3]; of ``count`` [1], pictures.
+        name -> [3]; ``count`` is [1], the number of pictures.
     """
     pixels = np.concatenate(frames)  # one tall picture, which Pillow counts in a third of NumPy's time
     counts = np.reshape(Image.fromarray(pixels).histogram(), (3, 256)).T  # [values, colours]
@@ -82,12 +82,12 @@ def of_pictures(frames: list[np.ndarray]) -> Stats:
 
 
 def sampled(length: int) -> set[int]:
-    """The steps of an episode whose pictures are in its statistics."""
+    """Returns the steps of an episode whose pictures are in its statistics."""
     return set(np.linspace(0, length - 1, min(length, SAMPLES)).round().astype(int).tolist())
 
 
 def together(parts: list[Stats]) -> Stats:
-    """Statistics of all from those of the parts; quantiles, which cannot be had so, are means of theirs, as LeRobot has them."""
+    """Combines the statistics of parts. Quantiles cannot be combined exactly: they are means of the parts', as in LeRobot."""
     count = np.array([part["count"][0] for part in parts], float)
     share = (count / count.sum())[:, None]
     mean, std = (np.stack([part[name] for part in parts]) for name in ("mean", "std"))

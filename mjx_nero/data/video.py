@@ -1,6 +1,6 @@
-"""Videos of a data set: H.264 with a whole picture every second frame, so that any frame is near one to begin from.
+"""Videos of a data set: H.264 with a key frame at every second frame, so that a reader can start near any frame.
 
-Each episode is encoded by itself, so that all cores can work, and begins with a whole picture.
+Each episode is encoded separately, so that all cores can work, and begins with a key frame.
 """
 
 import concurrent.futures
@@ -16,15 +16,15 @@ from mjx_nero import cores
 from mjx_nero.errors import UserError
 
 CODEC, PIXELS = "libx264", "yuv420p"
-# crf: of 0 to 51, the least lossless. bf: no frame waits for a later one, which needs two between whole pictures.
+# crf: quality from 0 (lossless) to 51. bf: no frame depends on a later one, which would need two frames between key frames.
 _OPTIONS = {"crf": "18", "g": "2", "bf": "0", "preset": "veryfast", "threads": "1"}
 
 
 def need() -> None:
-    """Is there an encoder?
+    """Checks that the encoder is installed.
 
     Raises:
-        UserError: there is none.
+        UserError: it is not.
     """
     try:
         import av  # noqa: F401
@@ -36,8 +36,8 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
     """Encodes episodes, as many at a time as there are cores, and writes them one after another.
 
     Args:
-        episodes: what gives the frames of each, uint8 [height, width, 3]; called in any thread.
-        shape: of a frame; height and width are even.
+        episodes: functions that yield the frames of each, uint8 [height, width, 3]; called in any thread.
+        shape: shape of a frame, with even height and width.
     """
     import av
 
@@ -47,7 +47,7 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
         encoder: Any = av.CodecContext.create(CODEC, "w")
         encoder.height, encoder.width, encoder.pix_fmt, encoder.options = *shape[:2], PIXELS, _OPTIONS
         encoder.framerate, encoder.time_base = round(fps), step
-        encoder.flags |= av.codec.context.Flags.global_header.value  # parameters stand once, in the file's head
+        encoder.flags |= av.codec.context.Flags.global_header.value  # parameters are written once, in the file's header
         packets = []
         for i, frame in enumerate(frames()):
             drawn = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(frame), format="rgb24")  # without a copy
@@ -57,7 +57,7 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
 
     pool = concurrent.futures.ThreadPoolExecutor(cores())
     with av.open(str(path), "w") as file, contextlib.ExitStack() as ends:
-        ends.callback(pool.shutdown, cancel_futures=True)  # after an error or Ctrl-C no further episode is begun
+        ends.callback(pool.shutdown, cancel_futures=True)  # start no further episode after an error or Ctrl-C
         stream: Any = file.add_stream(CODEC, rate=round(fps), options=_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = *shape[:2], PIXELS
         begin = 0
@@ -70,10 +70,10 @@ def write(path: pathlib.Path, episodes: Sequence[Callable[[], Iterable[np.ndarra
 
 
 def frames(path: pathlib.Path) -> Iterator[np.ndarray]:
-    """The frames of a file, uint8 [height, width, 3], one after another.
+    """Yields the frames of a video file, uint8 [height, width, 3].
 
     Raises:
-        OSError, ValueError: it is none.
+        OSError, ValueError: it is not a video file.
     """
     import av
 

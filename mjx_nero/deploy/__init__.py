@@ -1,1 +1,1 @@
-"""Policies on machines without JAX or MuJoCo: numpy, and a runtime for the network."""
+"""Runs policies on machines without JAX or MuJoCo, with numpy and a runtime for the network."""

@@ -1,4 +1,4 @@
-"""The arm as the runtime sees it: radians, metres, seconds, and no way to cut its torque."""
+"""The interface of an arm: radians, metres, seconds, and no way to cut its torque."""
 
 import dataclasses
 from typing import Protocol
@@ -11,11 +11,11 @@ class Feedback:
     """Readings of an arm's encoders and drives, as arrays along the arm's joints.
 
     Attributes:
-        time: when it was read, on the runtime's clock [s].
+        time: when they were read, on the runtime's clock [s].
         position: [rad or m].
         velocity: [rad/s or m/s].
-        load: share of the torque that a drive can give, 0 to 1; None where the arm does not tell.
-        temperature: of the drives [degrees C]; None likewise.
+        load: share of the drive's maximum torque, 0 to 1; None if the arm does not report it.
+        temperature: of the drives [degrees C]; None if the arm does not report it.
     """
 
     time: float
@@ -26,64 +26,64 @@ class Feedback:
 
 
 class ArmError(Exception):
-    """The bus does not answer, or what it answers is damaged. The drives keep to the last target that they got."""
+    """The bus does not answer, or its answer is damaged. The drives keep their last target."""
 
 
 class Arm(Protocol):
     """An arm behind its driver.
 
-    No method cuts torque: a driver that is closed leaves the drives at their last target.
+    No method cuts torque: closing a driver leaves the drives at their last target.
 
     Attributes:
-        joints: names, in the order of all arrays.
+        joints: names of the joints, in the order of all arrays.
     """
 
     joints: tuple[str, ...]
 
     def connect(self) -> None:
-        """Opens the bus and looks who is there; moves and changes nothing.
+        """Opens the bus and checks which arm answers; moves and changes nothing.
 
         Raises:
-            UserError: there is no such port, or another arm than expected answers.
+            UserError: the port does not exist, or another arm answers.
             ArmError: nothing answers.
         """
 
     def ranges(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """The least and the greatest positions that the arm, once connected, allows [rad or m]; None: those of its model."""
+        """Returns the lower and upper position limits of the connected arm [rad or m]; None: those of its model."""
 
     def engage(self) -> None:
-        """Lets the drives hold where they are.
+        """Makes the drives hold their present positions.
 
         Raises:
-            ArmError: it cannot be sent.
+            ArmError: the command cannot be sent.
         """
 
     def read(self) -> Feedback:
-        """The newest feedback.
+        """Returns the newest feedback.
 
         Raises:
             ArmError: it cannot be read.
         """
 
     def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Sends where the joints are to be [rad or m], and how fast they are to move there [rad/s or m/s].
+        """Sends target positions of the joints [rad or m], and their velocities there [rad/s or m/s].
 
         Returns:
-            what the drives were told, for the log.
+            the targets as sent to the drives, for the log.
 
         Raises:
-            ArmError: it cannot be sent.
+            ArmError: the command cannot be sent.
         """
 
     def close(self) -> None:
-        """Closes the bus. The drives hold on."""
+        """Closes the bus. The drives keep holding."""
 
 
 class Clock(Protocol):
-    """The time, and a way to wait for it; that of a simulation need not be the wall's."""
+    """A clock that can be waited for. In a simulation it need not be real time."""
 
     def now(self) -> float:
-        """[s]."""
+        """Returns the time [s]."""
 
     def sleep_until(self, time: float) -> None:
-        """Waits."""
+        """Waits until a time [s]."""

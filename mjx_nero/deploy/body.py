@@ -1,4 +1,4 @@
-"""Forward kinematics and clearances of a robot in numpy, for many postures at once, as an exported policy describes the robot."""
+"""Forward kinematics and clearances in numpy, for many postures at once, of the robot that an exported policy describes."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ STILL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def matrix(quat: Vector) -> np.ndarray:
-    """[3, 3] of a quaternion (wxyz), which need not be of unit length."""
+    """Returns the rotation matrix [3, 3] of a quaternion (wxyz) of any length."""
     w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
     return np.array(
         [
@@ -23,13 +23,13 @@ def matrix(quat: Vector) -> np.ndarray:
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Multiplies quaternions (wxyz): the turn ``b`` first, then ``a``."""
+    """Multiplies quaternions (wxyz): rotation ``b`` first, then ``a``."""
     (aw, *av), (bw, *bv) = a, b
     return np.append(aw * bw - np.dot(av, bv), aw * np.array(bv) + bw * np.array(av) + np.cross(av, bv))
 
 
 def transform(pos: Vector, quat: Vector = STILL) -> np.ndarray:
-    """[4, 4] of a position [m] and an orientation (wxyz)."""
+    """Returns the transform [4, 4] of a position [m] and an orientation (wxyz)."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = matrix(quat), pos
     return out
@@ -37,7 +37,7 @@ def transform(pos: Vector, quat: Vector = STILL) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Node:
-    """A joint in the tree; from its parent's frame to its own: ``still + sine sin(q) + cosine cos(q) + slide q``, each [4, 4]."""
+    """A joint in the tree. ``still + sine sin(q) + cosine cos(q) + slide q``, each [4, 4], maps its frame to its parent's."""
 
     parent: int
     joint: int
@@ -61,16 +61,16 @@ def _node(parent: int, joint: int, fixed: np.ndarray, what: Mapping[str, Any]) -
 
 
 class Body:
-    """A robot's links. Arrays of postures are [k, n] along ``joints`` [rad or m]; frames are those of the world.
+    """A robot's links. Postures are arrays [k, n] along ``joints`` [rad or m]; results are in the world frame.
 
     Args:
-        description: what ``interop.description.body`` made.
-        joints: in the order of all joint vectors.
-        base: of the robot, where positions that are observed count from [m].
+        description: result of ``interop.description.body``.
+        joints: names of the joints, in the order of all joint vectors.
+        base: position of the robot's base, the origin of observed positions [m].
 
     Attributes:
-        names: of shapes; then of the links that joints move, by their origins.
-        depth: how many of ``joints`` move each of these.
+        names: names of the shapes, followed by the names of the links that joints move, for their origins.
+        depth: number of ``joints`` that move each of these.
     """
 
     def __init__(self, description: Mapping[str, Any], joints: Sequence[str], base: Sequence[float] = (0.0, 0.0, 0.0)):
@@ -92,8 +92,10 @@ class Body:
         self._turns = self._turns_to(description)
 
     def _turns_to(self, description: Mapping[str, Any]) -> list[tuple[int, np.ndarray]]:
-        """Quaternions from the world to the end effector: fixed ones (joint -1), and the axes of hinges. A turn is told by two
-        quaternions; what a policy has learnt is the one that comes of their product."""
+        """Lists the rotations from the world to the end effector: fixed quaternions (joint -1), and axes of hinges.
+
+        Two quaternions describe each rotation. A policy has learnt the one that is the product of this list.
+        """
         bodies, ee = {body["name"]: body for body in description["bodies"]}, description["ee"]
         turns, name = [(-1, np.array(ee["quat"], float))], ee["body"]
         while name is not None:
@@ -107,11 +109,11 @@ class Body:
         return turns[::-1]
 
     def _place(self, body: Mapping[str, Any], node: int, fixed: np.ndarray) -> tuple[int, np.ndarray]:
-        """The joint that carries a body, and where the body is from there."""
+        """Returns the joint that carries a body, and the body's pose in the joint's frame."""
         fixed = fixed @ transform(body["pos"], body["quat"])
         for joint in body["joints"]:
             column = self._columns.get(joint["name"])
-            if column is None:  # nobody moves it
+            if column is None:  # it never moves
                 continue
             self._zero[column] = joint["zero"]
             self._nodes.append(_node(node, column, fixed @ transform(joint["pos"]), joint))
@@ -119,7 +121,7 @@ class Body:
         return node, fixed
 
     def _set_shapes(self, shapes: Sequence[Mapping[str, Any]], places: Mapping[str | None, tuple[int, np.ndarray]]) -> None:
-        """Shapes, and the origins of what moves as spheres without extent."""
+        """Stores the shapes, and the origins of moving links as spheres of radius zero."""
         origins = [
             {"name": name, "body": name, "type": "sphere", "size": [0.0, 0.0, 0.0]} for name, (at, _) in places.items() if at >= 0
         ]
@@ -135,7 +137,7 @@ class Body:
             radius.append(ball)
             capsules.append(_capsule(edges, round_, ball))
         self.names = tuple(shape["name"] for shape in (*shapes, *origins))
-        self.solid = len(shapes)  # so many have an extent
+        self.solid = len(shapes)  # number of shapes that have an extent
         self._frames, self._half, self._round, self._ball = (np.array(x) for x in (frames, half, rounds, radius))
         self._ends, self._radius = np.array([c[0] for c in capsules]), np.array([c[1] for c in capsules])
         self.depth = np.array([self._depth(node) for node in self._owner])
@@ -148,7 +150,7 @@ class Body:
         return len(moved)
 
     def link(self, names: Sequence[str]) -> np.ndarray:
-        """Counts how many of the named joints move each shape: its place in their chain."""
+        """Counts how many of the named joints move each shape."""
         wanted = {self._columns[name] for name in names}
         out = []
         for node in self._owner:
@@ -160,7 +162,7 @@ class Body:
         return np.array(out)
 
     def forward(self, q: np.ndarray) -> np.ndarray:
-        """[k, nodes + 1, 4, 4]: the joints' frames; the last is the world's, so that -1 finds it."""
+        """Computes the joints' frames [k, nodes + 1, 4, 4]; the last one is the world's, so that index -1 finds it."""
         q = self._all(np.atleast_2d(np.asarray(q, float)))
         out = np.empty((len(q), len(self._nodes) + 1, 4, 4))
         out[:, -1] = np.eye(4)
@@ -172,7 +174,7 @@ class Body:
         return out
 
     def _all(self, q: np.ndarray) -> np.ndarray:
-        """Adds the joints that follow others, counted from where they displace nothing."""
+        """Adds the joints that follow others, and subtracts each joint's zero position."""
         if self._couplings:
             q = np.concatenate([q, np.zeros((len(q), len(self._columns) - q.shape[1]))], axis=1)
             for c in self._couplings:
@@ -182,7 +184,7 @@ class Body:
         return q - self._zero
 
     def ee(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position [m] and orientation (wxyz) of the end effector in the world, of one posture."""
+        """Computes position [m] and orientation (wxyz) of the end effector in the world, for one posture."""
         node, fixed = self._ee
         half, quat = self._all(np.atleast_2d(np.asarray(q, float)))[0] / 2, STILL
         for joint, turn in self._turns:
@@ -190,22 +192,22 @@ class Body:
         return (self.forward(q)[0, node] @ fixed)[:3, 3], quat
 
     def shapes(self, q: np.ndarray) -> np.ndarray:
-        """[k, shapes, 4, 4]: their frames."""
+        """Computes the frames of all shapes [k, shapes, 4, 4]."""
         return self.forward(q)[:, self._owner] @ self._frames
 
     def bounds(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[k, shapes, 3] each: the least and the greatest coordinates of shapes in the world [m]."""
+        """Computes the minimum and maximum coordinates of all shapes in the world, [k, shapes, 3] each [m]."""
         turn = frames[..., :3, :3]
         reach = np.abs(turn) @ self._half[..., None]
-        flat = self._round[:, None] * np.sqrt(np.maximum(0.0, 1 - turn[..., 2] ** 2))  # of a cylinder's end
+        flat = self._round[:, None] * np.sqrt(np.maximum(0.0, 1 - turn[..., 2] ** 2))  # reach of a cylinder's ends
         reach = reach[..., 0] + flat + self._ball[:, None]
         return frames[..., :3, 3] - reach, frames[..., :3, 3] + reach
 
     def apart(self, frames: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """[k, pairs]: distances between the capsules about shapes [m]; negative where they overlap.
+        """Computes distances [k, pairs] between the bounding capsules of shapes [m]; negative if they overlap.
 
         Args:
-            pairs: [pairs, 2] numbers of shapes.
+            pairs: indices of shapes [pairs, 2].
         """
         if not len(pairs):
             return np.full((len(frames), 0), np.inf)
@@ -216,7 +218,7 @@ class Body:
 
 
 def _extent(kind: str, size: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Half edges of a box, the radius of a disc across z, and that of a ball; a shape is the sum of these three."""
+    """Describes a shape as the sum of a box (half edges), a disc across z (radius), and a ball (radius)."""
     size = np.concatenate([size, np.zeros(3)])[:3]
     if kind == "box":
         return size, 0.0, 0.0
@@ -227,7 +229,7 @@ def _extent(kind: str, size: np.ndarray) -> tuple[np.ndarray, float, float]:
 
 
 def _capsule(half: np.ndarray, round_: float, ball: float) -> tuple[np.ndarray, float]:
-    """A capsule about a shape: [2, 3] its ends, and its radius [m]."""
+    """Returns the bounding capsule of a shape: its ends [2, 3], and its radius [m]."""
     k = int(np.argmax(half))
     along = np.zeros(3)
     along[k] = half[k]
@@ -235,7 +237,7 @@ def _capsule(half: np.ndarray, round_: float, ball: float) -> tuple[np.ndarray, 
 
 
 def _between(p: np.ndarray, p_end: np.ndarray, q: np.ndarray, q_end: np.ndarray) -> np.ndarray:
-    """Distances between segments [..., 3]: the nearest points lie inside both, or at an end of one."""
+    """Computes distances between segments [..., 3]. The nearest points lie inside both, or at an end of one."""
     d, e, r = p_end - p, q_end - q, p - q
     a, b, c = _dot(d, d), _dot(d, e), _dot(e, e)
     f, g = _dot(d, r), _dot(e, r)

@@ -1,8 +1,8 @@
-"""A walk through an arm before a policy has it: small safe moves of one joint after another, what was read, what a person saw.
+"""Checks an arm before a policy runs on it, by small safe moves of one joint after another that a person watches.
 
-A move goes a few degrees from home and back, through the safety layer, at a fifth of the joints' speeds. What it shows of a
-joint: which reading followed (order), which way (sign), by how much (scale), what the reading says beside the command at rest
-(offset), and how late it came (delay, with what the drive adds to it).
+A move goes a few degrees from home and back, through the safety layer, at a fifth of the joints' speeds. It shows which reading
+followed (order), in which direction (sign), by how much (scale), the difference between reading and command at rest (offset), and
+how late the reading followed (delay, which includes the drive's own).
 """
 
 import dataclasses
@@ -17,22 +17,22 @@ from mjx_nero.deploy.guard import Guarded
 from mjx_nero.deploy.loop import Stop
 from mjx_nero.deploy.safety import Fault, Limits
 
-ANGLE, SHARE = 0.1, 0.2  # of a move [rad]; of the speeds
-SLIDE = 0.02  # of a move of a joint that slides [m]
-_REST, _SAMPLE = 0.4, 0.005  # [s] at each end; between readings
-_LATEST = 0.3  # [s] of a delay
-_SAME, _SCALE, _OFFSET = 0.5, 0.1, 0.05  # share of the move that counts as following; how far scale and offset may be off
+ANGLE, SHARE = 0.1, 0.2  # size of a move [rad]; share of the speeds
+SLIDE = 0.02  # size of a move of a slide [m]
+_REST, _SAMPLE = 0.4, 0.005  # time at rest at each end; time between readings [s]
+_LATEST = 0.3  # maximum delay [s]
+_SAME, _SCALE, _OFFSET = 0.5, 0.1, 0.05  # share of the move that counts as following; tolerances of scale and offset
 
 Ask = Callable[[str], "bool | None"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """A joint's move: what was told to it and read of all joints.
+    """A joint's move: its targets, and the readings of all joints.
 
     Attributes:
-        sent, told: when targets were sent, and which [rad or m].
-        times, read: when readings were made, and which [k, n].
+        sent, told: times of the targets [s], and the targets [rad or m].
+        times, read: times of the readings [s], and the readings [k, n].
     """
 
     sent: np.ndarray
@@ -43,16 +43,16 @@ class Move:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint as a move showed it.
+    """The findings about a joint from its move.
 
     Attributes:
-        name: of the joint.
+        name: the joint's name.
         follows: the joint whose reading moved most.
-        scale: how far the reading moved, over how far the command did.
-        offset: of the reading beside the command at rest [rad or m].
+        scale: motion of the reading over motion of the command.
+        offset: reading minus command at rest [rad or m].
         delay: from a command to the reading that follows it [s].
-        seen: whether a person saw it move as was said; None: nobody was asked.
-        there: whether the whole move could be made.
+        seen: whether a person saw it move as announced; None: nobody was asked.
+        there: whether the whole move was possible.
     """
 
     name: str
@@ -64,25 +64,25 @@ class Joint:
     there: bool = True
 
     def wrong(self, grips: bool) -> list[str]:
-        """Lists what speaks against letting a policy have it."""
+        """Lists the reasons against running a policy with this joint; ``grips``: it belongs to the gripper."""
         out = [] if self.there else ["the fence does not let it move here"]
         if self.follows != self.name:
             out.append(f"the reading of {self.follows} moved instead: the order of the joints is wrong")
         elif abs(self.scale) < _SAME:
-            out.append("its reading hardly moved: is it powered, and free?")
+            out.append("its reading hardly moved: check that it is powered and free to move")
         elif self.scale < 0:
             out.append("its reading moved the other way: its sign is wrong")
         elif abs(self.scale - 1) > _SCALE and not grips:
             out.append(f"its reading moved {self.scale:.2f} times as far: its scale is wrong, or it does not follow")
         if not out and abs(self.offset) > _OFFSET and not grips:
-            out.append(f"at rest it is read {self.offset:+.3f} beside its command: its zero is off, or it sags")
+            out.append(f"at rest its reading differs from its command by {self.offset:+.3f}: its zero is off, or it sags")
         if self.seen is False:
-            out.append("nobody saw it move as was said: its sign, zero or order differs from the model's")
+            out.append("you did not see it move as announced: its sign, zero or order differs from the model's")
         return out
 
 
 def move(arm: Guarded, joint: int, step: float, limits: Limits, clock: Clock, stop: Stop) -> Move:
-    """A joint goes ``step`` [rad or m] and back; the others stay. Stops where somebody says so, or something fails."""
+    """Moves a joint by ``step`` [rad or m] and back while the others stay. Ends early if ``stop`` says so or something fails."""
     begun, here = clock.now(), arm.read().position
     target, sent, told, times, read = here.copy(), [], [], [], []
     pace = limits.speed[joint] * SHARE * limits.dt
@@ -107,7 +107,7 @@ def move(arm: Guarded, joint: int, step: float, limits: Limits, clock: Clock, st
 
 
 def judged(made: Move, joint: int, names: tuple[str, ...], step: float) -> Joint:
-    """Judges a joint by its move."""
+    """Evaluates a joint's move."""
     far = np.abs(made.told - made.told[0]).max() > 0.8 * abs(step)
     settled = (made.times > made.sent[0]) & (np.abs(np.interp(made.times, made.sent, made.told) - made.told[0]) < 1e-6)
     start = made.read[made.times < made.sent[5]].mean(axis=0)
@@ -124,7 +124,7 @@ def judged(made: Move, joint: int, names: tuple[str, ...], step: float) -> Joint
 
 
 def delay_of(made: Move, joint: int) -> float:
-    """Returns how late the reading follows the command: where the two differ least, but for scale and offset [s]."""
+    """Returns the delay [s] at which reading and command differ least, apart from scale and offset."""
     seen, best = made.read[:, joint], (math.inf, 0.0)
     for delay in np.arange(0.0, _LATEST, 0.001):
         last = np.clip(np.searchsorted(made.sent, made.times - delay, side="right") - 1, 0, None)
@@ -135,7 +135,7 @@ def delay_of(made: Move, joint: int) -> float:
 
 
 def described(body: Body, position: np.ndarray, joint: int, step: float) -> str:
-    """Says what a person sees when a joint moves by ``step``: where the end effector goes."""
+    """Describes what a person sees when a joint moves by ``step``: where the end effector goes."""
     before, turn = body.ee(position)
     there = position.copy()
     there[joint] += step
@@ -155,7 +155,7 @@ def walk(
     """Moves each joint of an arm that is at home.
 
     Returns:
-        what was found, and why it stopped short, if it did.
+        the findings, and why the check stopped early (None: it did not).
     """
     found: list[Joint] = []
     for joint, name in enumerate(limits.names):
@@ -169,7 +169,7 @@ def walk(
         if arm.fault or len(made.times) < 10:
             return found, arm.fault or Fault("stop", "too few readings")
         one = judged(made, joint, limits.names, step)
-        seen = ask(f"did {name} do that, and nothing else?")
+        seen = ask(f"did {name} do that, and nothing else move?")
         if arm.fault:
             return found, arm.fault
         found.append(dataclasses.replace(one, seen=seen))
@@ -177,7 +177,8 @@ def walk(
 
 
 def yaml_of(robot: str, found: list[Joint], arm: Sequence[str]) -> str:
-    """Writes what ``deploy --identified`` and ``--env.identified`` read: offsets, and the delay with its range over the joints.
+    """Returns the YAML that ``deploy --identified`` and ``--env.identified`` read: offsets, and the delay with its range over the
+    joints.
 
     Args:
         arm: names of the arm's joints.
@@ -186,7 +187,7 @@ def yaml_of(robot: str, found: list[Joint], arm: Sequence[str]) -> str:
     delays = sorted(joint.delay for joint in mine)
     middle = delays[len(delays) // 2]
     lines = [
-        f"# What deploy --check read on a {robot}: offsets [rad or m] and the delay [s], which has in it what the drives add.",
+        f"# From deploy --check on a {robot}: offsets [rad or m], and the delay [s], which includes the drives' own.",
         f"robot: {robot}",
         f"delay: {{value: {middle:.4f}, low: {delays[0]:.4f}, high: {delays[-1]:.4f}}}",
         "joints:",

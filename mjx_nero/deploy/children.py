@@ -1,4 +1,4 @@
-"""Programs of this package in processes of their own."""
+"""Starts programs of this package in separate processes."""
 
 import os
 import pathlib
@@ -11,6 +11,6 @@ def command(module: str, *argv: str) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """Returns an environment in which a child finds the package that this process has."""
+    """Returns environment variables with which a child process finds the same package as this process."""
     root = str(pathlib.Path(__file__).resolve().parents[2])
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))}

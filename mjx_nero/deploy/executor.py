@@ -1,7 +1,7 @@
-"""The action chain in numpy: a policy's actions, one after another, become position targets of the drives.
+"""The action chain in numpy: turns a policy's actions into position targets of the drives.
 
-The file needs numpy alone. The chain is the JSON by which ``mdp.actions`` terms describe themselves, as ``export`` writes it into
-an ONNX file: each type of it is a class here, and the tests hold both equal, step for step.
+This file needs only numpy. The chain is described by the JSON that ``mdp.actions`` terms write about themselves, and that
+``export`` stores in an ONNX file. Each type in it is a class here. Tests check that both give the same targets at every step.
 """
 
 import dataclasses
@@ -12,18 +12,18 @@ from typing import Any, Protocol
 import numpy as np
 
 MOST_JOINTS, MOST_PARTS = 1000, 100
-LARGEST = 1e6  # of a number in a description
+LARGEST = 1e6  # largest number in a description
 
 
 def numbers(found: Any, name: str, size: int | None = None, above: float = -np.inf) -> np.ndarray:
-    """A field of a description that may be a stranger's: finite numbers [size], or one for all.
+    """Reads a field of an untrusted description: finite numbers [size], or one for all.
 
     Args:
-        size: how many there have to be; None: one.
-        above: what all of them are above.
+        size: required number of values; None: a single number.
+        above: all values must be above this.
 
     Raises:
-        ValueError: it holds something else; one line.
+        ValueError: the field holds something else; one line.
     """
     value = found.get(name) if isinstance(found, Mapping) else None
     given = value if isinstance(value, list | tuple) else [value]
@@ -54,10 +54,10 @@ def names(found: Any, name: str) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """The robot's joints as an executor knows them, as arrays along ``names`` [rad or m].
+    """The robot's joints, as arrays along ``names`` [rad or m].
 
     Attributes:
-        speed: of targets, at most [rad/s or m/s].
+        speed: maximum speed of targets [rad/s or m/s].
         dt: control step [s].
     """
 
@@ -73,21 +73,21 @@ class Joints:
         """Reads the metadata of an exported policy.
 
         Raises:
-            ValueError: they say something else than an exported policy's; one line.
+            ValueError: they are not an exported policy's; one line.
         """
         own = metadata.get("joints")
         called = names(own, "names")
         least = {"home": -np.inf, "lower": -np.inf, "upper": -np.inf, "speed": 0.0}
         arrays = {name: np.resize(numbers(own, name, len(called), above), len(called)) for name, above in least.items()}
         if not called or (arrays["lower"] > arrays["upper"]).any():
-            raise ValueError("the description's 'joints' takes some, whose 'lower' ends are not above their 'upper' ones")
+            raise ValueError("the description's 'joints' needs at least one, and 'lower' limits that are not above 'upper' ones")
         return cls(names=called, **arrays, dt=float(numbers(metadata, "control_dt", above=0.0)))
 
     def ids(self, wanted: Sequence[str]) -> np.ndarray:
-        """Places of some joints in all joint vectors.
+        """Returns the indices of some joints in joint vectors.
 
         Raises:
-            ValueError: there is no such joint.
+            ValueError: a joint does not exist.
         """
         if unknown := [name for name in wanted if name not in self.names]:
             raise ValueError(f"no joint {reprlib.repr(unknown[0])}: not one of {', '.join(self.names)}"[:400])
@@ -98,14 +98,14 @@ class Joints:
 class Step:
     """One action on its way to the drives."""
 
-    action: np.ndarray  # all of it
-    position: np.ndarray  # where the joints are
-    last: np.ndarray  # the targets now in force
-    targets: np.ndarray  # what comes of the action: at first, home
+    action: np.ndarray  # the whole action
+    position: np.ndarray  # positions of the joints
+    last: np.ndarray  # present targets
+    targets: np.ndarray  # new targets: home at first
 
 
 class Part(Protocol):
-    """A term of the chain. ``size``: how many entries of the action it reads."""
+    """A term of the chain. ``size``: number of entries of the action that it reads."""
 
     size: int
 
@@ -115,8 +115,8 @@ class Part(Protocol):
 
 class _Stateless:
     size = 0
-    reads: tuple[str, ...] = ()  # fields of its description: a number for each of its joints, or one for all
-    above_zero: tuple[str, ...] = ()  # further ones: one number
+    reads: tuple[str, ...] = ()  # fields of its description with a number for each joint, or one for all
+    above_zero: tuple[str, ...] = ()  # further fields, with one number above 0
 
     def __init__(self, joints: Joints, what: Mapping[str, Any]):
         self.joints = joints
@@ -129,7 +129,7 @@ class _Stateless:
         """Does nothing: the part has no memory."""
 
     def home(self) -> np.ndarray:
-        """The entries that keep the robot at home."""
+        """Returns the entries that keep the robot at home."""
         return np.zeros(self.size)
 
     def bounded(self, values: np.ndarray) -> np.ndarray:
@@ -149,7 +149,7 @@ class JointPosition(_Stateless):
             raise ValueError("the description's 'scale' of joint_position takes a number other than 0")
 
     def home(self) -> np.ndarray:
-        """Zero, unless the offset is not home."""
+        """Returns zero, unless the offset is not home."""
         return (self.joints.home[self.ids] - self.what["offset"]) / self.what["scale"]
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
@@ -157,7 +157,7 @@ class JointPosition(_Stateless):
 
 
 class JointVelocity(_Stateless):
-    """Entries move set-points, which stay near the joints and which targets lead."""
+    """Entries move set-points, which stay near the joints; targets lead the set-points."""
 
     reads, above_zero = ("ahead", "lag"), ("time",)
 
@@ -179,7 +179,7 @@ class JointVelocity(_Stateless):
 
 
 class Binary(_Stateless):
-    """A gripper: closed below minus ``hysteresis``, open from plus that on, between as it was, at first open."""
+    """A gripper: closes below ``-hysteresis``, opens from ``hysteresis`` on, and otherwise stays as it is; open at first."""
 
     size, reads = 1, ("close", "open")
 
@@ -188,7 +188,7 @@ class Binary(_Stateless):
         self.hysteresis = float(numbers({"hysteresis": 0.0, **what}, "hysteresis"))
 
     def reset(self, position: np.ndarray, home_action: np.ndarray) -> None:
-        """Open."""
+        """Opens the gripper."""
         self.closed = False
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
@@ -197,12 +197,12 @@ class Binary(_Stateless):
 
 
 class Continuous(_Stateless):
-    """A gripper: closed at -1, open at 1, and between in proportion."""
+    """A gripper: closed at -1, open at 1, and proportional in between."""
 
     size, reads = 1, ("close", "open")
 
     def home(self) -> np.ndarray:
-        """The entry for the gripper's opening at home."""
+        """Returns the entry for the gripper's opening at home."""
         close, open = (np.resize(self.what[end], len(self.ids)) for end in ("close", "open"))
         way = open - close
         return np.array([2 * ((self.joints.home[self.ids] - close) @ way) / (way @ way or 1.0) - 1])
@@ -213,7 +213,7 @@ class Continuous(_Stateless):
 
 
 class AntiWindup(_Stateless):
-    """Targets that turn back start near the joints."""
+    """Makes targets that reverse start near the joints."""
 
     reads = ("ahead",)
 
@@ -224,7 +224,7 @@ class AntiWindup(_Stateless):
 
 
 class SpeedLimit(_Stateless):
-    """Targets move at most as fast as their drives."""
+    """Limits the speed of targets to that of their drives."""
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
         most = self.joints.dt * self.joints.speed[self.ids]
@@ -249,7 +249,7 @@ class Nothing(_Stateless):
     """Does nothing, for terms that the real world adds by itself, such as delays and noise."""
 
     def __call__(self, own: np.ndarray, step: Step) -> None:
-        """Leaves all as it is."""
+        """Changes nothing."""
 
 
 PARTS: dict[str, Callable[[Joints, Mapping[str, Any]], Any]] = {
@@ -266,19 +266,19 @@ PARTS: dict[str, Callable[[Joints, Mapping[str, Any]], Any]] = {
 
 
 class Executor:
-    """Turns actions into targets, starting from where the joints are.
+    """Turns actions into targets, starting from the joints' positions.
 
     Args:
-        joints: of the robot.
-        parts: the chain, term after term.
-        clip: bounds actions to +- this first; 0: it does not.
-        position: of the joints, at the start [rad or m].
+        joints: the robot's joints.
+        parts: descriptions of the chain's terms, in order.
+        position: first positions of the joints [rad or m].
+        clip: actions are first clipped to +- this; 0: they are not clipped.
 
     Attributes:
         home_action: the action that keeps the robot at home.
 
     Raises:
-        ValueError: a part is of a type that is not known here, or is described by something else than numbers.
+        ValueError: a part has an unknown type, or its description is invalid.
     """
 
     def __init__(self, joints: Joints, parts: Sequence[Mapping[str, Any]], position: np.ndarray, clip: float = 0.0):
@@ -294,25 +294,25 @@ class Executor:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any], position: np.ndarray) -> "Executor":
-        """The chain of an exported policy."""
+        """Makes the executor of an exported policy."""
         clip = {"action_clip": metadata.get("action_clip") or 0.0}
         return cls(Joints.of(metadata), metadata.get("actions", ()), position, float(numbers(clip, "action_clip")))
 
     def reset(self, position: np.ndarray) -> None:
-        """Begins anew, with targets where the joints are.
+        """Starts again, with targets at the joints' positions.
 
         Raises:
-            ValueError: ``position`` is no finite number a joint.
+            ValueError: ``position`` is not one finite number per joint.
         """
         self.last = _finite(position, len(self.joints.names), "position").copy()
         for part in self._parts:
             part.reset(self.last.copy(), self.home_action)
 
     def __call__(self, action: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """The targets for an action and where the joints are now, arrays along ``joints.names`` [rad or m].
+        """Computes the targets for an action and the joints' positions, arrays along ``joints.names`` [rad or m].
 
         Raises:
-            ValueError: one of them has another size, or is not finite: no drive is told such.
+            ValueError: one of them has another size or is not finite; such values never reach a drive.
         """
         action = _finite(action, len(self.home_action), "action")
         position = _finite(position, len(self.joints.names), "position")
@@ -329,15 +329,15 @@ class Executor:
 class Lag:
     """Models the drives of training: joints follow targets like a first-order filter with time constant damping / stiffness.
 
-    Its output is where the joints are meant to be, which arms with stiff drives are told and which limits are for. Drives like
-    those of training are told ``position + lead * velocity``, which is the target again.
+    Its output is the intended positions of the joints. Limits apply to these, and arms with stiff drives receive them as targets.
+    Drives like those of training receive ``position + lead * velocity``, which is the original target.
 
     Args:
-        seconds: damping over stiffness, of each joint.
+        seconds: damping over stiffness of each joint [s].
         dt: control step [s].
 
     Attributes:
-        lead: [s].
+        lead: lead of targets over moving positions [s].
     """
 
     def __init__(self, seconds: np.ndarray, dt: float):
@@ -346,17 +346,17 @@ class Lag:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> "Lag":
-        """Builds the lag of an exported policy's drives."""
+        """Makes the lag of an exported policy's drives."""
         joints = metadata["joints"]
         return cls(np.array(joints["damping"], float) / np.array(joints["stiffness"], float), float(metadata["control_dt"]))
 
     def __call__(self, target: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Returns where the joints get in one step towards a target, from where they are meant to be [rad or m]."""
+        """Returns the intended positions after one step towards a target, from the present intended ones [rad or m]."""
         return position + self._share * (target - position)
 
 
 def _kind(part: Any) -> Any:
-    """The type of a part; None: it is none."""
+    """Returns the type of a part; None if it has none."""
     kind = part.get("type") if isinstance(part, Mapping) else None
     return kind if isinstance(kind, str) else None
 

@@ -1,5 +1,5 @@
-"""A fence around an arm: above the table, within a box, and clear of itself. It computes clearances of all links, for several
-postures at once."""
+"""A fence that keeps an arm above the table, within a box, and clear of itself. It computes the clearances of all links, for
+several postures at once."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ import numpy as np
 from mjx_nero.deploy.body import Body
 
 Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-_STEP = 1e-4  # of a finite difference [rad or m]
-_SAMPLES, _ALWAYS = 300, 0.9  # postures looked at; links that touch in so many of them are made that way
+_STEP = 1e-4  # finite difference [rad or m]
+_SAMPLES, _ALWAYS = 300, 0.9  # number of postures; share of them in which links that touch are ignored, as made that way
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,11 +17,11 @@ class FenceCfg:
     """Bounds for the links.
 
     Attributes:
-        table: height of the table's top, in the world [m].
-        press: how far commands may press into it [m]: policies slide fingertips over the table, and drives give way.
-        box: ranges of x, y and z in the world that no link may leave [m]; None: what the policy's task needs, and some room.
-        apart: between links that do not follow one another, at least [m].
-        room: about what the policy's task needs, where no box is given [m].
+        table: height of the table top in the world [m].
+        press: depth to which commands may press into the table [m], because policies slide fingertips over it, and drives yield.
+        box: ranges of x, y and z in the world that no link may leave [m]; None: the policy's task region plus ``room``.
+        apart: minimum distance between links that are not neighbours [m].
+        room: margin around the policy's task region if no box is given [m].
     """
 
     table: float = 0.0
@@ -32,17 +32,17 @@ class FenceCfg:
 
 
 class Fence:
-    """Signed clearances: of each moving shape from the table and from the box's sides, and of links from one another.
+    """Computes signed clearances of moving shapes from the table and the box's sides, and of links from each other.
 
-    What is closer than that at home already (an arm whose foot stands below the table's top) may be as close there, no closer.
+    Shapes that violate a limit at home (such as a foot below the table top) may be as close as they are at home, but not closer.
 
     Args:
         arm: names of the arm's joints, without the gripper's.
-        home: of all joints [rad or m].
-        ranges: of all joints, the least and the greatest [rad or m].
+        home: home positions of all joints [rad or m].
+        ranges: lower and upper limits of all joints [rad or m].
 
     Attributes:
-        names: of the constraints, for messages.
+        names: names of the constraints, for messages.
     """
 
     def __init__(self, body: Body, arm: tuple[str, ...], home: np.ndarray, ranges: tuple[np.ndarray, np.ndarray], cfg: FenceCfg):
@@ -67,7 +67,7 @@ class Fence:
         self._allowed = np.minimum(0.0, self._raw(home)[0])
 
     def _meeting(self, pairs: np.ndarray, home: np.ndarray, ranges: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """The pairs of shapes that ought to be apart: not those that touch at home, or in nearly all postures."""
+        """Selects the pairs of shapes to keep apart: all but those that touch at home or in nearly all postures."""
         low, high = ranges
         postures = np.concatenate([home[None], low + (high - low) * np.random.default_rng(0).random((_SAMPLES, len(home)))])
         touching = self._body.apart(self._body.shapes(postures), pairs) < 0
@@ -81,10 +81,10 @@ class Fence:
         return np.concatenate([sides.reshape(len(frames), -1), apart], axis=1)
 
     def clearance(self, q: np.ndarray) -> np.ndarray:
-        """[k, constraints] of postures [k, n]; negative: not allowed [m]."""
+        """Computes the clearances [k, constraints] of postures [k, n] [m]; negative: not allowed."""
         return self._raw(q) - self._allowed
 
     def gradient(self, q: np.ndarray, constraint: int) -> np.ndarray:
-        """[n] how a clearance changes with the joints."""
+        """Computes the gradient [n] of a clearance with respect to the joints."""
         around = self._raw(np.concatenate([q[None], q + _STEP * np.eye(len(q))]))[:, constraint]
         return (around[1:] - around[0]) / _STEP

@@ -1,4 +1,4 @@
-"""An arm behind its safety layer and its log: all that the runtime ever talks to."""
+"""An arm behind its safety layer and its log. The runtime talks only to this."""
 
 import contextlib
 import ctypes
@@ -13,14 +13,14 @@ from mjx_nero.deploy.arm import Arm, ArmError, Clock, Feedback
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Command, Fault, Safety
 
-_PRIORITY = 10  # of 1 to 99
-_LOCK = 1 | 2 | 4  # Linux's MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: what is in memory stays there
+_PRIORITY = 10  # real-time priority, from 1 to 99
+_LOCK = 1 | 2 | 4  # Linux's MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: memory in use is never swapped out
 
 
 class WallClock:
-    """Seconds of ``time.monotonic``."""
+    """The clock of ``time.monotonic``."""
 
-    _SPIN = 5e-4  # [s] that are waited for awake: sleep is up to some tenths of a millisecond late
+    _SPIN = 5e-4  # time of busy waiting [s], because sleep ends up to some tenths of a millisecond late
 
     def now(self) -> float:
         """See ``Clock``."""
@@ -36,7 +36,7 @@ class WallClock:
 
 @contextlib.contextmanager
 def urgent() -> Iterator[None]:
-    """Meanwhile this thread, and those that it starts, run before others, and memory stays in place, where the system lets it."""
+    """Gives this thread and those that it starts real-time priority, and locks memory, if the system allows it."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError, AttributeError):
             before = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -49,11 +49,11 @@ def urgent() -> Iterator[None]:
 
 
 class Guarded(Protocol):
-    """An arm as the loop sees it, in this process or in one of its own.
+    """The arm's interface for the loop; the arm is in this process or in a separate one.
 
     Attributes:
-        fault: why it holds; None: it does not.
-        sent: when the last command was sent [s].
+        fault: why the arm holds; None: it does not.
+        sent: time of the last command [s].
     """
 
     fault: Fault | None
@@ -70,7 +70,7 @@ class Guard:
     """An arm in this process.
 
     Args:
-        log: of what is read and sent; None: none.
+        log: log of everything read and sent; None: there is none.
     """
 
     def __init__(self, arm: Arm, safety: Safety, clock: Clock, log: Log | None = None):
@@ -84,10 +84,10 @@ class Guard:
         return self.safety.fault
 
     def start(self, anywhere: bool = False) -> Feedback:
-        """Reads the arm, and from then on commands it.
+        """Reads the arm and starts commanding it.
 
         Raises:
-            UserError: it is far from home, or at fault already.
+            UserError: the arm is far from home, or already at fault.
             ArmError: it does not answer.
         """
         self._last = feedback = self.arm.read()
@@ -95,7 +95,7 @@ class Guard:
         return feedback
 
     def read(self) -> Feedback:
-        """The newest feedback, checked; where the bus fails, the one before."""
+        """Returns the newest feedback, checked by the safety layer; the previous one if the bus fails."""
         assert self._last is not None, "start first"
         try:
             self._last = self.arm.read()
@@ -107,10 +107,10 @@ class Guard:
         return self._last
 
     def command(self, target: np.ndarray, notes: Sequence[float] = ()) -> Command:
-        """Sends the nearest safe command to a target [rad or m]; after a fault, what brakes and holds.
+        """Sends the safe command nearest to a target [rad or m]; after a fault, commands that brake and hold.
 
         Args:
-            notes: for the log: when inference began and ended [s], and the action.
+            notes: for the log: start and end of inference [s], and the action.
         """
         command = self.safety.step(target)
         told = command.position
@@ -124,11 +124,11 @@ class Guard:
         return command
 
     def hold(self, fault: Fault) -> None:
-        """The arm brakes and holds from the next command on."""
+        """Makes the arm brake and hold from the next command on."""
         self.safety.hold(fault)
 
     def settle(self) -> None:
-        """Brakes to rest, at the pace of commands."""
+        """Brakes to rest, one command per control step."""
         self.hold(Fault("stop", "the end"))
         for _ in range(1000):
             due = self.clock.now() + self.safety.limits.dt
@@ -147,10 +147,10 @@ class Guard:
 
 
 class Dry:
-    """An arm that is read, and never told anything: from the first command on it seems to be where it was sent.
+    """An arm that is read but never commanded. From the first command on, it reports the commanded positions as its own.
 
     Args:
-        say: shown each command.
+        say: called with each command as text.
     """
 
     def __init__(self, arm: Arm, say=print):

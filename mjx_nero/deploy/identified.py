@@ -1,4 +1,4 @@
-"""Delay and encoders' offsets of an arm, from a file of ``identify`` or ``deploy --check``."""
+"""The delay and encoder offsets of an arm, from a file written by ``identify`` or ``deploy --check``."""
 
 import dataclasses
 import math
@@ -14,10 +14,10 @@ from mjx_nero.errors import UserError
 
 
 def read(path: pathlib.Path, metadata: Mapping[str, Any]) -> tuple[float, list[float]]:
-    """The delay [s], and the offset of each joint [rad or m]; 0 for those that the file does not name.
+    """Reads the delay [s], and the offset of each joint [rad or m], which is 0 if the file does not name the joint.
 
     Raises:
-        UserError: there is no such file, or it is of another robot, or no such file.
+        UserError: the file does not exist, is invalid, or is for another robot.
     """
     found = files.read_yaml(path)
     try:
@@ -25,12 +25,14 @@ def read(path: pathlib.Path, metadata: Mapping[str, Any]) -> tuple[float, list[f
         delay = _number(found["delay"])
         offsets = {str(name): _number(joint["offset"]) for name, joint in joints.items()}
     except (TypeError, KeyError, ValueError, AttributeError):
-        raise UserError(f"{path} is no file of identify or deploy --check: robot, delay, and joints with an offset") from None
+        raise UserError(
+            f"{path} is not a file of identify or deploy --check: it needs robot, delay, and joints with an offset"
+        ) from None
     names = metadata["joints"]["names"]
     if robot != metadata["robot"] or not set(offsets) <= set(names):
-        raise UserError(f"{path} is of {robot} with joints {', '.join(offsets)}: the policy's robot is {metadata['robot']}")
+        raise UserError(f"{path} is for {robot} with joints {', '.join(offsets)}, but the policy's robot is {metadata['robot']}")
     if not 0 <= delay <= 1 or any(abs(x) > 0.5 for x in offsets.values()):
-        raise UserError(f"{path}: a delay is 0 to 1 s, and offsets beyond 0.5 are for the arm's own calibration")
+        raise UserError(f"{path}: the delay must be 0 to 1 s, and offsets at most 0.5: calibrate an arm with larger ones")
     return delay, [offsets.get(name, 0.0) for name in names]
 
 
@@ -42,7 +44,7 @@ def _number(part: Any) -> float:
 
 
 class Offset:
-    """An arm whose encoders read ``offset`` beside where its joints are [rad or m]; see ``Arm``."""
+    """An arm whose encoders read the joint positions plus ``offset`` [rad or m]; see ``Arm``."""
 
     def __init__(self, arm: Arm, offset: np.ndarray):
         self._arm, self._offset, self.joints = arm, offset, arm.joints

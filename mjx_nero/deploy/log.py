@@ -1,10 +1,10 @@
-"""The log of a run: the table that ``identify`` reads, with the gripper, velocities, actions and times in columns of their own.
+"""The log of a run: the table that ``identify`` reads, with further columns for gripper, velocities, actions and times.
 
     time,target.joint1,...,position.joint1,...,velocity.joint1,...,inferring,inferred,limited,held,action.0,...
 
-A row is written when feedback was read, and one when a command was sent; all times are seconds since the log began.
-``target`` is what the drives were told. Rows are written as they come, so that a log ends where its program did, by a thread,
-as no arm may wait for a disk.
+Each feedback and each command makes a row; times are seconds since the log began. ``target`` is what was sent to the drives. Rows
+are written immediately, so that a log is complete up to the moment its program ends. A thread writes them, because the arm must
+never wait for a disk.
 """
 
 import pathlib
@@ -23,14 +23,14 @@ class Log:
     """Writes a run's table.
 
     Args:
-        joints: all, in the order of the arrays.
-        start: targets in force at the beginning [rad or m].
+        joints: names of all joints, in the order of the arrays.
+        start: targets at the beginning [rad or m].
         begun: time of the beginning [s].
-        actions: how many numbers an action has.
-        notes: lines for its head.
+        actions: size of an action.
+        notes: lines for the head of the file.
 
     Attributes:
-        error: why no more was written; empty: all was.
+        error: why the log ends early; empty if it does not.
 
     Raises:
         UserError: the file cannot be written.
@@ -54,15 +54,15 @@ class Log:
         self._row(begun, start, None, None)
 
     def read(self, feedback: Feedback) -> None:
-        """A row of what was read."""
-        if feedback.time > self._begun + self._last:  # what was told before is no news
+        """Adds a row for a feedback."""
+        if feedback.time > self._begun + self._last:  # ignores feedback that is already logged
             self._row(feedback.time, None, feedback.position, feedback.velocity)
 
     def sent(self, time: float, told: np.ndarray, command: Command, fault: Fault | None, notes: Sequence[float]) -> None:
-        """A row of what was sent.
+        """Adds a row for a command.
 
         Args:
-            notes: when inference began and ended [s], then the action.
+            notes: start and end of inference [s], then the action.
         """
         times = [f"{t - self._begun:.6f}" for t in notes[:2]] or ["", ""]
         action = [f"{x:.6g}" for x in notes[2:]] or [""] * self._actions
@@ -71,7 +71,7 @@ class Log:
     def _row(
         self, time: float, told: np.ndarray | None, at: np.ndarray | None, speed: np.ndarray | None, rest: Sequence[str] = ()
     ) -> None:
-        self._last = max(time - self._begun, self._last + 1e-6)  # a reader wants times that ascend
+        self._last = max(time - self._begun, self._last + 1e-6)  # readers need ascending times
         cells = [f"{self._last:.7f}"]
         for values in (told, at, speed):
             cells += [""] * self._n if values is None else [f"{x:.7g}" for x in values]
@@ -82,10 +82,10 @@ class Log:
             with self._file:
                 while row := self._rows.get():
                     self._file.write(row)
-        except OSError as error:  # a full disk is no reason to stop an arm
+        except OSError as error:  # a full disk must not stop the arm
             self.error = f"the log {self._file.name} ends early: {error.strerror or error}"
 
     def close(self) -> None:
-        """Ends the file."""
+        """Writes the remaining rows and closes the file."""
         self._rows.put("")
         self._thread.join()

@@ -1,4 +1,4 @@
-"""The loop: at the policy's rate, from feedback to a safe command; and what it has to say about its timing."""
+"""The control loop, which turns feedback into safe commands at the policy's rate, and its timing."""
 
 import collections
 import dataclasses
@@ -21,20 +21,20 @@ Stop = Callable[[], Fault | None]
 
 
 class Brain(Policy):
-    """A policy with its chain of actions, its drives' lag and its observations: from feedback to where the joints are to be."""
+    """A policy with its observations, its action chain and its drives' lag: turns feedback into intended joint positions."""
 
     def warm(self) -> None:
-        """Runs the network once, which takes longer than every time after."""
+        """Runs the network once, because the first time takes much longer."""
         seen = {name: np.zeros(shape, np.uint8) for name, shape in self.cameras.items()}
         self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]}, seen)
         gc.collect()
 
     def begin(self, observer: Observer, feedback: Feedback, delay: float | None = None) -> None:
-        """A new episode, from where the joints are.
+        """Starts a new episode from the joints' positions.
 
         Args:
-            delay: from a target's sending until it is in force [s]; what the policy sees of targets are those in force. None: it
-                is found as the arm moves.
+            delay: time from sending a target until it takes effect [s]; the policy observes the targets that are in effect. None:
+                it is measured while the arm moves.
         """
         self.reset()
         self._observer, self._lag = observer, Lag.of(self.metadata)
@@ -51,7 +51,7 @@ class Brain(Policy):
         """Computes where the joints must be next [rad or m].
 
         Raises:
-            ValueError: an object is not seen, a picture is old, or an observation or the action is not finite.
+            ValueError: an object is lost, a picture is old, or an observation or the action is not finite.
         """
         self._targets.append(self._executor.last)
         found = self.lateness(feedback.position, self._meant)
@@ -64,13 +64,13 @@ class Brain(Policy):
         return self._lag(self._executor(self.action, feedback.position), self._meant)
 
     def sent(self, position: np.ndarray) -> None:
-        """Takes the safety layer's command, from which the joints continue."""
+        """Stores the safety layer's command, from which the joints continue."""
         self._meant = position
 
 
 @dataclasses.dataclass
 class Timing:
-    """Durations of cycles [s]; ``missed``: the cycles that were late, and by how much."""
+    """Durations of cycles [s]; ``missed``: late cycles, and by how much they were late [s]."""
 
     jitter: list[float] = dataclasses.field(default_factory=list)
     read: list[float] = dataclasses.field(default_factory=list)
@@ -79,7 +79,7 @@ class Timing:
     missed: list[tuple[int, float]] = dataclasses.field(default_factory=list)
 
     def summary(self) -> dict[str, float]:
-        """Medians and 99th percentiles [ms], and counts."""
+        """Computes medians and 99th percentiles [ms], and counts."""
         out: dict[str, float] = {"cycles": len(self.jitter), "missed": len(self.missed)}
         for name in ("jitter", "read", "infer", "send"):
             values = getattr(self, name)
@@ -90,7 +90,7 @@ class Timing:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """The end of a run. ``fault``: why the arm holds; the end of its time counts as one."""
+    """The end of a run. ``fault``: why the arm holds; the end of the run's time also counts as a fault."""
 
     fault: Fault
     timing: Timing
@@ -107,16 +107,16 @@ def run(
     misses: int = 5,
     delay: float | None = None,
 ) -> Report:
-    """Runs a policy until its time is over, somebody stops it, or something fails. Then the arm holds.
+    """Runs a policy until its time is over, ``stop`` ends it, or something fails. Then the arm holds.
 
     Args:
-        seconds: at most.
-        stop: asked every cycle; a fault ends the run.
-        misses: so many late cycles in a row end it, too.
-        delay: of the arm's targets, see ``Brain.begin`` [s].
+        seconds: maximum time [s].
+        stop: called every cycle; a returned fault ends the run.
+        misses: number of late cycles in a row that also ends the run.
+        delay: delay of the arm's targets [s], see ``Brain.begin``.
     """
     dt = float(brain.metadata["control_dt"])
-    gc.disable()  # a collection takes longer than the jitter that is allowed
+    gc.disable()  # a collection takes longer than the allowed jitter
     brain.begin(observer, arm.read(), delay)
     timing, limited, late, k = Timing(), dict[str, int](), 0, 0
     begun = clock.now()
@@ -134,7 +134,7 @@ def run(
             late = late + 1 if over > 0 else 0
             if over > 0:
                 timing.missed.append((k - 1, over))
-                k += int(over / dt)  # what is past is past
+                k += int(over / dt)  # skip the cycles that were missed
             if late >= misses:
                 arm.hold(Fault("deadline", f"{late} cycles in a row were late"))
     finally:
@@ -143,7 +143,7 @@ def run(
 
 
 def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing) -> tuple[str, ...]:
-    """One step; which limits acted."""
+    """Makes one control step; returns the limits that were reached."""
     started = clock.now()
     feedback = arm.read()
     inferring = clock.now()
@@ -163,15 +163,15 @@ def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing)
 
 
 def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop, share: float = 0.2, patience: float = 2.0) -> Fault | None:
-    """Moves an arm home in a straight line of its joints, slowly.
+    """Moves an arm home slowly, in a straight line in joint space.
 
     Args:
         limits: ``safety.Limits`` of the arm.
-        share: of the joints' speeds, at most.
-        patience: how long it may make no way [s].
+        share: maximum share of the joints' speeds.
+        patience: maximum time without progress [s].
 
     Returns:
-        why it stopped short; None: it is there.
+        why it stopped early; None: the arm is at home.
     """
     at, home, dt = arm.read().position, limits.home, limits.dt
     begun, moved = clock.now(), clock.now()
@@ -191,8 +191,6 @@ def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop, share: float = 
         if np.max(np.abs(there - at)) > 1e-5:
             moved = clock.now()
         if clock.now() - moved > patience:
-            return Fault(
-                "fence", "there is something in the straight way home: move the arm by hand, or give another --workspace"
-            )
+            return Fault("fence", "the straight way home is blocked: move the arm by hand, or pass another --workspace")
         at = there
     return arm.fault

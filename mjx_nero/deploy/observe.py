@@ -1,4 +1,4 @@
-"""Observations by name: the terms of ``mdp.observations`` that an arm can give, from its feedback and from where objects are."""
+"""Computes the terms of ``mdp.observations`` that are available on an arm, from its feedback and the objects' positions."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ Pictures = Callable[[Feedback, float], Mapping[str, np.ndarray]]
 
 
 def no_pictures(feedback: Feedback, now: float) -> Mapping[str, np.ndarray]:
-    """The pictures of a policy that looks at none."""
+    """Returns the pictures for a policy without cameras: none."""
     return {}
 
 
@@ -24,11 +24,11 @@ class Seen:
     """The quantities that terms read at one step.
 
     Attributes:
-        position, velocity, home, targets: of the joints [rad or m].
-        action: the last one.
-        ee, ee_quat: of the end effector in the robot's root frame [m], wxyz.
-        goal, goal_quat: what is commanded, likewise.
-        objects: by name, likewise.
+        position, velocity, home, targets: of the joints [rad or m; rad/s or m/s].
+        action: the last action.
+        ee, ee_quat: pose of the end effector in the robot's root frame [m], wxyz.
+        goal, goal_quat: the commanded pose in the same frame.
+        objects: poses of the objects by name, in the same frame.
     """
 
     position: np.ndarray
@@ -50,7 +50,7 @@ def _ways(seen: Seen, objects: list[str], limit: float) -> np.ndarray:
 
 
 def rotation_vector(quat: np.ndarray) -> np.ndarray:
-    """Axis times angle of a turn (wxyz), the short way [rad]."""
+    """Converts a rotation (wxyz) to axis times angle, at most half a turn [rad]."""
     quat = -quat if quat[0] < 0 else quat
     sine = float(np.linalg.norm(quat[1:]))
     return quat[1:] * (2 * np.arctan2(sine, quat[0]) / sine if sine > 1e-6 else 2.0)
@@ -61,7 +61,7 @@ def _turn(seen: Seen) -> np.ndarray:
 
 
 def _object_turn(seen: Seen, fold: int = 1, object: str = "cube") -> np.ndarray:
-    """The shortest turn of an object, which looks the same ``fold`` times in a full turn about z, to the goal's orientation."""
+    """Computes the shortest rotation of an object to the goal; the object has a ``fold``-fold symmetry about z."""
     halves = np.pi * np.arange(fold) / fold
     turns = [np.array([np.cos(h), 0.0, 0.0, np.sin(h)]) for h in halves]
     back = seen.objects[object].quaternion * [1, -1, -1, -1]
@@ -69,7 +69,7 @@ def _object_turn(seen: Seen, fold: int = 1, object: str = "cube") -> np.ndarray:
     return min(ways, key=lambda way: float(np.linalg.norm(way)))
 
 
-# What ``mdp.observations`` calls them -> of a step, with the term's parameters.
+# Name of a term in ``mdp.observations`` -> function of a step and the term's parameters.
 TERMS: dict[str, Callable[..., np.ndarray]] = {
     "joint_pos": lambda seen: seen.position,
     "joint_pos_rel": lambda seen: seen.position - seen.home,
@@ -95,19 +95,20 @@ TERMS: dict[str, Callable[..., np.ndarray]] = {
 
 
 class Observer:
-    """A policy's observations.
+    """Computes a policy's observations.
 
     Args:
-        metadata: of the policy.
-        goal: position in the robot's root frame [m], and perhaps orientation (wxyz); none: the middle of the task's region.
-        places: where objects are.
-        pictures: of the policy's cameras, by name, at some feedback and time [s].
+        metadata: metadata of the policy.
+        goal: position in the robot's root frame [m], optionally followed by an orientation (wxyz); None: the middle of the task's
+            region.
+        places: source of object positions.
+        pictures: source of the pictures of the policy's cameras, by name, for a feedback and a time [s].
 
     Attributes:
-        objects: names of those that the policy looks at.
+        objects: names of the objects that the policy observes.
 
     Raises:
-        UserError: the policy reads what no arm can give, or commands what is not known.
+        UserError: the policy observes something that is not available on an arm, or the task has no goal.
     """
 
     def __init__(
@@ -123,13 +124,13 @@ class Observer:
         if any("term" not in term for term in self._terms):
             raise UserError("the file does not say which terms it observes: export the policy again")
         if unknown := [t["term"] for t in self._terms if t["term"] not in TERMS]:
-            raise UserError(f"the policy observes {', '.join(unknown)}, which an arm cannot give: known are {', '.join(TERMS)}")
+            raise UserError(f"the policy observes {', '.join(unknown)}, not available on an arm: train with {', '.join(TERMS)}")
         params = [term["params"] for term in self._terms]
         named = [name for p in params for name in (*([p["object"]] if "object" in p else []), *p.get("objects", ()))]
         self.objects = tuple(dict.fromkeys(named))
         if unknown := [name for name in self.objects if name not in metadata["objects"]]:
             raise UserError(
-                f"the policy looks at {', '.join(unknown)}, which changes from episode to episode: this is for one object"
+                f"the policy observes {', '.join(unknown)}, which differs between episodes: deploy works with fixed objects only"
             )
         self.goal, self.goal_quat = _goal(metadata["command"], goal)
 
@@ -137,12 +138,12 @@ class Observer:
         """Computes the observations, by the names of the policy's terms.
 
         Args:
-            targets: in force, along the joints [rad or m].
-            action: the last one.
-            now: [s].
+            targets: the joints' targets in effect [rad or m].
+            action: the last action.
+            now: the time [s].
 
         Raises:
-            ValueError: an object is not seen.
+            ValueError: an object is lost.
         """
         ee, ee_quat = self._body.ee(feedback.position)
         objects = {name: self._places.find(name, now) for name in self.objects}
@@ -152,7 +153,7 @@ class Observer:
 
 
 def _goal(command: Mapping[str, Any], given: list[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Position [m] and orientation (wxyz)."""
+    """Returns the goal's position [m] and orientation (wxyz)."""
     still = np.array([1.0, 0.0, 0.0, 0.0])
     if command.get("quat"):
         still = np.array(command["quat"], float)
@@ -162,10 +163,10 @@ def _goal(command: Mapping[str, Any], given: list[float] | None) -> tuple[np.nda
         still = product(turns[2], product(turns[1], turns[0]))
     if given is None:
         if not all(axis in command for axis in "xyz"):
-            raise UserError("the task has no region for goals: give one with --goal X,Y,Z")
+            raise UserError("the task has no region for goals: pass --goal X,Y,Z")
         return np.array([np.mean(command[axis]) for axis in "xyz"]), still
     if len(given) not in (3, 7):
-        raise UserError("--goal takes x,y,z [m], or these and an orientation w,x,y,z")
+        raise UserError("--goal takes x,y,z [m], optionally followed by an orientation w,x,y,z")
     turned = np.array(given[3:], float) if len(given) == 7 else still
     if not 0.99 < np.linalg.norm(turned) < 1.01:
         raise UserError("--goal takes an orientation of length 1 (w,x,y,z)")

@@ -1,12 +1,12 @@
-"""Pictures for a policy that sees: from cameras, videos or folders (OpenCV), cut and sized as those that it was trained with.
+"""Pictures for a policy with cameras, from real cameras, videos or folders (OpenCV), cropped and scaled as in training.
 
-``--cameras cameras.json``, by the policy's names of its cameras:
+``--cameras cameras.json`` has an entry for each of the policy's cameras, by its name:
 
     {"front": {"camera": 0, "fovy": 55}, "wrist": {"camera": "/dev/video2", "fovy": 80}}
 
-``camera`` is OpenCV's number or address of one, a video's file, or a folder of pictures, shown in the order of
-their names. ``fovy`` is the vertical field of view of its whole picture [deg]; the policy is shown the part of the middle that
-its training's camera would have seen.
+``camera`` is OpenCV's number or address of a camera, a video file, or a folder of pictures, which are shown in the order of their
+names. ``fovy`` is the vertical field of view of the whole picture [deg]. The policy sees the central part that its camera saw in
+training.
 """
 
 import json
@@ -23,26 +23,27 @@ from mjx_nero.deploy.arm import Feedback
 from mjx_nero.deploy.places import Lost
 from mjx_nero.errors import UserError
 
-FRESH = 0.1  # [s] a picture may be old, as feedback may
-_FIRST = 5.0  # [s] for the first one
+FRESH = 0.1  # maximum age of a picture [s], as for feedback
+_FIRST = 5.0  # time limit for the first picture [s]
 Source = tuple[Callable[[], "np.ndarray | None"], Callable[[], None]]
 
 
 class Unseen(Lost):
-    """A camera gives no pictures any more."""
+    """A camera has stopped giving pictures."""
 
     kind = "picture"
 
 
 def opened(source: int | str, period: float = 0.0) -> Source:
-    """The next picture of a source, blue, green and red [h, w, 3] (None: none comes), and what ends it.
+    """Opens a source; returns a function that gets its next picture [h, w, 3] (blue, green, red; None: no picture), and one that
+    closes it.
 
     Args:
         source: OpenCV's number or address of a camera, or the path of a video or of a folder of pictures.
-        period: from a file's picture to the next [s]; a camera has its own.
+        period: time between two pictures of a file [s]; a camera has its own.
 
     Raises:
-        UserError: there is no such thing.
+        UserError: the source does not exist.
     """
     import cv2  # of the extra ``camera``
 
@@ -57,7 +58,7 @@ def opened(source: int | str, period: float = 0.0) -> Source:
         return shown, lambda: None
     capture = cv2.VideoCapture(source)
     if not capture.isOpened():
-        raise UserError(f"no camera {source!r}")
+        raise UserError(f"cannot open camera {source!r}: give OpenCV's number or address of a camera, a video or a folder")
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     pause = period if path and path.is_file() else 0.0
 
@@ -70,24 +71,26 @@ def opened(source: int | str, period: float = 0.0) -> Source:
 
 
 class View:
-    """The part of a camera's picture that the policy's camera would have seen, in its size and colours.
+    """Crops a camera's picture to what the policy's camera sees, and converts its size and colours.
 
     Args:
-        told: of the camera, in the policy's metadata.
+        told: description of the camera in the policy's metadata.
         fovy: vertical field of view of the whole picture [deg].
 
     Raises:
-        UserError: it sees less than the policy's camera.
+        UserError: the camera sees less than the policy's camera.
     """
 
     def __init__(self, name: str, told: Mapping[str, Any], fovy: float):
         self._name, (self._height, self._width, _) = name, told["shape"]
         self._share = math.tan(math.radians(float(told["fovy_deg"])) / 2) / math.tan(math.radians(fovy) / 2)
         if self._share > 1.001:
-            raise UserError(f"the camera {name!r} sees {fovy:g} degrees from top to bottom, the policy {told['fovy_deg']:g}")
+            raise UserError(
+                f"the camera {name!r} has a fovy of {fovy:g} degrees, but the policy needs {told['fovy_deg']:g}: use a wider lens"
+            )
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
-        """[h, w, 3] blue, green, red -> [height, width, 3] red, green, blue.
+        """Converts a picture [h, w, 3] (blue, green, red) to [height, width, 3] (red, green, blue).
 
         Raises:
             UserError: the picture is too narrow.
@@ -98,7 +101,9 @@ class View:
         height = min(self._share, 1.0) * rows
         width = height * self._width / self._height
         if width > columns + 1:
-            raise UserError(f"the camera {self._name!r} gives {columns} x {rows} pixels: the policy sees further to the sides")
+            raise UserError(
+                f"the camera {self._name!r} gives {columns} x {rows} pixels, but the policy needs a wider one: change its mode"
+            )
         top, left = round((rows - height) / 2), max(round((columns - width) / 2), 0)
         part = picture[top : top + round(height), left : left + round(width)]
         small = cv2.resize(part, (self._width, self._height), interpolation=cv2.INTER_AREA)
@@ -106,7 +111,7 @@ class View:
 
 
 class _Film:
-    """The newest picture of a source, taken by a thread as they come."""
+    """The newest picture of a source, read by a thread."""
 
     def __init__(self, view: View, source: Source):
         self._view, (self._next, self._end) = view, source
@@ -140,10 +145,10 @@ class Cameras:
         dt: control step [s].
 
     Attributes:
-        ages: of the pictures that were shown [s].
+        ages: ages of the pictures that the policy was shown [s].
 
     Raises:
-        UserError: a camera is missing, gives nothing, or sees too little.
+        UserError: a camera is missing, gives no picture, or sees too little.
     """
 
     def __init__(self, own: Mapping[str, tuple[int | str, float]], told: Mapping[str, Any], dt: float):
@@ -163,14 +168,14 @@ class Cameras:
         for name, film in self._films.items():
             while film.newest is None:
                 if film.error or time.monotonic() > end:
-                    raise UserError(film.error or f"the camera {name!r} gives no picture")
+                    raise UserError(film.error or f"the camera {name!r} gives no picture: check that it works and is not in use")
                 time.sleep(0.01)
 
     def __call__(self, feedback: Feedback, now: float) -> dict[str, np.ndarray]:
         """See ``observe.Pictures``.
 
         Raises:
-            Unseen: the newest is older than ``FRESH``.
+            Unseen: the newest picture is older than ``FRESH``.
         """
         out: dict[str, np.ndarray] = {}
         for name, film in self._films.items():
@@ -182,16 +187,16 @@ class Cameras:
         return out
 
     def close(self) -> None:
-        """Lets the cameras go."""
+        """Closes the cameras."""
         for film in self._films.values():
             film.close()
 
 
 def read(path: pathlib.Path, told: Mapping[str, Any]) -> dict[str, tuple[int | str, float]]:
-    """Source and field of view [deg] of each of the policy's cameras, from a file.
+    """Reads source and field of view [deg] of each of the policy's cameras from a file.
 
     Raises:
-        UserError: there is no such file, or it says something else.
+        UserError: the file does not exist, or is invalid.
     """
     try:
         text = path.read_bytes()[:100_000]
@@ -203,7 +208,7 @@ def read(path: pathlib.Path, told: Mapping[str, Any]) -> dict[str, tuple[int | s
             raise ValueError
         return {name: _camera(found[name], told[name]) for name in told}
     except (TypeError, KeyError, ValueError, AttributeError, RecursionError):
-        wanted = 'is to say, as JSON, a "camera" and perhaps its "fovy" in degrees for each of'
+        wanted = 'must be JSON with a "camera", and optionally its "fovy" in degrees, for each of'
         raise UserError(f"{path} {wanted} {', '.join(told)}") from None
 
 
@@ -215,6 +220,6 @@ def _camera(found: Mapping[str, Any], told: Mapping[str, Any]) -> tuple[int | st
 
 
 def summary(ages: Sequence[float]) -> str:
-    """The age of pictures."""
+    """Summarizes the ages of pictures."""
     middle, late = (1e3 * float(np.percentile(ages, p)) for p in (50, 99))
     return f"{middle:.0f} ms old (median), {late:.0f} ms (99th percentile)"

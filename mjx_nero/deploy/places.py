@@ -1,4 +1,4 @@
-"""Places of objects, as something outside reports them: a constant, a file, or datagrams and lines of a tracker."""
+"""Sources of object poses from outside: a constant, a file, or a tracker's datagrams or lines."""
 
 import contextlib
 import dataclasses
@@ -13,8 +13,8 @@ import numpy as np
 
 from mjx_nero.errors import UserError
 
-LONGEST = 4096  # bytes of a message
-_FAR = 10.0  # [m] beyond which nothing is seen
+LONGEST = 4096  # maximum bytes of a message
+_FAR = 10.0  # maximum coordinate of an object [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,33 +26,33 @@ class Place:
 
 
 class Lost(ValueError):
-    """An object is not seen, or was too long ago. ``kind``: of the fault that this is."""
+    """The pose of an object is unknown or too old. ``kind``: kind of the fault."""
 
     kind = "object"
 
 
 class Places(Protocol):
-    """A source of places."""
+    """A source of object poses."""
 
     def find(self, name: str, now: float) -> Place:
-        """Finds where an object is.
+        """Returns the pose of an object.
 
         Args:
-            now: [s].
+            now: the time [s].
 
         Raises:
-            Lost: nobody knows.
+            Lost: it is unknown or too old.
         """
 
     def close(self) -> None:
-        """Lets sockets go."""
+        """Closes sockets."""
 
 
 def parse(text: bytes | str) -> list[tuple[str | None, Place]]:
-    """The messages in a text.
+    """Parses the messages in a text.
 
     Raises:
-        ValueError: it holds something else.
+        ValueError: the text holds something else.
     """
     if len(text) > LONGEST:
         raise ValueError(f"longer than {LONGEST} bytes")
@@ -65,7 +65,7 @@ def parse(text: bytes | str) -> list[tuple[str | None, Place]]:
 
 def _message(item: Any) -> tuple[str | None, Place]:
     if not isinstance(item, Mapping) or "position" not in item:
-        raise ValueError("no position in it")
+        raise ValueError("it has no position")
     name = item.get("object")
     if not (name is None or isinstance(name, str)):
         raise ValueError("object takes a name")
@@ -83,10 +83,10 @@ def _numbers(value: Any, count: int) -> np.ndarray:
 
 
 class Known:
-    """Places that were said, each with its time.
+    """Poses that were reported, each with its time.
 
     Args:
-        fresh: how long a place holds [s].
+        fresh: how long a pose is valid [s].
     """
 
     def __init__(self, fresh: float = math.inf):
@@ -94,7 +94,7 @@ class Known:
         self._places: dict[str | None, tuple[float, Place]] = {}
 
     def say(self, text: bytes | str, now: float) -> None:
-        """Takes a message; what is none is counted in ``refused``."""
+        """Stores the poses of a message; invalid messages are counted in ``refused``."""
         try:
             self._places.update({name: (now, place) for name, place in parse(text)})
         except ValueError:
@@ -110,14 +110,14 @@ class Known:
         return place
 
     def close(self) -> None:
-        """Does nothing: there is nothing to let go."""
+        """Does nothing: there is nothing to close."""
 
 
 class FromFile(Known):
-    """A file that another program replaces as it likes.
+    """Poses from a file that another program may replace at any time.
 
     Raises:
-        UserError: it cannot be read now, or holds no place.
+        UserError: it cannot be read now, or holds no pose.
     """
 
     def __init__(self, path: pathlib.Path):
@@ -128,7 +128,7 @@ class FromFile(Known):
         except OSError as error:
             raise UserError(f"cannot read {path}: {error.strerror or error}") from None
         except ValueError as error:
-            raise UserError(f"{path} holds no place of an object: {error}") from None
+            raise UserError(f"{path} does not hold the position of an object: {error}") from None
 
     def find(self, name: str, now: float) -> Place:
         """See ``Places``."""
@@ -140,10 +140,10 @@ class FromFile(Known):
 
 
 class FromSocket(Known):
-    """A tracker's datagrams, to ``udp://HOST:PORT``, or lines, from ``tcp://HOST:PORT``; the newest counts.
+    """Poses from a tracker's datagrams, sent to ``udp://HOST:PORT``, or lines, from ``tcp://HOST:PORT``. The newest counts.
 
     Raises:
-        UserError: the address is taken, or nobody is there.
+        UserError: the address is taken, or nothing answers.
     """
 
     def __init__(self, kind: str, host: str, port: int, fresh: float = 0.5):
@@ -156,7 +156,7 @@ class FromSocket(Known):
                 self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                 self._socket.bind((host, port))
         except OSError as error:
-            raise UserError(f"no place of an object from {kind}://{host}:{port}: {error.strerror or error}") from None
+            raise UserError(f"cannot get object positions from {kind}://{host}:{port}: {error.strerror or error}") from None
         self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
 
@@ -167,9 +167,9 @@ class FromSocket(Known):
         return super().find(name, now)
 
     def _news(self) -> list[bytes]:
-        """Returns the texts that have arrived since, oldest first."""
+        """Returns the texts that have arrived since the last call, oldest first."""
         found: list[bytes] = []
-        for _ in range(1000):  # of a sender that never stops, so much a step
+        for _ in range(1000):  # limits the work per step if a sender never stops
             try:
                 chunk = self._socket.recv(LONGEST + 1)
             except OSError:
@@ -188,16 +188,16 @@ class FromSocket(Known):
 
 
 def of(text: str) -> Places:
-    """The source that a flag names: ``0.35,0.02,0.015``, a file's path, ``udp://HOST:PORT`` or ``tcp://HOST:PORT``.
+    """Opens the source that a flag names: ``0.35,0.02,0.015``, a file's path, ``udp://HOST:PORT`` or ``tcp://HOST:PORT``.
 
     Raises:
-        UserError: it is none of these.
+        UserError: it is none of these, or cannot be opened.
     """
     kind, separator, rest = text.partition("://")
     if separator:
         host, _, port = rest.rpartition(":")
         if kind not in ("udp", "tcp") or not host or not port.isdecimal() or not 0 <= int(port) < 65536:
-            raise UserError(f"an address is udp://HOST:PORT or tcp://HOST:PORT, got {text[:80]!r}")
+            raise UserError(f"an object's address takes udp://HOST:PORT or tcp://HOST:PORT, got {text[:80]!r}")
         return FromSocket(kind, host, int(port))
     return _constant(text) or FromFile(pathlib.Path(text))
 
@@ -210,7 +210,7 @@ def _constant(text: str) -> Known | None:
     known = Known()
     known.say(json.dumps({"position": numbers[:3], **({"quaternion": numbers[3:]} if len(numbers) > 3 else {})}), 0.0)
     if known.refused:
-        raise UserError(f"an object's place is x,y,z [m], or these and an orientation w,x,y,z, got {text[:80]!r}")
+        raise UserError(f"an object's place takes x,y,z [m], optionally with an orientation w,x,y,z, got {text[:80]!r}")
     return known
 
 
@@ -218,7 +218,7 @@ Sender = Callable[[str, np.ndarray, np.ndarray], None]
 
 
 def sender(host: str, port: int) -> Sender:
-    """Sends places as such datagrams: ``(name, position, quaternion)``."""
+    """Returns a function ``(name, position, quaternion)`` that sends a pose as a datagram for ``FromSocket``."""
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     out.setblocking(False)
 

@@ -1,4 +1,4 @@
-"""The arm as the policy's process sees it: behind a socket, in a process that outlives this one until the arm holds."""
+"""The arm as the policy's process sees it: behind a socket, in a separate process that lives until the arm holds."""
 
 import json
 import socket
@@ -14,15 +14,15 @@ from mjx_nero.deploy.safety import Command, Fault
 from mjx_nero.deploy.server import PACKET, Spec
 from mjx_nero.errors import UserError
 
-_PATIENCE = 10.0  # [s] for an answer; a bus gives up long before
+_PATIENCE = 10.0  # time limit for an answer [s]; a bus fails long before
 
 
 class Remote:
-    """Starts the arm's process; see ``Guarded``. Other work can be done until ``ready`` is called.
+    """Starts the arm's process; see ``Guarded``. Other work can be done before ``ready`` is called.
 
     Attributes:
-        fault, sent: as of the last answer.
-        pid: of the process.
+        fault, sent: see ``Guarded``, as of the last answer.
+        pid: id of the process.
     """
 
     def __init__(self, spec: Spec):
@@ -41,7 +41,7 @@ class Remote:
         """Waits until the arm answers.
 
         Raises:
-            UserError: the arm cannot be had.
+            UserError: the arm cannot be used.
         """
         self._hear()
 
@@ -49,10 +49,10 @@ class Remote:
         """See ``Guard.start``.
 
         Args:
-            actions: how many numbers an action has, for the log.
+            actions: size of an action, for the log.
 
         Raises:
-            UserError: it is far from home, or at fault already.
+            UserError: the arm is far from home, or already at fault.
         """
         return _feedback(self._ask({"do": "start", "anywhere": anywhere, "actions": actions}))
 
@@ -71,7 +71,7 @@ class Remote:
         self._ask({"do": "hold", "fault": [fault.kind, fault.text]})
 
     def close(self) -> None:
-        """Lets go: the arm brakes, holds, and its process ends."""
+        """Closes the connection: the arm brakes and holds, and its process ends."""
         self._channel.close()
         self._process.wait(_PATIENCE)
 

@@ -1,9 +1,9 @@
-"""The layer between policy and driver: whatever comes in, what goes out is within every limit, and every fault ends in holding.
+"""The safety layer between policy and driver. Whatever the policy sends, every command is within all limits, and every fault ends
+in holding.
 
-A command is a position and the velocity with which it goes on. The layer keeps one promise from step to step: from every
-command the arm can brake, within its acceleration, to a rest that has been looked at already; all poses on that way are within
-the joints' ranges and inside the fence. A target that would break the promise is bent to the nearest that does not, or the arm
-brakes.
+A command is a position and the velocity there. The layer maintains one invariant: from every command the arm can brake to rest
+within its acceleration limit, through poses that were checked to be within the joint limits and inside the fence. A target that
+would violate the invariant is bent to the nearest one that does not; otherwise the arm brakes.
 """
 
 import collections
@@ -19,26 +19,26 @@ from mjx_nero.deploy.fence import Fence
 from mjx_nero.errors import UserError
 
 _EPS = 1e-9
-_SLOW = 0.05  # of a joint's speed: hardly a motion
-_BENDS = 4  # tries to bend a target along the fence
+_SLOW = 0.05  # share of a joint's speed that hardly counts as motion
+_BENDS = 4  # maximum tries to bend a target along the fence
 
 
 @dataclasses.dataclass(frozen=True)
 class SafetyCfg:
-    """Limits beyond those of the joints.
+    """Limits besides those of the joints.
 
     Attributes:
-        share: of the joints' speeds.
-        spin_up: from rest to full speed [s]: speed over acceleration.
-        start: how far from home an arm's joint may be where a policy begins [rad or m].
-        stale: feedback older than this is a fault [s].
-        outside: how far beyond its range a joint may be read [rad or m].
-        behind, behind_s: a joint that is so far from its command [rad or m] for so long [s] is stalled.
-        load, load_s: a joint of the arm that hardly moves while its drive gives such a share of its torque, for so long [s], is
-            blocked.
-        temperature: of a drive, at most [degrees C].
-        misses: so many deadlines in a row, missed, are a fault.
-        silence: without a target for so long, the arm holds [s].
+        share: share of the joints' speed limits.
+        spin_up: time from rest to full speed [s]; sets the acceleration limit.
+        start: maximum distance of an arm's joint from home when a policy begins [rad or m].
+        stale: maximum age of feedback [s].
+        outside: maximum reading beyond a joint's range [rad or m].
+        behind, behind_s: a joint that is ``behind`` away from its command [rad or m] for ``behind_s`` [s] is stalled.
+        load, load_s: an arm's joint that hardly moves while its drive gives more than the share ``load`` of its torque for
+            ``load_s`` [s] is blocked.
+        temperature: maximum temperature of a drive [degrees C].
+        misses: number of missed deadlines in a row that is a fault.
+        silence: time without a target after which the arm holds [s].
     """
 
     share: float = 1.0
@@ -60,7 +60,7 @@ class Limits:
     """Limits of the joints, as arrays along ``names`` [rad or m].
 
     Attributes:
-        arm: which of them are the arm's, the others being the gripper's, which is there to press and to be blocked.
+        arm: which joints are the arm's. The others are the gripper's, which may press and be blocked.
     """
 
     names: tuple[str, ...]
@@ -85,13 +85,13 @@ class Limits:
         """Narrows the ranges to those of an arm.
 
         Raises:
-            UserError: home is outside.
+            UserError: home is outside these.
         """
         narrow = dataclasses.replace(self, lower=np.maximum(self.lower, lower), upper=np.minimum(self.upper, upper))
         for name, home, low, high in zip(self.names, self.home, narrow.lower, narrow.upper, strict=True):
             if not low - 1e-3 <= home <= high + 1e-3:
                 raise UserError(
-                    f"home of {name} is {home:.2f}, and the arm's own range is {low:.2f} to {high:.2f}: calibrate it again"
+                    f"home of {name} is {home:.2f}, but the arm's own range is {low:.2f} to {high:.2f}: calibrate it again"
                 )
         return dataclasses.replace(narrow, home=np.clip(self.home, narrow.lower, narrow.upper))
 
@@ -111,7 +111,7 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """A command: where the joints must be [rad or m], the velocity there [rad/s or m/s], and which limits acted."""
+    """A command: positions of the joints [rad or m], velocities there [rad/s or m/s], and the limits that were reached."""
 
     position: np.ndarray
     velocity: np.ndarray
@@ -119,13 +119,13 @@ class Command:
 
 
 class Safety:
-    """One arm's. ``begin`` it with the arm at rest; then ``check`` every feedback, and ``step`` every target.
+    """The safety layer of one arm. Call ``begin`` with the arm at rest, then ``check`` every feedback and ``step`` every target.
 
     Attributes:
         position, velocity: of the last command.
-        fault: the first one; from then on every command brakes, and then holds.
-        counts: how often each limit acted.
-        blocked_by: which of the fence's constraints bent a target last.
+        fault: the first fault; after it every command brakes, and then holds.
+        counts: how often each limit was reached.
+        blocked_by: the fence's constraint that last bent a target.
     """
 
     def __init__(self, limits: Limits, fence: Fence, cfg: SafetyCfg):
@@ -138,38 +138,38 @@ class Safety:
         self.blocked_by = ""
         self._seen: Feedback | None = None
         self._since = {what: _Since(len(self.position)) for what in ("behind", "load")}
-        self._passed = self.position  # where joints were last seen to move, or to need little torque
-        self._pressing = np.zeros(len(self.position), bool)  # which joints push at something, and hold where they are
-        self._met = self.position  # where they were read then
+        self._passed = self.position  # positions at which joints last moved, or needed little torque
+        self._pressing = np.zeros(len(self.position), bool)  # joints that push against something, and hold their position
+        self._met = self.position  # their readings at that moment
         self._clear: np.ndarray | None = None  # clearances at the last command
 
     def begin(self, feedback: Feedback, now: float, anywhere: bool = False) -> None:
         """Takes over an arm at rest.
 
         Args:
-            anywhere: it may be far from home: it is to be moved there.
+            anywhere: the arm may be far from home, because it will be moved there.
 
         Raises:
-            UserError: it is far from home, or its feedback is at fault.
+            UserError: the arm is far from home, or its feedback is at fault.
         """
         at = np.asarray(feedback.position, float)
         limits = self.limits
         self._seen = None
         if fault := self._fault(feedback, now):
             raise UserError(f"the arm cannot start: {fault.text}")
-        self.position, self.velocity = at.copy(), np.zeros(len(at))  # beyond a range it may only go back
+        self.position, self.velocity = at.copy(), np.zeros(len(at))  # a joint beyond its range may only move back
         self._clear = None
         far = np.abs(at - limits.home)[limits.arm]
         if not anywhere and far.max() > self.cfg.start:
             name = np.array(limits.names)[limits.arm][int(far.argmax())]
             raise UserError(
-                f"the arm is far from home: {name} by {far.max():.2f}, and a policy begins within {self.cfg.start:.2f} "
-                "[rad or m]: move it there slowly with --go-home"
+                f"the arm is far from home: {name} by {far.max():.2f} [rad or m], a policy begins within {self.cfg.start:.2f}: "
+                "move it home slowly with --go-home"
             )
         self._seen = feedback
 
     def check(self, feedback: Feedback, now: float) -> Fault | None:
-        """Looks at a feedback; a fault makes the arm hold, for good."""
+        """Checks a feedback. A fault makes the arm hold for good."""
         if self.fault is None and (fault := self._fault(feedback, now)):
             self.hold(fault)
             self._met = np.asarray(feedback.position, float)
@@ -182,12 +182,12 @@ class Safety:
         self.fault = self.fault or fault
 
     def lost(self, fault: Fault) -> None:
-        """The last command did not arrive: the drives are at the one before, and hold."""
+        """Handles a command that did not arrive: the drives still hold the one before."""
         self.hold(fault)
         self.position, self.velocity, self._clear = self._before, np.zeros_like(self._before), None
 
     def step(self, target: np.ndarray) -> Command:
-        """The next command towards a target [rad or m], or, after a fault, to rest."""
+        """Computes the next command towards a target [rad or m] or, after a fault, to rest."""
         target = np.asarray(target, float)
         if self.fault is None and (target.shape != self.position.shape or not np.all(np.isfinite(target))):
             self.hold(Fault("nan", "the policy's targets are not finite"))
@@ -195,13 +195,13 @@ class Safety:
             return self._move(target)
         if not np.any(self._pressing):
             return self._brake(())
-        back = np.where(self._pressing, self._met - self.position, 0.0)  # a drive that goes on to press burns
+        back = np.where(self._pressing, self._met - self.position, 0.0)  # a drive that keeps pressing overheats
         way = _stoppable(np.abs(back), self.limits.acceleration * self.limits.dt**2)
         return self._move(self.position + np.sign(back) * way)
 
     @property
     def at_rest(self) -> bool:
-        """True if the last command stands still."""
+        """Whether the last command has zero velocity."""
         return not np.any(self.velocity)
 
     def _move(self, target: np.ndarray) -> Command:
@@ -228,7 +228,7 @@ class Safety:
         return self._brake(acted)
 
     def _reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities of the next step: within acceleration and speed, and such that the arm can brake before its ranges."""
+        """Bounds the next velocity by acceleration and speed, and such that the arm can brake within its ranges."""
         limits = self.limits
         change, dt = limits.acceleration * limits.dt, limits.dt
         low = np.maximum(self.velocity - change, -limits.speed)
@@ -238,12 +238,12 @@ class Safety:
         return np.minimum(np.maximum(low, -down), calm), np.maximum(np.minimum(high, up), calm)
 
     def _braked(self, velocity: np.ndarray, steps: Any = 1) -> np.ndarray:
-        """A velocity after some steps of braking."""
+        """Computes a velocity after some steps of braking."""
         change = self.limits.acceleration * self.limits.dt
         return np.sign(velocity) * np.maximum(np.abs(velocity) - steps * change, 0.0)
 
     def _poses(self, velocity: np.ndarray) -> np.ndarray:
-        """[k, n]: the next command, and all on the way to rest from there."""
+        """Computes the next command's pose, and all poses until rest from there [k, n]."""
         change = self.limits.acceleration * self.limits.dt
         count = math.ceil(float(np.max(np.abs(velocity) / change)) - 1e-6)
         path = self._braked(velocity, np.arange(max(count, 0) + 1)[:, None])
@@ -262,7 +262,7 @@ class Safety:
         return Command(self.position.copy(), self.velocity.copy(), acted)
 
     def _fault(self, feedback: Feedback, now: float) -> Fault | None:
-        """Says what is wrong with a feedback, if anything."""
+        """Returns the fault of a feedback; None if there is none."""
         limits, cfg, at = self.limits, self.cfg, np.asarray(feedback.position, float)
         speeds = np.asarray(feedback.velocity, float)
         if at.shape != limits.home.shape or not (np.all(np.isfinite(at)) and np.all(np.isfinite(speeds))):
@@ -271,12 +271,12 @@ class Safety:
             return Fault("stale", f"the arm's feedback is {1e3 * (now - feedback.time):.0f} ms old")
         beyond = np.maximum(limits.lower - at, at - limits.upper)
         if beyond.max() > cfg.outside:
-            return Fault("range", f"{self._name(beyond)} is read {beyond.max():.2f} beyond its range [rad or m]")
+            return Fault("range", f"the reading of {self._name(beyond)} is {beyond.max():.2f} [rad or m] beyond its range")
         if self._seen is not None:
             passed = max(feedback.time - self._seen.time, limits.dt)
             leap = np.abs(at - self._seen.position) - 4 * limits.speed / cfg.share * passed - 0.02
             if leap.max() > 0:
-                return Fault("jump", f"{self._name(leap)} is read where it cannot have got to")
+                return Fault("jump", f"the reading of {self._name(leap)} jumped farther than it can move")
         if feedback.temperature is not None and not np.max(feedback.temperature) <= cfg.temperature:
             return Fault("temperature", f"{self._name(feedback.temperature)} has {np.max(feedback.temperature):.0f} degrees C")
         if self._seen is not None:
@@ -291,11 +291,11 @@ class Safety:
             self._passed = np.where(pushing, self._passed, at)
             if np.any(lasting := self._since["load"].lasts(pushing, now, cfg.load_s)):
                 self._pressing = lasting
-                return Fault("load", f"{self._name(np.where(pushing, load, 0.0))} is blocked: its drive gives all it has")
+                return Fault("load", f"{self._name(np.where(pushing, load, 0.0))} is blocked: its drive is at its torque limit")
         return None
 
     def _name(self, values: np.ndarray) -> str:
-        """Names the worst joint; only among the arm's if those matter."""
+        """Returns the name of the joint with the largest value."""
         return self.limits.names[int(np.argmax(values))]
 
 
@@ -306,13 +306,13 @@ class _Since:
         self._begun = np.full(count, np.nan)
 
     def lasts(self, so: np.ndarray, now: float, seconds: float) -> np.ndarray:
-        """True for those for which it has held for ``seconds``."""
+        """Returns for which joints the condition ``so`` has held for ``seconds``."""
         self._begun = np.where(so, np.where(np.isnan(self._begun), now, self._begun), np.nan)
         return np.asarray(now - self._begun >= seconds)
 
 
 def _stoppable(room: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """The longest step after which steps that shorten by ``unit`` each still end within ``room`` [rad or m]."""
+    """Computes the longest step from which braking, by ``unit`` less per step, still ends within ``room`` [rad or m]."""
     room = np.maximum(room, 0.0)
     count = np.maximum(np.ceil((np.sqrt(1 + 8 * room / unit) - 1) / 2 - 1e-12), 1)
     return room / count + unit * (count - 1) / 2

@@ -1,9 +1,10 @@
-"""The arm's own process: it has the bus, the safety layer and the log, and holds the arm when the policy's process hangs or ends.
+"""The arm's own process, with bus, safety layer and log. It holds the arm if the policy's process hangs or ends.
 
     python -m mjx_nero.deploy.server SOCKET
 
-The policy's process (``remote.Remote``) starts it, with an open socket by its number. Messages are JSON, one a packet: a request
-``{"do": "read"}`` has one answer. From ``start`` on, silence of ``SafetyCfg.silence`` seconds is a fault; so is the socket's end.
+The policy's process (``remote.Remote``) starts it with the number of an open socket. Messages are JSON, one per packet; each
+request, such as ``{"do": "read"}``, has one answer. After ``start``, silence of ``SafetyCfg.silence`` seconds is a fault, and so
+is the end of the socket.
 """
 
 import dataclasses
@@ -28,7 +29,7 @@ from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Fault, SafetyCfg
 from mjx_nero.errors import UserError
 
-PACKET = 1 << 17  # bytes of a message, at most
+PACKET = 1 << 17  # maximum bytes of a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,13 +37,13 @@ class Spec:
     """Everything that the arm's process must know, as plain values.
 
     Attributes:
-        kind, options: of the driver, see ``drivers.make``.
-        metadata: of the policy.
+        kind, options: driver and its options, see ``drivers.make``.
+        metadata: metadata of the policy.
         safety, fence: fields of ``SafetyCfg`` and ``FenceCfg``.
-        log: file of the log; empty: none.
-        dry: nothing is sent.
-        offsets: of the encoders, along the joints [rad or m]; none: all zero.
-        notes: lines for the log's head.
+        log: file of the log; empty: no log.
+        dry: send nothing to the arm.
+        offsets: encoder offsets of the joints [rad or m]; empty: all zero.
+        notes: lines for the head of the log.
     """
 
     kind: str
@@ -60,7 +61,7 @@ class Server:
     """Answers requests about one arm.
 
     Raises:
-        UserError, ArmError: the arm cannot be had.
+        UserError, ArmError: the arm cannot be used.
     """
 
     def __init__(self, spec: Spec):
@@ -93,7 +94,7 @@ class Server:
 
     def _start(self, request: Mapping[str, Any]) -> dict[str, Any]:
         feedback = self.guard.start(bool(request["anywhere"]))
-        if not self.running:  # what refuses to start gets no torque
+        if not self.running:  # an arm that cannot start gets no torque
             self._arm.engage()
             feedback = self.guard.start(bool(request["anywhere"]))
         if self.spec.log and self.guard.log is None:
@@ -113,12 +114,12 @@ class Server:
         return {}
 
     def watch(self) -> float:
-        """Does what is due; returns how long nothing else will be [s]."""
+        """Does what is due; returns the time until the next call is needed [s]."""
         if not self.running:
             return 1.0
         now, guard = self.clock.now(), self.guard
         if guard.fault is None and now - self.heard > self.cfg.silence:
-            guard.hold(Fault("silence", f"the policy said nothing for {1e3 * (now - self.heard):.0f} ms"))
+            guard.hold(Fault("silence", f"the policy sent nothing for {1e3 * (now - self.heard):.0f} ms"))
         if guard.fault is None:
             return max(self.heard + self.cfg.silence - now, 0.0) + 1e-3
         if now - self.heard > self.dt and not guard.safety.at_rest:
@@ -128,13 +129,13 @@ class Server:
 
 
 def plain(feedback: Feedback) -> dict[str, Any]:
-    """A feedback as JSON has it."""
+    """Converts a feedback to plain values for JSON."""
     values = dataclasses.asdict(feedback)
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def serve(channel: socket.socket) -> None:
-    """Answers until the other side is gone; then brakes, holds and leaves."""
+    """Answers until the other side closes the connection; then brakes, holds and ends."""
     spec = Spec(**json.loads(channel.recv(PACKET)))
     try:
         server = Server(spec)
@@ -160,8 +161,8 @@ def serve(channel: socket.socket) -> None:
 
 
 def main() -> None:
-    """The process."""
-    for number in (signal.SIGINT, signal.SIGHUP):  # they are for the policy's process, which then says so here
+    """Runs the process."""
+    for number in (signal.SIGINT, signal.SIGHUP):  # handled by the policy's process, which then tells this one
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with urgent():

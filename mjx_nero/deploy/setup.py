@@ -1,4 +1,4 @@
-"""Builds the safety layer of an arm from the metadata of an exported policy."""
+"""Makes the safety layer of an arm from the metadata of an exported policy."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,43 +14,43 @@ from mjx_nero.errors import UserError
 
 Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
-_FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: more is a mistake, or somebody's trick
+_FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: larger values are a mistake or an attack
 NEEDED = ("joints", "gripper", "body", "command", "objects")
 
 
 def check(metadata: Mapping[str, Any]) -> None:
-    """Checks that a file says all that an arm needs.
+    """Checks that a policy's metadata have everything that an arm needs.
 
     Raises:
-        UserError: an older version exported it, or its limits are no arm's.
+        UserError: an older version exported it, or its limits are implausible.
     """
     if missing := [name for name in NEEDED if name not in metadata]:
-        raise UserError(f"the file does not say {', '.join(missing)}: export the policy again with this version")
+        raise UserError(f"the policy file lacks {', '.join(missing)}: export the policy again with this version")
     own = Joints.of(metadata)
     right = (-_FAR <= own.lower) & (own.lower <= own.home) & (own.home <= own.upper) & (own.upper <= _FAR) & (own.speed <= _FAST)
     if not right.all() or own.dt > _SLOW:
         name = own.names[int(np.argmin(right))]
         raise UserError(
-            f"the file's limits of {name} are no arm's: home within its range, this within {_FAR:g} rad or m, a speed of at most "
-            f"{_FAST:g} rad/s or m/s, and a target at least every {_SLOW:g} s"
+            f"the policy file's limits of {name} are implausible: home must be within its range, that within {_FAR:g} rad or m, "
+            f"the speed at most {_FAST:g} rad/s or m/s, and the control step at most {_SLOW:g} s"
         )
 
 
 def body_of(metadata: Mapping[str, Any]) -> Body:
-    """The robot's links."""
+    """Makes the robot's links."""
     return Body(metadata["body"], metadata["joints"]["names"], metadata["base"]["position"])
 
 
 def safety_of(
     metadata: Mapping[str, Any], cfg: SafetyCfg = USUAL, fence: FenceCfg = USUAL_FENCE, ranges: Ranges | None = None
 ) -> Safety:
-    """The layer with the limits of the policy's robot, and, where no box is given, the room that its task needs.
+    """Makes the safety layer with the limits of the policy's robot and, if no box is given, a box for its task.
 
     Args:
-        ranges: of the arm, where it has its own; see ``Arm.ranges``.
+        ranges: the arm's own ranges, see ``Arm.ranges``; None: the model's.
 
     Raises:
-        UserError: these leave home out.
+        UserError: home is outside these ranges.
     """
     limits, body = Limits.of(metadata, cfg), body_of(metadata)
     if ranges is not None:
@@ -62,7 +62,7 @@ def safety_of(
 
 
 def room_for(metadata: Mapping[str, Any], body: Body, room: float) -> Box:
-    """The box about home and the regions of the robot and of the task, and some room on all sides [m]."""
+    """Returns a box around home and the regions of robot and task, with a margin ``room`` on all sides [m]."""
     low, high = body.bounds(body.shapes(np.array(metadata["joints"]["home"], float)))
     points = [low[0].min(axis=0), high[0].max(axis=0)]
     regions = [np.array(box, float) for box in metadata.get("regions", {}).values()]

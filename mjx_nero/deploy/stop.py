@@ -1,4 +1,4 @@
-"""Ways in which a person stops an arm: Ctrl-C, SIGTERM, a key, or a file that nobody touches any more."""
+"""Lets a person stop an arm: by Ctrl-C, SIGTERM, a key, or a file that is no longer touched."""
 
 import collections
 import contextlib
@@ -14,27 +14,27 @@ from mjx_nero.deploy.loop import Stop
 from mjx_nero.deploy.safety import Fault
 
 KEYS = b" q\x1b"  # space, q, escape
-typed: collections.deque[str] = collections.deque(maxlen=16)  # other keys, for who asks questions
-FRESH = 0.5  # [s] a dead man's file has to be younger
+typed: collections.deque[str] = collections.deque(maxlen=16)  # other keys, for code that asks questions
+FRESH = 0.5  # maximum age of a dead man's file [s]
 
 
 @contextlib.contextmanager
 def operator(alive: pathlib.Path | None = None) -> Iterator[Stop]:
-    """Asks, once a cycle, whether somebody wants the arm to hold.
+    """Yields a function that says whether someone wants the arm to hold, to be called every cycle.
 
     Args:
-        alive: a file that somebody has to touch every half second; None: there is none.
+        alive: a file that must be touched at least every half second; None: there is none.
     """
     caught: list[str] = []
     before = {n: signal.signal(n, lambda number, _: caught.append(signal.Signals(number).name)) for n in _SIGNALS}
 
     def asked() -> Fault | None:
         if caught:
-            return Fault("stop", f"{caught[0]} came")
+            return Fault("stop", f"{caught[0]} arrived")
         if key := _key():
             return Fault("stop", f"the key {key!r} was pressed")
-        if alive and not abs(_age(alive)) <= FRESH:  # one from the future would be fresh for long
-            return Fault("stop", f"nobody has touched {alive} for {FRESH:g} s")
+        if alive and not abs(_age(alive)) <= FRESH:  # abs: a time stamp in the future would stay fresh
+            return Fault("stop", f"{alive} was not touched for {FRESH:g} s")
         return None
 
     try:
@@ -56,7 +56,7 @@ def _age(path: pathlib.Path) -> float:
 
 
 def _key() -> str:
-    """A key that stops, if it was pressed."""
+    """Returns the pressed key that stops the arm; empty if none was."""
     if not sys.stdin or sys.stdin.closed or not sys.stdin.isatty():
         return ""
     while select.select([sys.stdin], [], [], 0)[0]:
@@ -70,7 +70,7 @@ def _key() -> str:
 
 @contextlib.contextmanager
 def _keys() -> Iterator[None]:
-    """Keys come at once, without Enter."""
+    """Makes the terminal deliver keys at once, without Enter."""
     if not sys.stdin or sys.stdin.closed or not sys.stdin.isatty():
         yield
         return

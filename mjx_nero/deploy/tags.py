@@ -1,14 +1,14 @@
-"""Places of objects by AprilTags that a camera sees (pupil-apriltags; OpenCV opens the camera).
+"""Object poses from AprilTags in a camera's pictures (pupil-apriltags; OpenCV opens the camera).
 
-``--object camera.json`` with a file that has a ``camera``:
+``--object camera.json`` uses it if the file has a ``camera``:
 
     {"camera": 0, "intrinsics": [600, 600, 320, 240], "position": [0.2, 0, 0.7], "quaternion": [0, 1, 0, 0], "size": 0.03,
      "tags": {"3": {"object": "cube", "position": [0, 0, 0.015]}}}
 
-``camera`` is OpenCV's number of it or an address, ``intrinsics`` fx, fy, cx, cy in pixels. ``position`` and ``quaternion`` (wxyz)
-place the camera in the robot's root frame, with x to the right of the picture, y down and z into it. ``size`` is the edge of a
-tag's black square [m], ``family`` tag36h11 if nothing is said. Each tag says which object it is on, and where the object's centre
-is and how it is turned in the tag's frame: x to the right, y down as printed, z into what it is stuck to.
+``camera`` is OpenCV's number or address of the camera, ``intrinsics`` are fx, fy, cx, cy in pixels. ``position`` and
+``quaternion`` (wxyz) are the camera's pose in the robot's root frame, with x to the right of the picture, y down and z into it.
+``size`` is the edge of a tag's black square [m]; ``family`` is tag36h11 by default. Each tag names the object that it is on, and
+the pose of the object's center in the tag's frame: x to the right and y down as printed, z into the object.
 """
 
 import contextlib
@@ -26,20 +26,21 @@ from mjx_nero.deploy.body import matrix, transform
 from mjx_nero.deploy.places import Known, Lost, Place
 from mjx_nero.errors import UserError
 
-Pictures = Callable[[], "np.ndarray | None"]  # the next one, grey [h, w]; None: none comes
-_SURE = 20.0  # of a detection: its margin
+Pictures = Callable[[], "np.ndarray | None"]  # returns the next picture, grey [h, w]; None: there is none
+_SURE = 20.0  # minimum decision margin of a detection
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A camera and the tags that it is to look for; poses as [4, 4].
+    """A camera and the tags to look for. Poses are [4, 4].
 
     Attributes:
-        source: OpenCV's number or address.
+        source: OpenCV's number or address of the camera.
         intrinsics: fx, fy, cx, cy [pixels].
-        pose: in the robot's root frame.
-        size: of a tag's black square [m].
-        tags: object and its pose in the tag's frame, by the tag's number.
+        pose: pose of the camera in the robot's root frame.
+        size: edge of a tag's black square [m].
+        family: family of the tags.
+        tags: number of a tag -> object, and its pose in the tag's frame.
     """
 
     source: int | str
@@ -51,10 +52,10 @@ class Camera:
 
 
 def read(path: pathlib.Path) -> Camera | None:
-    """A camera's file; None: the file is none such.
+    """Reads the file of a camera; None if the file does not describe one.
 
     Raises:
-        UserError: it has a ``camera`` and something else is wrong.
+        UserError: the file has a ``camera``, but something else is wrong.
     """
     try:
         found = json.loads(path.read_bytes()[:100_000])
@@ -71,7 +72,7 @@ def read(path: pathlib.Path) -> Camera | None:
         text = "needs camera, intrinsics of four numbers, position, quaternion, size and tags, each with an object"
         raise UserError(f"{path} {text} ({type(error).__name__}: {error})") from None
     if not (fx > 0 and fy > 0 and 0.001 < made.size < 1 and tags):
-        raise UserError(f"{path}: intrinsics and size are above zero, and there is a tag to look for")
+        raise UserError(f"{path}: fx, fy and size [m] must be above 0, size below 1, and tags must name at least one")
     return made
 
 
@@ -86,14 +87,14 @@ _USUAL = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
 
 
 class FromTags(Known):
-    """Objects by their tags, in pictures that a thread looks at as they come.
+    """Object poses from tags, which a thread finds in the pictures.
 
     Args:
-        pictures: None: the camera's.
-        fresh: how long a place holds [s].
+        pictures: source of pictures; None: the camera.
+        fresh: how long a pose is valid [s].
 
     Raises:
-        UserError: there is no such camera.
+        UserError: the camera does not exist.
     """
 
     def __init__(self, camera: Camera, pictures: Pictures | None = None, fresh: float = 0.5):
@@ -111,7 +112,7 @@ class FromTags(Known):
 
         capture = cv2.VideoCapture(self._camera.source)
         if not capture.isOpened():
-            raise UserError(f"no camera {self._camera.source!r}")
+            raise UserError(f"cannot open camera {self._camera.source!r}: give OpenCV's number or address of a camera")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._end = capture.release
 
@@ -139,14 +140,14 @@ class FromTags(Known):
         raise Lost(f"the camera does not see the tag of the {name}")
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Closes the camera."""
         self._over.set()
         self._thread.join(2.0)
         self._end()
 
 
 def places(detector: Any, camera: Camera, picture: np.ndarray) -> dict[str, Place]:
-    """Objects whose tags a picture [h, w] shows, by name; of several tags on one the surest counts."""
+    """Finds the objects whose tags a picture [h, w] shows, by name. If an object shows several tags, the surest counts."""
     shown = np.ascontiguousarray(picture, np.uint8)
     seen = detector.detect(shown, estimate_tag_pose=True, camera_params=camera.intrinsics, tag_size=camera.size)
     out: dict[str, Place] = {}
@@ -161,7 +162,7 @@ def places(detector: Any, camera: Camera, picture: np.ndarray) -> dict[str, Plac
 
 
 def quaternion(turn: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation [3, 3]: the eigenvector of its quadratic form (Bar-Itzhack 2000)."""
+    """Returns the quaternion (wxyz) of a rotation [3, 3]: the eigenvector of its quadratic form (Bar-Itzhack 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = turn
     form = np.array(
         [

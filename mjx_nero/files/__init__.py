@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and read with limits, for a stranger may have made them."""
+"""Safe file access: files are written whole or not at all, and read with limits, since they may come from an untrusted source."""
 
 import contextlib
 import fcntl
@@ -16,25 +16,25 @@ from lxml import etree
 
 from mjx_nero.errors import UserError
 
-TRIES = 5  # of a file whose folder is removed as it is written
-PART = ".part"  # in the name of a file that is not whole yet
-MAX_TAGS = 400_000  # of an XML file
+TRIES = 5  # attempts to write a file whose folder is removed meanwhile
+PART = ".part"  # in the name of a file that is still being written
+MAX_TAGS = 400_000  # elements and attributes in an XML file
 MAX_YAML = 200_000  # bytes
-MAX_NODES = 20_000  # of a YAML file, aliases written out
-MAX_DEPTH = 12  # of lists and entries within one another
+MAX_NODES = 20_000  # values in a YAML file, with aliases expanded
+MAX_DEPTH = 12  # levels of nesting in a YAML file
 MAX_JSON = 4_000_000  # bytes
 MAX_JSON_DEPTH = 30
 
 
 @contextlib.contextmanager
 def open_file(path: pathlib.Path) -> Iterator[tuple[BinaryIO, int]]:
-    """A regular file to read from, and its size in bytes.
+    """Opens a regular file for reading; yields it and its size in bytes.
 
     Raises:
-        UserError: there is none, or it cannot be read.
+        UserError: there is no such file, or it cannot be read.
     """
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # of a pipe, opening would wait for a writer
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # O_NONBLOCK: opening a pipe would wait for a writer
         try:
             status = os.fstat(handle)
             if not stat.S_ISREG(status.st_mode):
@@ -54,10 +54,10 @@ def open_file(path: pathlib.Path) -> Iterator[tuple[BinaryIO, int]]:
 
 
 def read_bytes(path: pathlib.Path, limit: int) -> bytes:
-    """The content of a regular file.
+    """Reads a regular file.
 
     Raises:
-        UserError: there is none, it cannot be read, or it is larger than ``limit`` bytes.
+        UserError: there is no such file, it cannot be read, or it is larger than ``limit`` bytes.
     """
     with open_file(path) as (file, size):
         content = file.read(limit + 1) if size <= limit else b""
@@ -68,10 +68,10 @@ def read_bytes(path: pathlib.Path, limit: int) -> bytes:
 
 
 def inside(folder: pathlib.Path, *names: str) -> pathlib.Path:
-    """A path below a folder that a stranger may have made: ``folder/name/name``, whether it is there or not.
+    """Returns the path ``folder/name/name`` inside an untrusted folder, whether it exists or not.
 
     Raises:
-        UserError: a link stands on the way, or what is there is neither a file nor a folder.
+        UserError: a part of the path is a link, or is neither a regular file nor a folder.
     """
     path = folder
     for name in names:
@@ -83,16 +83,16 @@ def inside(folder: pathlib.Path, *names: str) -> pathlib.Path:
         except (OSError, ValueError) as error:
             raise UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            what = "a link" if stat.S_ISLNK(mode) else "no file"
-            raise UserError(f"{path} is {what}, which is neither read nor written here: remove it, or copy {folder} without it")
+            what = "a link" if stat.S_ISLNK(mode) else "not a regular file"
+            raise UserError(f"{path} is {what} and will not be read or written: remove it, or copy {folder} without it")
     return path
 
 
 def read_json(path: pathlib.Path, limit: int = MAX_JSON) -> Any:
-    """The content of a JSON file: plain values, no key twice, finite numbers.
+    """Reads a JSON file of plain values with unique keys and finite numbers.
 
     Raises:
-        UserError: as ``read_bytes``; or it is no such JSON.
+        UserError: as in ``read_bytes``; or it is not such JSON.
     """
     content = read_bytes(path, limit)
     try:
@@ -103,10 +103,10 @@ def read_json(path: pathlib.Path, limit: int = MAX_JSON) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """JSON by the letter: no key twice, no numbers that are not finite.
+    """Parses strict JSON: keys are unique and numbers finite.
 
     Raises:
-        ValueError, RecursionError: it is none.
+        ValueError, RecursionError: the text is not strict JSON, or is nested too deeply.
     """
     found = json.loads(text, object_pairs_hook=_once, parse_constant=_refuse, parse_float=_finite, parse_int=_whole_number)
     level = [found]
@@ -121,12 +121,12 @@ def parse_json(text: str | bytes) -> Any:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) != len(pairs):
-        raise ValueError("a key stands twice")
+        raise ValueError("a key occurs twice")
     return out
 
 
 def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number that can be read")
 
 
 def _finite(text: str) -> float:
@@ -138,23 +138,23 @@ def _whole_number(text: str) -> int:
 
 
 def parse_xml(content: bytes, name: str) -> etree._Element:
-    """The root element. Neither entities nor other files are read. Prefixes that are not declared stay in the tags (``a:b``).
+    """Returns the root element. Reads neither entities nor other files. Undeclared prefixes stay in the tags (``a:b``).
 
     Raises:
-        UserError: malformed, or it has more elements and attributes than ``MAX_TAGS``, or it declares a document type, which no
-            model or mesh needs and entity bombs do.
+        UserError: the XML is malformed, has more than ``MAX_TAGS`` elements and attributes, or declares a document type, which
+            entity bombs need but models and meshes do not.
     """
-    tags = content.count(b"<") + content.count(b"=")  # libxml2 takes hundreds of bytes for each
+    tags = content.count(b"<") + content.count(b"=")  # libxml2 needs hundreds of bytes for each
     if tags > MAX_TAGS:
-        raise UserError(f"{name} has some {tags:,} elements and attributes: more than {MAX_TAGS:,} are not read")
+        raise UserError(f"{name} has about {tags:,} elements and attributes: more than {MAX_TAGS:,} are not read")
     parser = _parser()
     try:
         root = etree.fromstring(content, parser, base_url=name)
     except (etree.XMLSyntaxError, ValueError) as error:
-        log = parser.error_log  # the error's own may hold what other files had
+        log = parser.error_log  # the exception's own log may contain errors of other files
         if not log or any(entry.domain_name != "NAMESPACE" for entry in log):
             raise UserError(f"{name} is not well-formed XML: {error}") from None
-        root = etree.fromstring(content, _parser(recover=True), base_url=name)  # prefixes that are not declared, no more
+        root = etree.fromstring(content, _parser(recover=True), base_url=name)  # only prefixes are undeclared
     if root.getroottree().docinfo.internalDTD is not None:
         raise UserError(f"{name} declares a document type (<!DOCTYPE ...>): remove it, a robot description needs none")
     return root
@@ -165,19 +165,19 @@ def _parser(recover: bool = False) -> etree.XMLParser:
 
 
 def read_yaml(path: pathlib.Path, loader: type["YamlLoader"] | None = None) -> Any:
-    """The content of a YAML file as mappings, lists, strings, numbers, booleans and None; keys are strings, as written.
+    """Reads a YAML file as mappings, lists, strings, numbers, booleans and None; keys are strings, as written.
 
     Args:
-        loader: in place of ``YamlLoader``, one that knows more tags.
+        loader: a subclass of ``YamlLoader`` that knows more tags.
 
     Raises:
-        UserError: as ``read_bytes``; or it is not YAML, a key stands twice, or it is larger or deeper than ``MAX_NODES`` and
-            ``MAX_DEPTH`` say.
+        UserError: as in ``read_bytes``; or it is not YAML, a key occurs twice, or it has more than ``MAX_NODES`` values or
+            ``MAX_DEPTH`` levels.
     """
     content = read_bytes(path, MAX_YAML)
     try:
         return (loader or YamlLoader)(content).get_single_data()
-    # Constructors fail in their own ways.
+    # Constructors raise various exceptions.
     except (yaml.YAMLError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
@@ -186,12 +186,12 @@ def read_yaml(path: pathlib.Path, loader: type["YamlLoader"] | None = None) -> A
 
 
 class YamlLoader(yaml.SafeLoader):
-    """PyYAML's, with limits that hold while the file is read, and for plain values only."""
+    """PyYAML's loader for plain values only, with limits that already apply while the file is read."""
 
     def __init__(self, content: bytes):
         super().__init__(content)
         self._count = self._depth = 0
-        self._sizes: dict[int, int] = {}  # nodes in a node
+        self._sizes: dict[int, int] = {}  # number of nodes in each node, by its id
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         mark, alias = self.peek_event().start_mark, self.check_event(yaml.AliasEvent)
@@ -201,7 +201,7 @@ class YamlLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self._depth -= 1
         if alias and id(node) not in self._sizes:
-            raise yaml.MarkedYAMLError(problem="an alias within what it stands for", problem_mark=mark)
+            raise yaml.MarkedYAMLError(problem="an alias inside its own anchor", problem_mark=mark)
         self._count += self._sizes[id(node)] if alias else 1
         if self._count > MAX_NODES:
             raise yaml.MarkedYAMLError(problem=f"more than {MAX_NODES} values", problem_mark=mark)
@@ -212,13 +212,13 @@ class YamlLoader(yaml.SafeLoader):
         out: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.value in out:
-                problem = f"key {key.value!r} stands twice" if isinstance(key, yaml.ScalarNode) else "a key that is no name"
+                problem = f"key {key.value!r} occurs twice" if isinstance(key, yaml.ScalarNode) else "a key that is not a string"
                 raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
             out[key.value] = self.construct_object(value, deep=True)
         return out
 
     def integer(self, node: Any) -> int:
-        value = self.construct_yaml_int(node) if len(node.value) < 100 else 1 << 63  # sexagesimal ones take long
+        value = self.construct_yaml_int(node) if len(node.value) < 100 else 1 << 63  # long sexagesimal ones take a long time
         if abs(value) >= 1 << 63:
             raise yaml.MarkedYAMLError(problem="a whole number of more than 64 bits", problem_mark=node.start_mark)
         return value
@@ -233,10 +233,10 @@ class YamlLoader(yaml.SafeLoader):
         return value
 
     def refuse(self, node: Any) -> Any:
-        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag[:60]!r} is not read", problem_mark=node.start_mark)
+        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag[:60]!r} is not supported", problem_mark=node.start_mark)
 
 
-YamlLoader.yaml_implicit_resolvers = {  # a date is a string here
+YamlLoader.yaml_implicit_resolvers = {  # without dates, which stay strings
     first: [rule for rule in rules if not rule[0].endswith((":timestamp", ":merge", ":value"))]
     for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
@@ -255,7 +255,7 @@ YamlLoader.yaml_constructors = {
 
 
 def check_writable(path: pathlib.Path) -> None:
-    """Checks, before long work, that a file can be written at its end.
+    """Checks before long work that its result can be written to a file.
 
     Raises:
         UserError: it is a folder, or its folder does not exist or is not writable.
@@ -267,12 +267,12 @@ def check_writable(path: pathlib.Path) -> None:
 
 
 class _FolderRemoved(UserError):
-    """A folder went away while a file was written into it."""
+    """A folder was removed while a file was written into it."""
 
 
 @contextlib.contextmanager
 def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a path to write to; the file then appears whole or not at all, even if the power fails. Makes its folder.
+    """Yields a path to write to; the file then appears whole or not at all, even if the power fails. Creates its folder.
 
     Raises:
         UserError: it cannot be written.
@@ -280,12 +280,12 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     part = path.with_name(f".{path.stem}{PART}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.unlink(missing_ok=True)  # a link there would be written through
+        part.unlink(missing_ok=True)  # a link there would redirect the write
         yield part
         sync(part)
         part.replace(path)
         sync(path.parent)
-    except (OSError, ValueError) as error:  # ValueError: a kind of file that a library does not know
+    except (OSError, ValueError) as error:  # ValueError: the writing library does not know this file type
         if isinstance(error, UserError):
             raise
         kind = _FolderRemoved if isinstance(error, FileNotFoundError) else UserError
@@ -296,7 +296,7 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def write(path: pathlib.Path, data: bytes) -> None:
-    """Writes a file, whole or not at all; again where somebody removes its folder meanwhile.
+    """Writes a file, whole or not at all; tries again if its folder is removed meanwhile.
 
     Raises:
         UserError: it cannot be written.
@@ -312,7 +312,7 @@ def write(path: pathlib.Path, data: bytes) -> None:
 
 
 def own(path: pathlib.Path) -> None:
-    """Gives a file that has further names elsewhere (hard links) a copy to itself, before something is added to it in place.
+    """Replaces a file that has hard links elsewhere by its own copy, before something is appended to it in place.
 
     Raises:
         UserError: it cannot be copied.
@@ -325,7 +325,7 @@ def own(path: pathlib.Path) -> None:
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:
-    """Writes JSON that every reader takes: a number that is not finite becomes null, what JSON does not know its text.
+    """Writes JSON that every reader accepts: non-finite numbers become null, and objects that JSON does not know become strings.
 
     Raises:
         UserError: it cannot be written.
@@ -334,7 +334,7 @@ def write_json(path: pathlib.Path, value: Any) -> None:
 
 
 def finite(value: Any) -> Any:
-    """``value`` with None in place of every number that is not finite."""
+    """Returns ``value`` with every non-finite number replaced by None."""
     if isinstance(value, Mapping):
         return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -343,11 +343,11 @@ def finite(value: Any) -> Any:
 
 
 def lock(path: pathlib.Path) -> int:
-    """Opens a file that the system keeps locked until the handle is closed, or while this process lives.
+    """Opens and locks a file; returns its handle. The lock lasts until the handle is closed or this process ends.
 
     Raises:
-        UserError: another process holds it.
-        OSError: it cannot be made.
+        UserError: another process holds the lock.
+        OSError: the file cannot be created.
     """
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
@@ -357,14 +357,14 @@ def lock(path: pathlib.Path) -> int:
             owner = os.read(handle, 100).decode(errors="replace").strip()
             os.close(handle)
             raise UserError(
-                f"{path.parent} is in use by {owner or 'another process'}: wait for its end, or pass another --out"
+                f"{path.parent} is in use by {owner or 'another process'}: wait until it ends, or pass another --out"
             ) from None
         except OSError:
             return handle  # the file system has no locks
         with contextlib.suppress(FileNotFoundError):
             if os.fstat(handle).st_nlink > 1:  # a hard link to someone else's file
                 path.unlink()
-            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # otherwise its owner removed it just before we locked it
+            elif os.stat(path).st_ino == os.fstat(handle).st_ino:  # otherwise the owner removed it just before it was locked
                 os.truncate(handle, 0)
                 os.write(handle, f"process {os.getpid()} on {os.uname().nodename}\n".encode())
                 return handle
@@ -372,7 +372,7 @@ def lock(path: pathlib.Path) -> int:
 
 
 def sync(path: pathlib.Path) -> None:
-    """Waits until a file, or a folder's list of files, is on the disk."""
+    """Waits until a file, or a folder's list of files, is stored on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

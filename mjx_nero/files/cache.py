@@ -1,4 +1,4 @@
-"""Compiled code kept between runs, where this user and this machine let files be kept."""
+"""The cache of compiled code between runs, if the user's and the machine's settings permit one."""
 
 import contextlib
 import os
@@ -9,25 +9,27 @@ import zlib
 
 from mjx_nero.errors import UserError
 
-_LEAST_ADDRESSES = 2.5e9  # bytes: below, XLA cannot start its threads, and aborts
+_LEAST_ADDRESSES = 2.5e9  # bytes; with less address space XLA cannot start its threads and aborts
 
 
 def folder() -> pathlib.Path | None:
-    """The user's cache folder; without a home that can be written to, a temporary one of this user's; None: nowhere."""
+    """Returns the user's cache folder, or the user's temporary one if the home is not writable; None if neither is writable."""
     wanted = [os.environ.get("XDG_CACHE_HOME")]
-    with contextlib.suppress(RuntimeError):  # no HOME, and none that the system knows of
+    with contextlib.suppress(RuntimeError):  # neither HOME nor the system's user database names a home
         wanted.append(str(pathlib.Path.home() / ".cache"))
     for parent in filter(None, wanted):
         if _writable(path := pathlib.Path(parent) / "mjx_nero"):
             return path
     path = pathlib.Path(tempfile.gettempdir()) / f"mjx_nero-{os.getuid()}"
-    return path if _writable(path) and path.stat().st_uid == os.getuid() else None  # another user's may hold another's code
+    return (
+        path if _writable(path) and path.stat().st_uid == os.getuid() else None
+    )  # another user's folder may contain malicious code
 
 
 def heal(path: pathlib.Path) -> None:
-    """Removes entries that a killed process left half-written: JAX would warn of them at every start, and never replace them.
+    """Removes entries that a killed process left incomplete: JAX would warn about them at every start and never replace them.
 
-    Looks at what is newer than the last look.
+    Checks only entries that are newer than the last check.
     """
     looked = path / ".looked"
     with contextlib.suppress(OSError):
@@ -40,12 +42,12 @@ def heal(path: pathlib.Path) -> None:
 
 def check_addresses() -> None:
     """Raises:
-    UserError: this process may use too few addresses for JAX, which would abort without a word that helps.
+    UserError: the limit on this process's address space is too low for JAX, which would abort without a helpful message.
     """
     most, _ = resource.getrlimit(resource.RLIMIT_AS)
     if 0 <= most < _LEAST_ADDRESSES:
         raise UserError(
-            f"this process may use {most / 1e9:.1f} GB of addresses, and JAX needs {_LEAST_ADDRESSES / 1e9:g}: raise the limit "
+            f"this process may use {most / 1e9:.1f} GB of address space, JAX needs {_LEAST_ADDRESSES / 1e9:g}: raise the limit "
             "(ulimit -v unlimited)"
         )
 
@@ -60,7 +62,7 @@ def _writable(path: pathlib.Path) -> bool:
 
 
 def _whole(entry: bytes) -> bool:
-    """True unless the compressed data of an entry end too early. What JAX compresses with depends on what is installed."""
+    """Returns True unless an entry's compressed data ends too early. JAX compresses with zstandard if that is installed."""
     if entry[:4] == b"\x28\xb5\x2f\xfd":  # Zstandard
         with contextlib.suppress(ImportError):
             import zstandard

@@ -1,4 +1,4 @@
-"""Identifies a real arm's drives from a log of their targets and motions: what the drives move, and how they answer."""
+"""Identifies the drives of a real arm from a log of their targets and motions."""
 
 from mjx_nero.identify.fit import Fit, identify
 from mjx_nero.identify.log import Log

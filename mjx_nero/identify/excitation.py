@@ -1,4 +1,4 @@
-"""Targets that show all that is to be identified, and nothing that an arm should fear: sine sweeps about home."""
+"""Targets that excite all parameters to be identified without endangering the arm: sine sweeps about home."""
 
 import mujoco
 import numpy as np
@@ -9,29 +9,30 @@ from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
-RATE = 50.0  # of the targets [Hz]
-_SLOW, _FAST = 0.1, 3.0  # of the sweeps [Hz]
-_SPEED, _RANGE = 0.7, 0.9  # shares of what the drives' limits allow
-_STILL = 1.5  # at the beginning and at the end, and as long again to start and to stop [s]
-_CLEAR = 0.02  # between links, and over the table [m]
+RATE = 50.0  # rate of the targets [Hz]
+_SLOW, _FAST = 0.1, 3.0  # frequencies of the sweeps [Hz]
+_SPEED, _RANGE = 0.7, 0.9  # shares of the drives' speeds and the joints' ranges
+_STILL = 1.5  # time at rest at the beginning and the end, and again the time to fade in and out [s]
+_CLEAR = 0.02  # clearance between links, and over the table [m]
 
 
 def sweeps(robot: RobotCfg, seconds: float, amplitude: float = 0.5) -> Float[np.ndarray, "m n"]:
-    """Position targets of the arm's joints at ``RATE`` [rad or m].
+    """Makes position targets of the arm's joints at ``RATE`` [rad or m].
 
-    Each joint swings at a frequency that goes up and down between 0.1 and 3 Hz, in a period of its own, so that no two move
-    alike: about home, or beside it where home lies at the end of a range, within the ranges and at most at 70% of the targets'
-    speeds. The swings are halved until all shapes of the model that are two joints and 2 cm or more apart at home stay 2 cm
-    apart, and as far from the table.
+    Each joint swings about home (or beside it, if home is near a limit) at a frequency that rises and falls between 0.1 and 3 Hz.
+    Each joint has a different period, so that no two move alike. Targets stay within the joint ranges and at most at 70% of the
+    drives' speeds. Swings are halved until shapes that are at least two joints and 2 cm apart at home stay 2 cm apart, and as far
+    from the table.
 
     Args:
-        amplitude: at most [rad or m].
+        seconds: length of the movement [s].
+        amplitude: maximum amplitude [rad or m].
 
     Raises:
         UserError: the time is too short, or there is no room.
     """
     if seconds < 4 * _STILL:
-        raise UserError(f"an excitation takes {4 * _STILL:g} s or more, got {seconds:g}")
+        raise UserError(f"the movement takes at least {4 * _STILL:g} s, got {seconds:g}: pass a larger --seconds")
     model = scene.build(robot, SceneCfg(objects={}), SimCfg())
     time, home = np.arange(round(seconds * RATE)) / RATE, np.array(robot.arm.home)
     low, high = np.array([model.joint(j).range for j in robot.arm.joints]).T
@@ -43,11 +44,11 @@ def sweeps(robot: RobotCfg, seconds: float, amplitude: float = 0.5) -> Float[np.
         if _clear(model, robot, targets[:: round(RATE / 4)]):
             return targets
         swings, room = swings / 2, room / 2
-    raise UserError(f"{robot.name} has no room for an excitation about its home: give it another home")
+    raise UserError(f"{robot.name} has no room for the movement about its home: give it another home")
 
 
 def _sweep(time: np.ndarray, seconds: float, joint: int, speed: float, room: float) -> np.ndarray:
-    """A sine whose frequency goes up and down; from where ``room`` would be too fast, the amplitude falls with it."""
+    """Makes a sine whose frequency rises and falls. Where the amplitude ``room`` would be too fast, the amplitude is lower."""
     period = seconds / (3.0 + 0.7 * joint)
     share = np.abs((time / period + 0.37 * joint) % 2 - 1)
     frequency = _SLOW * (_FAST / _SLOW) ** share
@@ -58,15 +59,15 @@ def _sweep(time: np.ndarray, seconds: float, joint: int, speed: float, room: flo
 
 
 def _clear(model: mujoco.MjModel, robot: RobotCfg, targets: np.ndarray) -> bool:
-    """True if links that are apart at home stay apart."""
+    """Returns whether links that are apart at home stay apart."""
     data = mujoco.MjData(model)
     at = [int(model.joint(j).qposadr[0]) for j in (*robot.arm.joints, *robot.gripper.joints)]
     pictures = ("table_top", "floor", "goal")  # the table itself is a plane
     solid = [g for g in range(model.ngeom) if model.geom(g).name not in pictures]
     weld = model.body_weldid
-    below = weld[model.body_parentid[weld]]  # the next body that moves against it
+    below = weld[model.body_parentid[weld]]  # the next body that moves relative to it
 
-    after = np.where(below[below] > 0, below[below], -1)  # and the one below that, unless it is the world
+    after = np.where(below[below] > 0, below[below], -1)  # the body below that, unless it is the world
 
     def near(a: int, b: int) -> bool:
         i, j = (int(weld[model.geom_bodyid[g]]) for g in (a, b))

@@ -1,8 +1,8 @@
-"""Parameters of drives from a log: nonlinear least squares (SciPy's) on MuJoCo's rollouts.
+"""Fits the parameters of drives to a log by nonlinear least squares (SciPy) on MuJoCo's rollouts.
 
-The whole log is simulated open loop from its first reading on; what is minimised are the differences to the readings. First over
-the beginning, where a Jacobian is cheap, then over all that is not held out. Intervals come from the Jacobian at the solution and
-the residuals' variance, inflated by how long these stay correlated: what the model cannot explain is no independent noise.
+The log is simulated open loop from its first reading, and the differences to the readings are minimized: first over its start,
+where a Jacobian is cheap, then over everything that is not held out. Intervals follow from the Jacobian at the solution and the
+residuals' variance, which is inflated by their correlation time, because what the model cannot explain is not independent noise.
 """
 
 import dataclasses
@@ -17,12 +17,12 @@ from mjx_nero.errors import UserError
 from mjx_nero.identify.log import Log
 from mjx_nero.identify.plant import Drives, Plant
 
-HELD_OUT = 0.25  # of the log, its end
-_BEGINNING = 15.0  # [s]
-_SETTLED = 4.0  # [s] from which on it shows no more in which position dry friction held the joints
-_SURE, _NOISE = 1.0, 1e-4  # the model's own parameters are right to such a share, as against such noise of a reading [rad or m]
-_FACTOR, _OFFSET, _LATEST = 30.0, 0.5, 0.3  # bounds: of the model's own parameters; [rad or m]; [s]
-_STEP = 3e-4  # of a finite difference, in units of ``_unit``
+HELD_OUT = 0.25  # share of the log, at its end
+_BEGINNING = 15.0  # length of the first part [s]
+_SETTLED = 4.0  # time after which the positions in which dry friction held the joints no longer matter [s]
+_SURE, _NOISE = 1.0, 1e-4  # prior: relative error of the model's own parameters, and noise of a reading [rad or m]
+_FACTOR, _OFFSET, _LATEST = 30.0, 0.5, 0.3  # bounds: factor of the model's own parameters, offset [rad or m], delay [s]
+_STEP = 3e-4  # finite difference in units of ``_unit``
 _LEVEL = 0.975
 
 
@@ -32,10 +32,10 @@ class Fit:
 
     Attributes:
         drives, low, high: the values and their 95% intervals.
-        readings: [k, n] what the identified arm's encoders read.
-        nominal: [k, n] what the model's own would.
-        held: [k] where the log was held out.
-        rms, nominal_rms: [n] of the differences over what was held out [rad or m].
+        readings: encoder readings of the identified arm [k, n] [rad or m].
+        nominal: encoder readings with the model's own drives [k, n] [rad or m].
+        held: where the log was held out [k].
+        rms, nominal_rms: root mean squares of their differences to the held-out log [n] [rad or m].
     """
 
     drives: Drives
@@ -52,7 +52,7 @@ def identify(plant: Plant, log: Log) -> Fit:
     """Fits drives to a log.
 
     Raises:
-        UserError: the log does not say enough, or the simulation diverges.
+        UserError: the log does not determine all parameters, or the simulation diverges.
     """
     cut = log.times[0] + (1 - HELD_OUT) * (log.times[-1] - log.times[0])
     begun = dataclasses.replace(plant.nominal, offset=np.mean(log.positions - _held(log), axis=0))
@@ -61,8 +61,8 @@ def identify(plant: Plant, log: Log) -> Fit:
         part = (log.times >= log.times[0] + _SETTLED) & (log.times <= end)
         found = _solve(plant, log, part, x, enough)
         x = found.x
-    # Armatures show least: the search can come to rest where one is several times too large. So it begins there again, with the
-    # model's, and the better of both counts.
+    # Armatures have the least effect: the search can end where one is several times too large. So it starts again from there with
+    # the model's armatures, and the better of both solutions counts.
     x = np.concatenate([x[: 2 * plant.n], plant.nominal.armature, x[3 * plant.n :]])
     found = min(found, _solve(plant, log, part, x, enough), key=lambda solution: solution.cost)
     x = found.x
@@ -76,8 +76,10 @@ def identify(plant: Plant, log: Log) -> Fit:
 
 
 def _first_delay(plant: Plant, log: Log, drives: Drives) -> float:
-    """Returns the delay [s] with which the model's drives fit the log's beginning best, to 10 ms. A search that begins far from
-    it ends where damping and armature explain what is late."""
+    """Returns the delay [s] with which the model's drives fit the log's beginning best, to 10 ms.
+
+    A search that begins far from it ends where damping and armature explain the delay.
+    """
     part = (log.times >= log.times[0] + _SETTLED) & (log.times <= log.times[0] + _BEGINNING)
     tried = np.arange(0.0, 0.2, 0.01)
     paths = _read(plant, log, [dataclasses.replace(drives, delay=delay).vector() for delay in tried], part)
@@ -85,7 +87,7 @@ def _first_delay(plant: Plant, log: Log, drives: Drives) -> float:
 
 
 def _held(log: Log) -> np.ndarray:
-    """The targets last sent at the readings [k, n]."""
+    """Returns the targets last sent before each reading [k, n]."""
     return log.targets[np.clip(np.searchsorted(log.sent, log.times, side="right") - 1, 0, None)]
 
 
@@ -95,10 +97,10 @@ def _read(plant: Plant, log: Log, vectors: list[np.ndarray], part: np.ndarray | 
 
 
 def _solve(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray, enough: float):
-    """Least squares over a part of the log; the model's own parameters count as readings, too, if rough ones.
+    """Solves the least squares over a part of the log, with the model's own parameters as a weak prior.
 
     Args:
-        enough: ends where a step makes the sum smaller by less than this share.
+        enough: the search ends when a step reduces the sum by less than this share.
     """
     n, wanted, unit = plant.n, log.positions[part], _unit(plant)
     guessed = np.eye(len(x))[: 4 * n] * _NOISE / _SURE
@@ -119,15 +121,15 @@ def _solve(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray, enough: floa
 
 
 def _unit(plant: Plant) -> np.ndarray:
-    """Scale of the free numbers: the model's own parameters, 1e-2 rad and 10 ms."""
+    """Returns the scale of the free parameters: the model's own parameters, 1e-2 rad and 10 ms."""
     return np.concatenate([plant.nominal.vector()[: 4 * plant.n], np.full(plant.n + 1, 0.01)])
 
 
 def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int) -> np.ndarray:
-    """[p] half the widths of the 95% intervals; linear theory.
+    """Computes half the widths of the 95% intervals [p], by linear theory.
 
     Raises:
-        UserError: some parameter does not show in the log.
+        UserError: a parameter has no effect in the log.
     """
     seen = residuals[: rows * n]
     free = len(seen) - jacobian.shape[1]
@@ -135,14 +137,16 @@ def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int)
     try:
         factor = scipy.linalg.cho_factor((jacobian / scale).T @ (jacobian / scale))
     except (np.linalg.LinAlgError, ValueError):
-        raise UserError("the log does not show all parameters: every joint has to move, slowly and fast") from None
+        raise UserError(
+            "the log does not determine all parameters: record one in which every joint moves slowly and fast"
+        ) from None
     variance = np.diag(scipy.linalg.cho_solve(factor, np.eye(len(scale)))) / scale**2
     noise = seen @ seen / free * _correlation(seen.reshape(-1, n))
     return scipy.special.stdtrit(free, _LEVEL) * np.sqrt(noise * variance)
 
 
 def _correlation(residuals: Float[np.ndarray, "k n"], longest: int = 400) -> float:
-    """Number of readings worth one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
+    """Computes how many readings equal one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
     total = np.sum(residuals**2)
     out = 1.0
     for lag in range(1, min(longest, len(residuals) // 2)):

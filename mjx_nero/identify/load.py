@@ -1,4 +1,4 @@
-"""Inertia and weight that drives move over the workspace."""
+"""The inertia and weight that drives move, over the workspace."""
 
 import dataclasses
 
@@ -15,11 +15,11 @@ class Load:
     """The load of a drive over the workspace.
 
     Attributes:
-        joint: its name.
+        joint: name of the joint.
         light, heavy: 5th and 95th percentile of the inertia [kg m^2 or kg].
         gravity: largest static load [N m or N].
-        effort: the drive's limit [N m or N].
-        friction: damping that the joint has of its own [N m s/rad or N s/m].
+        effort: the drive's effort limit [N m or N].
+        friction: the joint's own damping [N m s/rad or N s/m].
     """
 
     joint: str
@@ -33,12 +33,12 @@ class Load:
 def loads(model: mujoco.MjModel, poses: int = _POSES, seed: int = 0) -> tuple[Load, ...]:
     """Measures each drive's load over random poses within the joint limits.
 
-    Joints that equalities couple move as one: their drives share its inertia and load.
+    Joints that are coupled by equality constraints move together, so their drives share inertia and load.
     """
     data, (joints, dofs), ways = mujoco.MjData(model), driven(model), moves(model)
     leader, ratio = leaders(model)
     together = leader[:, None] == leader
-    # With equal gains a drive takes ratio / sum(ratio^2) of a force and 1 / sum(ratio^2) of an inertia of the common motion.
+    # With equal gains, a drive carries ratio / sum(ratio^2) of a force and 1 / sum(ratio^2) of an inertia of the common motion.
     squares = np.where(together, ratio**2, 0).sum(axis=1)
     lower, upper = ranges(model)[joints].T
     rng, full = np.random.default_rng(seed), np.zeros((model.nv, model.nv))

@@ -1,11 +1,11 @@
-"""The log of an arm: what its drives were told, and what their encoders read. A table that any program can write:
+"""The log of an arm: targets of its drives, and readings of their encoders, in a table that any program can write:
 
     time,target.joint1,target.joint2,position.joint1,position.joint2
     0.000,0.1,0.5,0.1002,0.4997
     0.005,,,0.1001,0.4998
 
-``time`` [s] ascends; the targets [rad or m] of a row were sent then, its positions [rad or m] read then; cells without news are
-empty. The first row has targets. Lines that begin with # are notes.
+``time`` [s] ascends. At the time of a row its targets [rad or m] were sent and its positions [rad or m] were read; either may be
+empty. The first row has targets. Lines that begin with # are comments.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from mjx_nero.config.values import hint, short
 from mjx_nero.errors import UserError
 
 MAX_BYTES, MAX_ROWS = 64_000_000, 500_000
-_LARGEST = 1e4  # of a number: an arm's angles, metres and seconds are below
-SHORTEST, FEWEST = 10.0, 500  # [s], readings
+_LARGEST = 1e4  # largest number in a log: an arm's angles, metres and seconds are smaller
+SHORTEST, FEWEST = 10.0, 500  # minimum length [s] and number of readings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Log:
     """Targets and readings of an arm's joints.
 
     Attributes:
-        sent: [m], when targets were sent [s].
+        sent: times of the targets [m] [s].
         targets: [m, n] [rad or m].
-        times: [k], when the encoders were read [s].
+        times: times of the readings [k] [s].
         positions: [k, n] [rad or m].
     """
 
@@ -59,23 +59,25 @@ def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[s
 
 
 def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, fewest: int = FEWEST) -> Log:
-    """Reads a log of a robot's arm; a stranger may have made it.
+    """Reads a log of a robot's arm. The file is not trusted.
 
     Args:
-        joints: of the arm, in their order here; the file may have them in another.
-        shortest, fewest: how long it has to be [s], and how many readings it has to have.
+        joints: names of the arm's joints, in the order of the result; the file may have another order.
+        shortest, fewest: minimum length of the log [s], and minimum number of readings.
 
     Raises:
-        UserError: there is none, it is too large, or it is no log of these joints; the message names the line.
+        UserError: the file does not exist, is too large, or is not a log of these joints; the message names the line.
     """
     lines = numbered(path, MAX_BYTES)
     if len(lines) > MAX_ROWS:
-        raise UserError(f"{path} has {len(lines):,} rows: more than {MAX_ROWS:,} are not read")
+        raise UserError(f"{path} has {len(lines):,} rows, but at most {MAX_ROWS:,} are read: give a shorter log")
     head = [name.strip() for name in lines[0][1].split(",")] if lines else []
     wanted = ["time", *(f"target.{j}" for j in joints), *(f"position.{j}" for j in joints)]
     for name in wanted:
         if head.count(name) != 1:
-            raise UserError(f"{path} needs one column {name}{hint(name, head)}: its first line names {short(','.join(head))}")
+            raise UserError(
+                f"{path} needs exactly one column {name}{hint(name, head)}: its first line is {short(','.join(head))}"
+            )
     columns, n, rows = [head.index(name) for name in wanted], len(joints), []
     for i, line in lines[1:]:
         cells = line.split(",")
@@ -84,14 +86,14 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
         row = [number(cells[c], f"{path} line {i} {head[c]}") for c in columns]
         for part in (row[1 : n + 1], row[n + 1 :]):
             if 0 < sum(map(math.isnan, part)) < n:
-                raise UserError(f"{path} line {i} has news of some joints and not of others: give all or none")
+                raise UserError(f"{path} line {i} has values for some joints and not for others: give all or none")
         rows.append(row)
     table = np.array(rows, float).reshape(-1, 2 * n + 1)
     if not len(table) or np.isnan(table[:, 0]).any() or (np.diff(table[:, 0]) <= 0).any():
-        raise UserError(f"{path}: time has to be in every row, and to ascend")
+        raise UserError(f"{path}: every row needs a time, and times must ascend")
     told, seen = ~np.isnan(table[:, 1]), ~np.isnan(table[:, n + 1])
     if not told[0]:
-        raise UserError(f"{path}: its first row has to have the targets that are in force at its beginning")
+        raise UserError(f"{path}: the first row needs the targets in effect at its beginning")
     log = Log(table[told, 0], table[told, 1 : n + 1], table[seen, 0], table[seen, n + 1 :])
     if len(log.times) < fewest or log.times[-1] - log.times[0] < shortest:
         raise UserError(f"{path} has {len(log.times)} readings: {fewest} or more over {shortest:g} s or more are needed")
@@ -101,20 +103,20 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
 
 
 def numbered(path: pathlib.Path, limit: int) -> list[tuple[int, str]]:
-    """Reads the lines of a table that are neither empty nor notes, each with its number in the file.
+    """Reads the lines of a table that are neither empty nor comments, each with its line number.
 
     Raises:
-        UserError: there is none, it is larger than ``limit`` bytes, or no text.
+        UserError: the file does not exist, is larger than ``limit`` bytes, or is not text.
     """
     try:
         text = files.read_bytes(path, limit).decode()
     except UnicodeDecodeError:
-        raise UserError(f"{path} is no text: a log is a table of numbers with commas") from None
+        raise UserError(f"{path} is not text: a log is a comma-separated table of numbers") from None
     return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
 
 
 def number(text: str, where: str, empty: bool = True) -> float:
-    """Reads a cell, not a number if it is empty.
+    """Reads a cell; NaN if it is empty.
 
     Args:
         where: names the cell in messages.

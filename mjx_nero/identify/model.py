@@ -1,4 +1,4 @@
-"""A robot's drives and what they turn, as arrays along the drives."""
+"""A robot's drives and the joints that they move, as arrays along the drives."""
 
 import math
 
@@ -11,25 +11,25 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 
 def drives_model(robot: RobotCfg, sim: SimCfg) -> mujoco.MjModel:
-    """The robot with its drives, without contacts. Where gains make it diverge, its state turns NaN instead of starting anew."""
+    """Builds the robot with its drives, without contacts. If gains make it diverge, its state becomes NaN and is not reset."""
     model = scene.build(robot, SceneCfg(objects={}), sim, visuals=False)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
 
 
 def driven(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and degrees of freedom that the drives act on, [nu] each."""
+    """Returns the joints and degrees of freedom that the drives act on, [nu] each."""
     joints = model.actuator_trnid[:, 0]
     return joints, model.jnt_dofadr[joints]
 
 
 def ranges(model: mujoco.MjModel) -> np.ndarray:
-    """[njnt, 2]; half a turn to either side where there is no limit."""
+    """Returns the joint ranges [njnt, 2]; half a turn to either side for joints without limits."""
     return np.where(model.jnt_limited[:, None].astype(bool), model.jnt_range, [-math.pi, math.pi])
 
 
 def moves(model: mujoco.MjModel) -> np.ndarray:
-    """[nv, nv] column c: how all joints move when joint c does and its followers follow, in a linkage at its zero."""
+    """Returns a matrix [nv, nv], whose column c says how all joints move with joint c and its followers, at a linkage's zero."""
     out, dof = np.eye(model.nv), dict(zip(model.jnt_qposadr, model.jnt_dofadr, strict=True))
     for coupling in linkage.couplings(model):
         if coupling.leader != coupling.follower:
@@ -45,7 +45,7 @@ def leaders(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_model(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> None:
-    """Puts the driven joints and the drives' targets at ``pose``, coupled joints where their leaders have them."""
+    """Sets driven joints and drive targets to ``pose``, and coupled joints to match their leaders."""
     mujoco.mj_resetData(model, data)
     data.qpos[model.jnt_qposadr[driven(model)[0]]], data.ctrl[:] = pose, pose
     linkage.close(linkage.couplings(model), data.qpos)

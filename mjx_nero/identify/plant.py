@@ -1,7 +1,7 @@
-"""An arm and its drives as identification sees them: parameters and targets in, the encoders' readings out.
+"""Model of an arm and its drives for identification: computes encoder readings from parameters and targets.
 
-In MuJoCo's C library, without contacts. A target is in force from ``delay`` after it was sent until the next one is; the drive
-then pulls the joint to it, and the encoder reads the joint's position plus an offset:
+It uses MuJoCo's C library, without contacts. A target takes effect ``delay`` after it was sent, until the next does. The drive
+pulls the joint to it, and the encoder reads the joint's position plus an offset:
 
     (M(q) + armature) qdd + c(q, qd) = stiffness (target - q) - damping qd - friction sign(qd),   reading = q + offset
 """
@@ -20,9 +20,9 @@ from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
-REST = 0.5  # [s] before a log, in which its first target holds the arm
-FRICTION = 0.01  # of a drive's effort: the first guess where a model has no joint friction
-MAX_NUMBERS = 100_000_000  # of states and targets, of all that is simulated at once
+REST = 0.5  # time before a log, during which its first target holds the arm [s]
+FRICTION = 0.01  # first guess of joint friction, as a share of the drive's effort, if the model has none
+MAX_NUMBERS = 100_000_000  # maximum count of numbers in states and targets that are simulated at once
 POSITIVE = ("stiffness", "damping", "armature", "friction")
 
 
@@ -35,8 +35,8 @@ class Drives:
         damping: [N m s/rad or N s/m], of drive and joint together.
         armature: [kg m2 or kg].
         friction: dry friction [N m or N].
-        offset: what the encoder reads beside the joint's position [rad or m].
-        delay: from a target's sending until it is in force [s].
+        offset: encoder reading minus joint position [rad or m].
+        delay: time from sending a target until it takes effect [s].
     """
 
     stiffness: np.ndarray
@@ -47,26 +47,26 @@ class Drives:
     delay: float = 0.0
 
     def vector(self) -> np.ndarray:
-        """[5 n + 1]: the parameters of all joints one after another, offsets, delay."""
+        """Returns all parameters as one vector [5 n + 1]: each parameter of all joints in turn, offsets, delay."""
         return np.concatenate([*(getattr(self, name) for name in POSITIVE), self.offset, [self.delay]])
 
     @classmethod
     def of(cls, vector: np.ndarray) -> "Drives":
-        """The inverse of ``vector``."""
+        """Makes drives from a ``vector``."""
         stiffness, damping, armature, friction, offset = np.split(np.asarray(vector, float)[:-1], 5)
         return cls(stiffness, damping, armature, friction, offset, float(vector[-1]))
 
 
 class Plant:
-    """Simulates an arm's drives; the gripper's hold still.
+    """Simulates an arm's drives; the gripper's drives hold still.
 
     Args:
-        robot: its model, gains and joints.
+        robot: the robot, with its model, gains and joints.
         dt: physics step [s].
 
     Attributes:
-        model: compiled, with the robot's own parameters.
-        nominal: the parameters that the model has, where it has any.
+        model: compiled model with the robot's own parameters.
+        nominal: the model's own parameters, with guesses for those that it lacks.
 
     Raises:
         UserError: the physics step cannot resolve the drives.
@@ -78,7 +78,7 @@ class Plant:
         self.robot, self.dt, self.n = robot, dt, len(robot.arm.joints)
         self.model = scene.build(robot, SceneCfg(objects={}, table=False), SimCfg(dt=dt, iterations=50), visuals=False)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.model.opt.tolerance = 1e-12  # finite differences see the solver's last digits
+        self.model.opt.tolerance = 1e-12  # finite differences need an accurate solver
         joints = self.model.actuator_trnid[: self.n, 0]
         self._at, self._dof = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
         armature, friction = self.model.dof_armature[self._dof], self.model.dof_frictionloss[self._dof]
@@ -94,7 +94,7 @@ class Plant:
         self._rollout = rollout.Rollout(nthread=threads).rollout
 
     def with_drives(self, drives: Drives) -> mujoco.MjModel:
-        """The model with other parameters; their damping is all the drives'."""
+        """Returns the model with other parameters, whose damping belongs entirely to the drives."""
         model, n = copy.copy(self.model), self.n
         model.actuator_gainprm[:n, 0], model.actuator_biasprm[:n, 1] = drives.stiffness, -drives.stiffness
         model.actuator_biasprm[:n, 2], model.dof_damping[self._dof] = -drives.damping, 0.0
@@ -113,17 +113,24 @@ class Plant:
         """Simulates the encoders' readings at ``times``, for each of several parameter sets.
 
         Args:
-            sent: times of the targets [s], ascending.
-            targets: [rad or m].
-            start: readings before the first target was sent [n].
-            times: [s], none before the first target.
+            drives: parameter sets.
+            sent: times of the targets, ascending [s].
+            targets: targets [rad or m].
+            start: readings before the first target was sent [n] [rad or m].
+            times: times of the readings, none before the first target [s].
+
+        Returns:
+            readings of each parameter set [rad or m].
+
+        Raises:
+            UserError: the log is too long, or the simulation diverges.
         """
         m, n = self.model, self.n
         begin = sent[0] - REST
         steps = int(np.ceil((times[-1] - begin) / self.dt)) + 1
         if len(drives) * steps * (m.nq + m.nv + m.nu) > MAX_NUMBERS:
             text = f"{times[-1] - begin:.0f} s are too many physics steps of {self.dt:g} s"
-            raise UserError(f"{text}: a minute is enough; or give a larger --dt")
+            raise UserError(f"{text}: give a shorter log (a minute is enough) or a larger --dt")
         edges = begin + self.dt * np.arange(steps + 1)
         states = np.zeros((len(drives), 1 + m.nq + m.nv))
         states[:, 1 : 1 + m.nq] = m.qpos0
@@ -144,11 +151,11 @@ class Plant:
 
 
 def in_force(since: np.ndarray, targets: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The mean of the targets in force over each physics step [steps, n]: smooth in the delay, where their stairs are not.
+    """Computes the mean target over each physics step [steps, n]. Unlike the targets' stairs, it is smooth in the delay.
 
     Args:
-        since: when each target came into force [m].
-        edges: of the steps [steps + 1].
+        since: time at which each target took effect [m].
+        edges: edges of the steps [steps + 1].
     """
     knots = np.concatenate([[min(edges[0], since[0]) - 1.0], since, [max(edges[-1], since[-1]) + 1.0]])
     held = np.concatenate([targets[:1], targets])
@@ -157,5 +164,5 @@ def in_force(since: np.ndarray, targets: np.ndarray, edges: np.ndarray) -> np.nd
 
 
 def interpolate(at: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Linear, of the columns of ``y``."""
+    """Interpolates the columns of ``y`` linearly."""
     return np.stack([np.interp(at, x, column) for column in y.T], axis=-1)

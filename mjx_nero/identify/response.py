@@ -1,4 +1,4 @@
-"""Step responses of drives, in MuJoCo's C library."""
+"""Measures step responses of drives, in MuJoCo's C library."""
 
 import dataclasses
 import math
@@ -9,23 +9,23 @@ import numpy as np
 
 from mjx_nero.identify.model import driven, leaders, pose_model, ranges
 
-SECONDS = 5.0  # of a response: several time constants of the slowest drive in the package
-_SHARE = 0.1  # a step is at most this share of the joint's range: 5 mm on a finger's slide of 50 mm
-_BAND = 0.02  # settled: within this share of the way
+SECONDS = 5.0  # length of a response: several time constants of the slowest drive in the package
+_SHARE = 0.1  # maximum step as a share of the joint's range: 5 mm on a finger's slide of 50 mm
+_BAND = 0.02  # share of the motion within which a joint counts as settled
 
 
 @dataclasses.dataclass(frozen=True)
 class Response:
-    """A joint's answer to a step of its drive's target.
+    """A joint's response to a step of its drive's target.
 
     Attributes:
-        joint: its name.
-        step: by which the target moved [rad or m].
-        time: [n] since the step, from 0 [s].
-        position: [n] way since the step [rad or m].
-        force: [n - 1] of the drive, during each physics step [N m or N].
-        error: what lacks to the target at the end [rad or m]; gravity's sag included.
-        effort: the drive's limit [N m or N].
+        joint: name of the joint.
+        step: step of the target [rad or m].
+        time: time since the step [n] [s].
+        position: motion since the step [n] [rad or m].
+        force: force of the drive during each physics step [n - 1] [N m or N].
+        error: target minus position at the end, sag by gravity included [rad or m].
+        effort: the drive's effort limit [N m or N].
     """
 
     joint: str
@@ -38,7 +38,7 @@ class Response:
 
     @property
     def share(self) -> np.ndarray:
-        """[n] of the way to where the joint comes to rest; NaN where it does not move."""
+        """Position as a share of the final position [n]; NaN if the joint does not move."""
         end = self.position[-1]
         return self.position / end if abs(end) > 1e-6 * abs(self.step) else np.full_like(self.position, np.nan)
 
@@ -62,7 +62,7 @@ class Response:
 
     @property
     def saturation(self) -> float:
-        """Share of the time until settled that the drive pushes with all its effort."""
+        """Share of the time until settled during which the drive is at its effort limit."""
         full = np.abs(self.force) >= self.effort * (1 - 1e-6)
         return float(np.mean(full[self.time[1:] <= max(self.settling, self.time[1])]))
 
@@ -76,7 +76,7 @@ class Response:
 
 
 def steps(model: mujoco.MjModel, pose: Sequence[float], step: float) -> np.ndarray:
-    """[nu] steps of the drives' targets: ``step``, at most a tenth of the joint's range, away from its nearer end."""
+    """Returns the drives' target steps [nu]: ``step``, at most a tenth of a joint's range, away from its nearer end."""
     (joints, _), (leader, ratio), at = driven(model), leaders(model), np.asarray(pose)
     lower, upper = ranges(model)[joints].T
     size = np.minimum(step, _SHARE * (upper - lower)) * np.where(at - lower > upper - at, -1, 1)
@@ -85,19 +85,20 @@ def steps(model: mujoco.MjModel, pose: Sequence[float], step: float) -> np.ndarr
 
 
 def respond(model: mujoco.MjModel, pose: Sequence[float], step: float, seconds: float = SECONDS) -> tuple[Response, ...]:
-    """Step responses of all drives of a model, one after another; the others hold ``pose``. Coupled joints step together.
+    """Measures the step responses of all drives, one after another, while the others hold ``pose``. Coupled joints step together.
 
     Args:
-        model: with position drives on joints.
-        pose: [nu], where the drives hold the joints before the step [rad or m].
+        model: model with position drives on joints.
+        pose: positions that the drives hold before the step [nu] [rad or m].
         step: see ``steps``.
+        seconds: length of each response [s].
     """
     data, (joints, _) = mujoco.MjData(model), driven(model)
     at = model.jnt_qposadr[joints]
     held, change, (leader, _) = np.asarray(pose, float), steps(model, pose, step), leaders(model)
     pose_model(model, data, held)
     n = max(2, round(seconds / model.opt.timestep))
-    for _ in range(n):  # gravity sags the joints
+    for _ in range(n):  # until the joints sag under gravity
         mujoco.mj_step(model, data)
     rest = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
     out: dict[int, Response] = {}

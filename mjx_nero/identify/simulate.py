@@ -1,4 +1,4 @@
-"""Logs of a simulated arm: what ``record`` writes, with all that makes a real one hard to read."""
+"""Simulates logs of an arm for ``record``, with the noise, offsets and delays of a real one."""
 
 import dataclasses
 from typing import Annotated
@@ -18,13 +18,13 @@ class RecordCfg:
 
     Attributes:
         seconds: length of the log [s].
-        rate: readings a second [Hz].
+        rate: rate of readings [Hz].
         noise: standard deviation of a reading [rad or m].
         resolution: one count of the encoders [rad or m]; 0: no rounding.
-        scatter: the arm's parameters are the model's times factors up to this, drawn log-uniformly; 1: the model's.
-        offset: greatest offset of an encoder [rad or m].
-        delay: greatest delay of a target [s]; with a scatter above 1 it is drawn, too.
-        amplitude: greatest amplitude of the swings [rad or m].
+        scatter: multiply the model's parameters by log-uniform random factors up to this; 1: use the model's.
+        offset: maximum offset of an encoder [rad or m].
+        delay: delay of a target [s]; with a scatter above 1, the maximum of a random delay.
+        amplitude: maximum amplitude of the movement [rad or m].
         seed: random seed.
     """
 
@@ -45,7 +45,7 @@ class RecordCfg:
 
 
 def record(plant: Plant, cfg: RecordCfg) -> tuple[Log, Drives]:
-    """A log of the simulated arm under ``excitation.sweeps``, and the parameters that it has.
+    """Simulates a log of the arm during ``excitation.sweeps``; returns it with the arm's true parameters.
 
     Raises:
         UserError: the arm has no room, or the simulation diverges.
@@ -54,7 +54,7 @@ def record(plant: Plant, cfg: RecordCfg) -> tuple[Log, Drives]:
     truth = draw(plant.nominal, cfg, rng)
     targets = sweeps(plant.robot, cfg.seconds, cfg.amplitude)
     sent, times = np.arange(len(targets)) / RATE, np.arange(round(cfg.seconds * cfg.rate)) / cfg.rate
-    # A second at rest comes before the log, as before a real one.
+    # The simulation begins with some time at rest before the log, as for a real one.
     (positions,) = plant.readings([truth], sent, targets, targets[0] + truth.offset, times)
     positions = positions + cfg.noise * rng.standard_normal((len(times), n))
     if cfg.resolution:
@@ -63,7 +63,7 @@ def record(plant: Plant, cfg: RecordCfg) -> tuple[Log, Drives]:
 
 
 def draw(nominal: Drives, cfg: RecordCfg, rng: np.random.Generator) -> Drives:
-    """Parameters about the model's."""
+    """Draws parameters around the model's."""
     n, width = len(nominal.offset), abs(float(np.log(cfg.scatter)))
     factors = {name: getattr(nominal, name) * np.exp(rng.uniform(-width, width, n)) for name in POSITIVE}
     delay = cfg.delay * (rng.uniform() if width else 1.0)

@@ -1,1 +1,1 @@
-"""Learners that learn from somebody who can do the task: from demonstrations (``clone``) or from a teacher (``distill``)."""
+"""Imitation learning: from demonstrations (``clone``) or from a teacher (``distill``)."""

@@ -1,4 +1,4 @@
-"""Other software: environments for Gymnasium and torch, policies for ONNX runtimes. Each part needs its extra."""
+"""Interfaces to other software: environments for Gymnasium and torch, policies for ONNX runtimes. Each part needs its extra."""
 
 import importlib
 from typing import Any
@@ -7,13 +7,13 @@ from mjx_nero.types import UserError
 
 
 def missing(error: ModuleNotFoundError, extra: str) -> UserError:
-    """Returns the message for an installation that lacks the module of an extra."""
+    """Makes the error for an installation that lacks the module of an extra."""
     name = (error.name or "").partition(".")[0]
     return UserError(f"this needs {name}, of the extra {extra!r}: pip install 'mjx-nero[{extra}]'")
 
 
 def need(module: str, extra: str) -> Any:
-    """Imports a module that an extra brings.
+    """Imports a module of an extra.
 
     Raises:
         UserError: it is not installed.

@@ -1,4 +1,4 @@
-"""A batch of environments that restarts what has ended, and keeps how it ended."""
+"""A batch of environments that restarts ended episodes, and returns how they ended."""
 
 import jax
 import jax.numpy as jnp
@@ -9,25 +9,25 @@ from mjx_nero.types import Key
 
 
 class Batch:
-    """Environments side by side; pure, to be jitted by its user.
+    """Environments side by side. Its methods are pure; the caller jits them.
 
     Args:
-        env: one of them.
-        size: how many.
+        env: one environment.
+        size: number of environments.
     """
 
     def __init__(self, env: ManipulationEnv, size: int):
         self.env, self.size = env, size
 
     def reset(self, key: Key) -> State:
-        """Fresh episodes everywhere."""
+        """Starts a new episode in every environment."""
         return jax.vmap(self.env.reset)(jax.random.split(key, self.size))
 
     def step(self, state: State, action: jax.Array, key: Key) -> tuple[State, State]:
-        """One control step, with fresh episodes drawn from ``key`` where it was the last.
+        """Makes one control step, and starts a new episode, drawn from ``key``, in each environment whose episode ended.
 
         Returns:
-            the states to go on from, and those before the restart: with the last observations, rewards and results.
+            the states to continue from, and the states before restarts, with last observations, rewards and results.
         """
         last = jax.vmap(self.env.step)(state, action)
         done = last.done > 0
@@ -39,11 +39,11 @@ class Batch:
         start = (last.pipeline_state, last.obs, last.info["carry"])
         if jax.default_backend() == "cpu":
             sim, obs, carry = jax.lax.cond(done.any(), restart, lambda start: start, start)
-        else:  # a branch would keep the host waiting until the device knows ``done``, with the next step's work undone meanwhile
+        else:  # with a branch the host would wait until the device knows ``done``, and could not prepare the next step meanwhile
             sim, obs, carry = restart(start)
         return last.replace(pipeline_state=sim, obs=obs, info={**last.info, "carry": carry}), last
 
 
 def where(mask: jax.Array, new, old):
-    """Takes rows of one tree of arrays [n, ...] where ``mask`` [n] holds, else those of another."""
+    """Selects rows of the tree ``new`` of arrays [n, ...] where ``mask`` [n] holds, and rows of ``old`` elsewhere."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)

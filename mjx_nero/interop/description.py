@@ -1,4 +1,5 @@
-"""A robot's tree and collision shapes as plain values: what numpy's kinematics on a robot's computer read (``deploy.body``)."""
+"""Describes a robot's tree and collision shapes as plain values, for the numpy kinematics on a robot's computer
+(``deploy.body``)."""
 
 from typing import Any
 
@@ -18,7 +19,7 @@ _SHAPES = {
 
 
 def robot(cfg: RobotCfg) -> dict[str, Any]:
-    """Joints with their drives and limits, the base, and the body of a robot; docs/guides/deploy_onnx.md has the fields."""
+    """Describes a robot's joints with drives and limits, its base and its body; docs/guides/deploy_onnx.md lists the fields."""
     model, drives = scene.robot_model(cfg), (cfg.arm, cfg.gripper)
     joints = [model.joint(name) for name in cfg.joints]
 
@@ -42,10 +43,10 @@ def robot(cfg: RobotCfg) -> dict[str, Any]:
 
 
 def body(cfg: RobotCfg) -> dict[str, Any]:
-    """Bodies from the world on, the end effector, coupled joints and collision shapes of a mounted robot.
+    """Describes the bodies of a mounted robot (parents first), its end effector, coupled joints and collision shapes.
 
-    Poses are those of MuJoCo's compiled model, in the frame of the parent: position [m], orientation (wxyz). A shape that is
-    neither sphere, capsule, cylinder nor box is given by the box about it.
+    Poses are those of MuJoCo's compiled model, in the parent's frame: position [m], orientation (wxyz). A shape that is not a
+    sphere, capsule, cylinder or box is described by its bounding box.
 
     Raises:
         KeyError: the robot has no such end effector.

@@ -9,10 +9,10 @@ class Graph:
     """Collects nodes and weights.
 
     Args:
-        onnx: the package.
+        onnx: the package ``onnx``.
 
     Attributes:
-        nodes, weights: as ``onnx.helper.make_graph`` takes them.
+        nodes, weights: arguments of ``onnx.helper.make_graph``.
     """
 
     def __init__(self, onnx: Any):
@@ -21,7 +21,7 @@ class Graph:
         self.weights: list[Any] = []
 
     def constant(self, name: str, value: Any) -> str:
-        """Adds a weight, float32; returns its name."""
+        """Adds a weight as float32; returns its name."""
         self.weights.append(self._onnx.numpy_helper.from_array(np.asarray(value, np.float32), name))
         return name
 

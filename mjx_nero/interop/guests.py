@@ -1,4 +1,4 @@
-"""Outside code as a guest with the same rights: one call registers what a file or a package of its own brings."""
+"""Registers outside code: with one call, a user's file or package adds robots, environments, controllers and more."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -19,16 +19,16 @@ def register(
     physics_backends: Mapping[str, physics.Make] | None = None,
     learners: Mapping[str, learner.Kind] | None = None,
 ) -> None:
-    """Makes a guest's things known to ``make`` and to every command (their ``--load`` reads the file that calls this).
+    """Registers things for ``make`` and for every command, which loads the file that calls this with ``--load``.
 
-    Terms need no registration: a task names its functions.
+    Terms need no registration, because tasks refer to their functions directly.
 
     Args:
-        robots: by their own names.
-        envs: name -> (robot, preset -> factory of an ``EnvCfg``), as the package's arms have them.
+        robots: robots, each registered by its own name.
+        envs: name -> (robot, preset -> factory of an ``EnvCfg``), as in the package's arms.
         controllers: name -> (class, its config), as in ``control.CONTROLLERS``.
         physics_backends: name -> ``(model, options, fields) -> Physics``.
-        learners: for ``--learner``.
+        learners: name -> learner, for ``--learner``.
 
     Raises:
         UserError: a name is taken.

@@ -1,6 +1,6 @@
-"""Environments for Gymnasium 1: ``VectorEnv`` with arrays of JAX, torch or numpy, and ``Env``, one environment with numpy's.
+"""Environments for Gymnasium 1: ``VectorEnv`` with JAX, torch or numpy arrays, and ``Env``, one environment with numpy arrays.
 
-Importing this module registers them: ``gymnasium.make("mjx_nero/nero_lift-v0")``, or without an import of one's own
+Importing this module registers them: ``gymnasium.make("mjx_nero/nero_lift-v0")``. Without importing it first, use
 ``gymnasium.make("mjx_nero.interop.gymnasium:mjx_nero/nero_lift-v0")``.
 """
 
@@ -30,27 +30,27 @@ ARRAYS = ("numpy", "jax", "torch")
 
 
 class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
-    """Many environments in one compiled program, by Gymnasium's vector API, with same-step autoreset.
+    """Many environments in one compiled program, with Gymnasium's vector API and same-step autoreset.
 
-    Where an episode ends, ``step`` returns the reward and the flags of its last step and the first observation of the next one;
+    When an episode ends, ``step`` returns the reward and flags of its last step, and the first observation of the next episode.
     ``info["final_obs"]`` holds the last observation and ``info["final_info"]`` the results (``success``, ``final_distance`` [m],
-    ...), valid where the masks ``info["_final_obs"]`` and ``info["_final_info"]`` are true. They are there at every step, so that
-    the host need not wait for the device to ask.
+    ...). Both are valid where the masks ``info["_final_obs"]`` and ``info["_final_info"]`` are true. They are present at every
+    step, so that the host need not wait for the device.
 
-    The action space ends where the joints' limits do. A pickle holds the arguments: what comes out of it is made anew, and has to
-    be reset.
+    The action space is bounded by the joint limits. A pickle holds only the arguments: unpickling makes a new environment, which
+    must be reset.
 
     Args:
-        env: name of an environment, or one made before.
-        num_envs: how many.
+        env: name of an environment, or an environment.
+        num_envs: number of environments.
         arrays: ``numpy``; or ``jax`` or ``torch``, which stay on JAX's device and are not copied.
-        group: observation group to return; None: all of them, in a dict.
+        group: observation group to return; None: all groups, in a dict.
         render_mode: None or ``rgb_array``.
-        num_rendered: how many environments ``render`` draws, the first ones.
-        kwargs: of ``mjx_nero.make``.
+        num_rendered: number of environments that ``render`` draws.
+        kwargs: further arguments of ``mjx_nero.make``.
 
     Raises:
-        UserError: as ``mjx_nero.make``, or an argument is none of the above.
+        UserError: see ``mjx_nero.make``; or an argument is invalid.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
@@ -82,18 +82,18 @@ class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Fresh episodes everywhere: observations and an empty info. A seed makes all that follows reproducible."""
+        """Starts new episodes; returns observations and an empty info. A seed makes everything that follows reproducible."""
         seed = _checked(self.closed, seed, options)
         super().reset(seed=seed)
         self._state, self._key = self._reset(_key(self.np_random, seed))
         return jax.tree.map(self._out, _group(self._state.obs, self._group)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step: observations, rewards, terminated, truncated, info.
+        """Makes one control step; returns observations, rewards, terminated, truncated, info.
 
         Raises:
-            gymnasium.error.InvalidAction: another shape, or no finite numbers. Values that are on the device already are not
-                looked at: where they are not finite, the episode ends, and its results say ``nan``.
+            gymnasium.error.InvalidAction: the actions have another shape, or are not finite numbers. Values that are already on
+                the device are not checked: if they are not finite, the episode ends with ``nan`` in its results.
         """
         _check_open(self.closed, "step", self._state)
         action = _to_jax(actions, self.action_space.shape, self._device)
@@ -104,7 +104,7 @@ class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
         return *given, info
 
     def render(self) -> tuple[np.ndarray, ...]:
-        """Frames of the first ``num_rendered`` environments, uint8 [height, width, 3].
+        """Draws the first ``num_rendered`` environments, uint8 [height, width, 3] each.
 
         Raises:
             UserError: the machine cannot draw offscreen.
@@ -129,15 +129,15 @@ class VectorEnv(gymnasium.vector.VectorEnv, gymnasium.utils.EzPickle):
         done, truncated = last.done > 0, last.info["truncation"] > 0
         results = [last.metrics[name] for name in _results(self.env)]
         obs, final_obs = (_group(each.obs, self._group) for each in (state, last))
-        # Handing an array over to torch takes the host some 25 us; taking one apart there takes 2.
+        # Passing an array to torch takes the host about 25 us; splitting one there takes 2 us.
         packed = jnp.stack(results) if self._packed else results
         return state, key, (obs, last.reward, done & ~truncated, truncated, final_obs, done, packed)
 
 
 class Env(gymnasium.Env, gymnasium.utils.EzPickle):
-    """One environment with numpy arrays: what ``gymnasium.make("mjx_nero/nero_lift-v0")`` makes.
+    """One environment with numpy arrays, as made by ``gymnasium.make("mjx_nero/nero_lift-v0")``.
 
-    The info of an episode's last step holds its results. Arguments, errors and pickles are those of ``VectorEnv``.
+    The info of an episode's last step holds its results. Arguments, errors and pickles are as in ``VectorEnv``.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
@@ -153,14 +153,14 @@ class Env(gymnasium.Env, gymnasium.utils.EzPickle):
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A fresh episode: observation and an empty info."""
+        """Starts a new episode; returns the observation and an empty info."""
         seed = _checked(self._closed, seed, options)
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random, seed))
         return jax.tree.map(np.asarray, _group(self._state.obs, self._group)), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One control step: observation, reward, terminated, truncated, info."""
+        """Makes one control step; returns observation, reward, terminated, truncated, info."""
         _check_open(self._closed, "step", self._state)
         action = _to_jax(action, self.action_space.shape, self._device)
         self._state = state = self._step(self._state, action)
@@ -170,7 +170,7 @@ class Env(gymnasium.Env, gymnasium.utils.EzPickle):
         return obs, float(state.reward), done and not truncated, truncated, info
 
     def render(self) -> np.ndarray:
-        """A frame, uint8 [height, width, 3].
+        """Draws the environment, uint8 [height, width, 3].
 
         Raises:
             UserError: the machine cannot draw offscreen.
@@ -188,17 +188,17 @@ class Env(gymnasium.Env, gymnasium.utils.EzPickle):
 
 
 def _made(env: Any, **kwargs: Any) -> ManipulationEnv:
-    """The environment of a name, or the one that was made before.
+    """Makes the named environment, or returns the given one.
 
     Raises:
-        UserError: as ``mjx_nero.make``; or it is neither.
+        UserError: see ``mjx_nero.make``; or ``env`` is neither a name nor an environment.
     """
     if isinstance(env, str):
         return mjx_nero.make(env, **kwargs)
     if not isinstance(env, ManipulationEnv):
         raise UserError(f"env takes a name or an environment of mjx_nero.make, got {values.short(env)}")
     if given := [name for name in kwargs if name != "num_envs"]:
-        raise UserError(f"{', '.join(given)}: fields of an environment that is made already: pass them to mjx_nero.make")
+        raise UserError(f"{', '.join(given)} cannot change an environment that is already made: pass them to mjx_nero.make")
     return env
 
 
@@ -209,9 +209,9 @@ def _render_mode(mode: Any) -> str | None:
 
 
 def _check_open(closed: bool, what: str, state: Any = ()) -> None:
-    """Raises Gymnasium's own errors where an environment was closed, or has no episode yet (``state`` is None)."""
+    """Raises Gymnasium's own errors if an environment is closed, or has no episode yet (``state`` is None)."""
     if closed:
-        raise gymnasium.error.ClosedEnvironmentError(f"{what} after close: make the environment anew")
+        raise gymnasium.error.ClosedEnvironmentError(f"{what} after close: make a new environment")
     if state is None:
         raise gymnasium.error.ResetNeeded(f"call reset before {what}")
 
@@ -226,7 +226,7 @@ def _spaces(env: ManipulationEnv, group: Any) -> tuple[Any, Any]:
 
 
 def _space(obs: Any) -> gymnasium.spaces.Space:
-    """Builds the space of an observation group's shapes; pictures are whole numbers from 0 to 255."""
+    """Makes the space of an observation group; pictures are integers from 0 to 255."""
     if isinstance(obs, dict):
         return gymnasium.spaces.Dict({name: _space(each) for name, each in obs.items()})
     low, high = (0, 255) if obs.dtype == np.uint8 else (-np.inf, np.inf)
@@ -238,29 +238,29 @@ def _group(obs: Any, group: str | None) -> Any:
 
 
 def _results(env: ManipulationEnv) -> list[str]:
-    """Metrics of an ended episode."""
+    """Returns the names of an ended episode's metrics."""
     own = [name for name, term in env.cfg.metrics.items() if term.at_end]
     return ["success", "final_distance", *own, "dropped", "nan"]
 
 
 def _checked(closed: bool, seed: Any, options: Any) -> int | None:
-    """The seed of a reset.
+    """Checks the arguments of a reset; returns the seed.
 
     Raises:
-        gymnasium.error.Error: as ``checked_seed``; the environment is closed; or options ask for what is not done.
+        gymnasium.error.Error: see ``checked_seed``; or the environment is closed, or options are given.
     """
     _check_open(closed, "reset")
     if options is not None and not (isinstance(options, dict) and not options):
         named = ", ".join(map(str, options)) if isinstance(options, dict) else values.short(options)
-        raise gymnasium.error.Error(f"reset takes no options here, got {named}: all episodes start anew")
+        raise gymnasium.error.Error(f"reset takes no options here, got {named}: leave them out, all episodes start anew")
     return checked_seed(seed)
 
 
 def checked_seed(seed: Any) -> int | None:
-    """A seed as JAX takes it.
+    """Checks that a seed is a single one in JAX's range.
 
     Raises:
-        gymnasium.error.Error: it is no single one that JAX takes.
+        gymnasium.error.Error: it is not.
     """
     try:
         return None if seed is None else values.read(bounds.Seed, seed, "seed")
@@ -281,10 +281,10 @@ def _converter(arrays: str) -> Callable[[jax.Array], Any]:
 
 
 def _to_jax(action: Any, shape: tuple[int, ...] | None, device: jax.Device) -> jax.Array:
-    """Actions as JAX takes them, float32; those of torch by DLPack.
+    """Converts actions to JAX, float32; torch tensors are passed by DLPack.
 
     Raises:
-        gymnasium.error.InvalidAction: they have another shape, or are no finite numbers, as far as they are on the host.
+        gymnasium.error.InvalidAction: they have another shape, or are not finite numbers (checked on the host only).
     """
     here = not (isinstance(action, jax.Array) or hasattr(action, "detach"))
     try:
@@ -312,7 +312,7 @@ def _frame(env: ManipulationEnv, renderer: Renderer, state: Any, index: int) -> 
 
 
 def register() -> None:
-    """Registers the environments that ``mjx_nero.list_envs`` names, with ``-v0`` behind: call it again after adding your own."""
+    """Registers the environments of ``mjx_nero.list_envs``, with the suffix ``-v0``. Call it again after you add your own."""
     for name in registry.list_envs():
         if f"mjx_nero/{name}-v0" not in gymnasium.registry:
             gymnasium.register(

@@ -1,4 +1,4 @@
-"""A policy as ONNX: normalisation and network as a graph, and what a runtime has to know of the robot as metadata."""
+"""Converts a policy to ONNX: normalization and network as a graph, and everything a runtime needs about the robot as metadata."""
 
 import inspect
 import json
@@ -21,24 +21,26 @@ from mjx_nero.learn.policy import Policy
 from mjx_nero.sim import team
 from mjx_nero.types import UserError
 
-OPSET = 17  # of 2021: what embedded runtimes know, too
-IR_VERSION = 8  # the one of that opset
+OPSET = 17  # from 2021, which embedded runtimes also support
+IR_VERSION = 8  # belongs to that opset
 
 
 def model(policy: Policy, env: ManipulationEnv) -> Any:
-    """The policy as an ``onnx.ModelProto``: ``observations`` [n, state] -> ``actions`` [n, action_size], deterministic.
+    """Converts a policy to an ``onnx.ModelProto``: ``observations`` [n, state] -> ``actions`` [n, action_size], deterministic.
 
-    One that sees takes what its cameras see, too: ``picture_<camera>`` [n, height, width, channels].
+    A policy with cameras also has the inputs ``picture_<camera>`` [n, height, width, channels].
 
     Args:
-        env: what it acts in; the metadata describe its robot and terms.
+        env: the policy's environment, whose robot and terms the metadata describe.
 
     Raises:
-        UserError: the extra ``onnx`` is not installed, or the policy reads observations that stay apart.
+        UserError: the extra ``onnx`` is not installed, or the policy's observation terms stay apart.
     """
     onnx = need("onnx", "onnx")
     if isinstance(policy.meta["observation_size"]["state"], dict):
-        raise UserError("only a policy that reads one vector can be exported: this one's observations stay apart")
+        raise UserError(
+            "only a policy that reads one vector can be exported, and this one's terms stay apart: train another preset"
+        )
     helper, floats = onnx.helper, onnx.TensorProto.FLOAT
     drawn, own = Graph(onnx), _own(policy.meta)
     seen = own.pictures(policy.meta) if own else {}
@@ -58,12 +60,12 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
 
 
 def _own(meta: Mapping[str, Any]) -> Any:
-    """The module by which a learner draws its policies; None: they are PPO's layers."""
+    """Returns the module that builds the graphs of a learner's policies; None: they are PPO's layers."""
     return learner.find(meta.get("learner", "ppo")).graph
 
 
 def _build(policy: Policy, graph: Graph) -> None:
-    """Adds normalisation, then the layers."""
+    """Adds normalization, then the layers."""
     network, normalizer = policy.meta["network"], policy.params[0]
     x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
     x = graph.apply("Div", x, graph.constant("std", normalizer.std["state"]))
@@ -72,10 +74,10 @@ def _build(policy: Policy, graph: Graph) -> None:
     *hidden, last = _layers(policy.params[1].policy["params"])
     for i, (kernel, bias) in enumerate(hidden):
         x = graph.apply("Gemm", x, graph.constant(f"kernel_{i}", kernel), graph.constant(f"bias_{i}", bias))
-        # Swish is x * sigmoid(x), which ONNX has no single operator for before opset 24.
+        # ONNX has no operator for swish, x * sigmoid(x), before opset 24.
         swish = network["activation"] == "swish"
         x = graph.apply("Mul", x, graph.apply("Sigmoid", x)) if swish else graph.apply(_OPS[network["activation"]], x)
-    n = policy.meta["action_size"]  # what the last layer gives beyond it is the deviation of tanh_normal
+    n = policy.meta["action_size"]  # further outputs of the last layer are the deviation of tanh_normal
     x = graph.apply("Gemm", x, graph.constant("kernel_out", last[0][:, :n]), graph.constant("bias_out", last[1][:n]))
     graph.apply("Tanh" if network["distribution"] == "tanh_normal" else "Identity", x)
     graph.name_output("actions")
@@ -85,15 +87,15 @@ _OPS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 
 
 def _layers(params: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(kernel, bias) of each layer, the input's first."""
-    hidden = params.get("MLP_0", params)  # with a deviation of its own the network is a module within a module
+    """Yields (kernel, bias) of each layer, from input to output."""
+    hidden = params.get("MLP_0", params)  # with a separate deviation the network is nested
     dense = [hidden[name] for name in sorted(hidden, key=lambda name: int(name.rpartition("_")[2]))]
     for layer in dense + ([params["Dense_0"]] if "Dense_0" in params else []):
         yield np.asarray(layer["kernel"]), np.asarray(layer["bias"])
 
 
 def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
-    """Collects what a runtime needs beside the graph; docs/guides/deploy_onnx.md explains every field."""
+    """Collects everything that a runtime needs besides the graph; docs/guides/deploy_onnx.md explains every field."""
     team.alone(env.cfg.scene.robots, "an exported policy")
     robot, own = env.cfg.robot, _own(policy.meta)
     return {
@@ -116,7 +118,7 @@ def metadata(policy: Policy, env: ManipulationEnv) -> dict[str, Any]:
 
 
 def _observations(env: ManipulationEnv) -> list[dict[str, Any]]:
-    """The terms of the group ``state``, in the order of the input."""
+    """Describes the terms of the group ``state``, in the order of the input."""
     sizes = jax.eval_shape(lambda key: env.named_observations(env.reset(key))["state"], jax.random.PRNGKey(0))
     terms, out, start = env.cfg.observations["state"].terms, [], 0
     for name, term in terms.items():
@@ -131,18 +133,18 @@ def _observations(env: ManipulationEnv) -> list[dict[str, Any]]:
 
 
 def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
-    """A term's parameters as JSON has them; what JSON does not know, by its text."""
+    """Converts a term's parameters to JSON; values of other types become text."""
     return json.loads(json.dumps(dict(params), default=str))
 
 
 def tries(meta: Mapping[str, Any]) -> int:
-    """Returns the number of observations of a check: fewer where they are pictures."""
+    """Returns the number of observations of a check, which is smaller with pictures."""
     own = _own(meta)
     return own.TRIES if own else 10_000
 
 
 def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tuple[float, float]:
-    """Runs the model with ONNX Runtime on one core, on observations drawn as the normaliser has seen them.
+    """Runs the model with ONNX Runtime on one core, on observations drawn from the normalizer's statistics.
 
     Returns:
         the largest difference to JAX, and the 99th percentile of the core's time for one observation [s].

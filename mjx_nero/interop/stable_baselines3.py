@@ -1,4 +1,4 @@
-"""Environments for Stable-Baselines3: its own kind of vector environment over ``gymnasium.VectorEnv``."""
+"""Environments for Stable-Baselines3: its vector environment, as a wrapper of ``gymnasium.VectorEnv``."""
 
 from typing import Any
 
@@ -18,20 +18,22 @@ except ModuleNotFoundError as error:
 
 
 class VecEnv(vec_env.VecEnv):
-    """``PPO("MlpPolicy", VecEnv("nero_reach", 256))``. The info of an ended episode tells ``is_success``, which is logged.
+    """A vector environment: ``PPO("MlpPolicy", VecEnv("nero_reach", 256))``.
+
+    The info of an ended episode has ``is_success``, which Stable-Baselines3 logs.
 
     Args:
-        env: name of an environment, or one made before.
-        num_envs: how many.
-        kwargs: of ``VectorEnv``, whose errors these are, too.
+        env: name of an environment, or an environment.
+        num_envs: number of environments.
+        kwargs: further arguments of ``VectorEnv``.
 
     Raises:
-        UserError: as ``VectorEnv``; or the arrays are not to be numpy's.
+        UserError: see ``VectorEnv``; or ``arrays`` is not numpy.
     """
 
     def __init__(self, env: str | ManipulationEnv, num_envs: int, **kwargs: Any):
         if kwargs.get("arrays", "numpy") != "numpy":
-            raise UserError("Stable-Baselines3 takes arrays of numpy: leave arrays out")
+            raise UserError("Stable-Baselines3 takes numpy arrays only: leave arrays out")
         self.envs = VectorEnv(env, num_envs, **kwargs)
         self._seed: int | None = None
         self._actions: np.ndarray | None = None
@@ -43,20 +45,20 @@ class VecEnv(vec_env.VecEnv):
         return [seed] * self.num_envs
 
     def reset(self) -> np.ndarray:
-        """First observations [n, ...]."""
+        """Starts new episodes; returns their first observations [n, ...]."""
         obs, _ = self.envs.reset(seed=self._seed)
         self._seed = None
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions [n, action_size] for ``step_wait``."""
+        """Stores the actions [n, action_size] for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, dones and infos of one control step.
+        """Makes one control step; returns observations, rewards, dones and infos.
 
         Raises:
-            gymnasium.error.NoAsyncCallError: no actions wait.
+            gymnasium.error.NoAsyncCallError: there are no actions.
         """
         if self._actions is None:
             raise gymnasium.error.NoAsyncCallError("call step_async before step_wait", "step")
@@ -76,7 +78,7 @@ class VecEnv(vec_env.VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same for each environment: they are one program."""
+        """Returns the same value for each environment, because all of them are one program."""
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -84,9 +86,9 @@ class VecEnv(vec_env.VecEnv):
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Calls it once, for all."""
+        """Calls a method once for all environments."""
         return [getattr(self.envs, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Returns False for each: no environment is wrapped."""
+        """Returns False for each environment: none is wrapped."""
         return [False] * len(list(self._get_indices(indices)))

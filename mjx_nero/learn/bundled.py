@@ -6,7 +6,7 @@ from mjx_nero.sim.robot import ASSETS
 
 
 def shipped(env_name: str, preset: str = "default") -> pathlib.Path:
-    """Path of the package's own policy for an environment: the preset's, or else the default's."""
+    """Returns the path of the bundled policy of an environment: the preset's, or else the default preset's."""
     own = ASSETS / "policies" / f"{env_name}_{preset}.safetensors"
     return own if own.is_file() else ASSETS / "policies" / f"{env_name}.safetensors"
 

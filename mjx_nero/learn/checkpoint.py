@@ -1,4 +1,4 @@
-"""Checkpoints: arrays and a JSON description in one safetensors file. No pickle, so a stranger's file runs no code."""
+"""Checkpoints: arrays and a JSON description in one safetensors file. No pickle, so reading an untrusted file runs no code."""
 
 import json
 import pathlib
@@ -64,7 +64,7 @@ def verify(path: pathlib.Path) -> None:
     except (SafetensorError, OSError, ValueError):
         good = False
     if not good:
-        raise Damaged(f"{path} is damaged: its numbers are not those that were written")
+        raise Damaged(f"{path} is damaged (its numbers have changed since it was written): copy it again or give another file")
 
 
 def not_finite(tree: Any) -> str | None:
@@ -131,5 +131,5 @@ def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = No
         with safe_open(path, framework="numpy") as file:
             leaves = [jnp.asarray(file.get_tensor(name)) for name in wanted]
     except (SafetensorError, OSError):
-        raise UserError(f"{path} does not fit this environment and these networks, or it is damaged") from None
+        raise UserError(f"{path} does not fit this environment and these networks, or it is damaged: give another file") from None
     return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -49,7 +49,7 @@ def check(learner: Learner) -> None:
     """Checks the learner's estimate before anything is compiled.
 
     Raises:
-        UserError: it does not.
+        UserError: the run does not fit.
     """
     Pool(_limit(learner.num_devices), *learner.footprint()).check(learner)
     physics = learner.env.unwrapped.footprint(learner.num_devices)
@@ -79,7 +79,7 @@ def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) 
         if need > there:
             raise UserError(
                 f"{name} {count:,} with {state / 1e3:,.0f} kB of state each, and {kept / 1e9:.1f} GB of records, needs about "
-                f"{need / 1e9:,.1f} GB of memory, and {there / 1e9:.1f} GB are free: pass fewer, shorter episodes, or smaller "
+                f"{need / 1e9:,.1f} GB of memory, but {there / 1e9:.1f} GB are free: pass fewer, shorter episodes, or smaller "
                 "histories and delays"
             )
 
@@ -99,12 +99,12 @@ def check_compiled(learner: Learner, program: Any) -> None:
 
 @contextlib.contextmanager
 def out_of_memory_as_user_error(learner: Learner) -> Iterator[None]:
-    """Turns running out of memory into an error that the user can mend.
+    """Turns running out of memory into an error that the user can fix.
 
     No estimate foresees everything, such as another program on the device.
 
     Raises:
-        UserError: replaces any error that says so.
+        UserError: replaces an error that says that memory ran out.
     """
     try:
         yield
@@ -115,13 +115,13 @@ def out_of_memory_as_user_error(learner: Learner) -> Iterator[None]:
 
 
 def says_so(error: BaseException) -> bool:
-    """True for an error whose message says that memory ran out."""
+    """Returns whether an error's message says that memory ran out."""
     text = str(error).lower()
     return any(sign in text for sign in ("resource_exhausted", "out of memory", "failed to allocate"))
 
 
 def program_bytes(program: Any) -> int | None:
-    """Memory of a device that a compiled program takes from XLA, arguments and results included; None if unknown."""
+    """Returns the device memory that a compiled program takes from XLA [bytes], with arguments and results; None if unknown."""
     use = program.memory_analysis()
     if use is None:
         return None
@@ -129,12 +129,12 @@ def program_bytes(program: Any) -> int | None:
 
 
 def size(tree: Any) -> int:
-    """Bytes of a tree of arrays, or of their shapes."""
+    """Returns the bytes of a tree of arrays or of their shapes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def _limit(num_devices: int) -> float:
-    """Memory that XLA may take on a device [bytes]. A CPU's devices share the machine's free memory."""
+    """Returns the memory that XLA may take on a device [bytes]. A CPU's devices share the machine's free memory."""
     stats = jax.local_devices()[0].memory_stats() or {}
     return stats.get("bytes_limit") or _free_of_machine() / num_devices
 

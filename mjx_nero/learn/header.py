@@ -1,4 +1,4 @@
-"""The header of a policy or checkpoint, which may be a stranger's: read with limits, before any library sees the file."""
+"""The header of a policy or checkpoint. The file is untrusted, so this is read with limits before any library sees the file."""
 
 import math
 import pathlib
@@ -75,7 +75,7 @@ def check_fields(meta: Mapping[str, Any], path: pathlib.Path) -> None:
 
 
 def acts_alike(*metas: Mapping[str, Any]) -> bool:
-    """True if two policies' actions are of the same kinds. Files before 0.5.0 do not say; their arms take positions."""
+    """Returns whether two policies' actions have the same kinds. Files before 0.5.0 do not say; they take joint positions."""
     said = [list(meta["actions"]) for meta in metas if "actions" in meta]
     return said[0] == said[1] if len(said) == 2 else all(kinds[:1] == ["JointPosition"] for kinds in said)
 

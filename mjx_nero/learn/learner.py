@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from mjx_nero.types import Bank, Key
 
-ROWS = 16_384  # of ``types.Shown``
+ROWS = 16_384  # number of rows of ``types.Shown``
 HELD = {"[0]": ".normalizer", "[1]": ".params"}  # ``Kind.held`` of a state with these two
 Params = Any  # a policy's parameters: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
@@ -91,8 +91,8 @@ class Kind:
         presets: its config for each preset of an environment; ``default`` for the others. A config is a frozen dataclass with at
             least ``num_envs`` and ``num_timesteps``, where 0 means chosen for the machine.
         policy: description in a policy's file -> (template of the policy's parameters, act function).
-        envs: number of environments that suits a CPU, and one that suits a GPU.
-        pace: what a GPU does, for people who train without one.
+        envs: default number of environments on a CPU, and on a GPU.
+        pace: speed of a GPU, shown to users who train without one.
         fit: (config, devices at the run's start) -> the config with what their number decides, which the run keeps.
         held: prefix of the parameters' names in a policy's file -> their prefix in the learner's state, as in
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
@@ -114,21 +114,21 @@ class Kind:
 
 def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:
     """Repeats an iteration, as ``Learner.run`` does; returns the state and the mean metrics."""
-    import jax  # names and configs do without
+    import jax  # not needed for names and configs
 
     with jax.default_matmul_precision("float32"):
         state, metrics = jax.lax.scan(lambda s, _: iterate(s), state, length=iterations)
     return state, {name: value.mean() for name, value in metrics.items()}
 
 
-# The package's own: a folder whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds the presets without importing Brax.
+# The package's learners: folders whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
 _OWN = {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.imitation.clone", "distill": "mjx_nero.imitation.distill"}
 KINDS: Registry[Kind | str] = Registry("learner", _OWN)
 
 
 def names() -> tuple[str, ...]:
-    """Names of all learners."""
+    """Returns the names of all learners."""
     return tuple(KINDS)
 
 
@@ -146,7 +146,7 @@ def cfg_for(name: str, preset: str, fields: Mapping[str, Any]) -> Any:
     """Returns a learner's config for a preset of an environment.
 
     Args:
-        fields: the task's wishes by dotted name (``EnvCfg.training``); fields that this learner lacks are ignored.
+        fields: the task's settings by dotted name (``EnvCfg.training``); fields that this learner lacks are ignored.
     """
     kind = KINDS.find(name)
     presets = importlib.import_module(f"{kind}.cfg").PRESETS if isinstance(kind, str) else kind.presets

@@ -35,17 +35,17 @@ def join() -> None:
 
 
 def several() -> bool:
-    """True if there is more than one process."""
+    """Returns whether there is more than one process."""
     return jax.process_count() > 1
 
 
 def first() -> bool:
-    """True in the process that writes, evaluates and decides."""
+    """Returns whether this is the process that writes, evaluates and decides."""
     return jax.process_index() == 0
 
 
 def default_devices() -> int:
-    """Default number of devices per machine: one, or all where machines are joined."""
+    """Returns the default number of devices per machine: one, or all if machines are joined."""
     return jax.local_device_count() if several() else 1
 
 
@@ -74,7 +74,7 @@ def fetch(x: Any) -> np.ndarray:
 
 
 def wait() -> None:
-    """Waits until all processes are here."""
+    """Waits until all processes have called this function."""
     gather([0.0])
 
 
@@ -85,7 +85,7 @@ def _gpus() -> list[int] | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects a result, and the device."""
+    """Returns the versions of everything that affects a result, and the device."""
     names = ("mjx-nero", "mujoco", "mujoco-mjx", "jax", "brax", "flax", "optax", "warp-lang")
     found = {}
     for name in names:

@@ -1,4 +1,4 @@
-"""Policies: the files that hold them, and whether one fits an environment."""
+"""Policies: reading their files, and checking whether a policy fits an environment."""
 
 import dataclasses
 import functools
@@ -98,7 +98,7 @@ def load_for(
 
     Args:
         preset: preset of the bundled policy, if it has its own.
-        robot: the robot that the user named in place of the environment's own, for messages.
+        robot: the robot that the user named instead of the environment's own, for messages.
         any_robot: allow a policy that was trained for another model of the robot.
 
     Raises:
@@ -130,8 +130,8 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
         return f"is a {kind} for {there['robot']}, not for {robot}: pass the --robot that it was trained with"
     if not any_robot and there.get("fingerprint", here["fingerprint"]) != here["fingerprint"]:
         return (
-            f"is a {kind} for another model of {robot} (other links, masses, joints or drives): pass the --robot that "
-            "it was trained with, or the --env.identified, train one for this robot, or pass --any-robot to play it all the same"
+            f"is a {kind} for another model of {robot} (other links, masses, joints or drives): pass the --robot "
+            "or --env.identified that it was trained with, train one for this robot, or pass --any-robot to play it anyway"
         )
     if there["observations"]["state"] != here["observations"]["state"]:
         return f"was trained on other observations (preset {there['preset']}): pass --preset {there['preset']}"
@@ -140,13 +140,13 @@ def misfit(there: Mapping[str, Any], here: Mapping[str, Any], any_robot: bool = 
         return f"is of another robot ({count}): leave out --robot, or train one with it and pass --policy"
     if (sizes := [each["observation_size"]["state"] for each in (there, here)])[0] != sizes[1]:
         return (
-            f"was trained on observations of size {sizes[0]}, here it is {sizes[1]}: pass the --preset (it had "
+            f"was trained on observations of size {sizes[0]}, but here it is {sizes[1]}: pass the --preset (it had "
             f"{there['preset']}) and the --env fields that it was trained with, or train one and pass --policy"
         )
     shapes = [each["observation_size"].get("pictures") for each in (there, here)]
     if shapes[0] and shapes[0] != shapes[1]:
         return (
-            f"was trained on pictures of the shapes {shapes[0]}, here they are {shapes[1] or 'none'}: pass the --preset "
+            f"was trained on pictures of the shapes {shapes[0]}, but here they are {shapes[1] or 'none'}: pass the --preset "
             f"(it had {there['preset']}) and the --env.scene.cameras fields that it was trained with"
         )
     if not header.acts_alike(there, here):

@@ -1,7 +1,7 @@
-"""Waits for a program on the CPU so that signals are answered meanwhile.
+"""Waits for a program on the CPU in a way that lets signals be handled meanwhile.
 
-Python handles a signal between two instructions of its main thread, and there are none while JAX computes there: minutes, if a
-program draws pictures.
+Python handles a signal between two instructions of its main thread. While JAX computes there, no instruction ends, which takes
+minutes if a program draws pictures.
 """
 
 import concurrent.futures
@@ -13,9 +13,9 @@ import jax
 
 
 def result_of(function: Callable[..., Any], *args: Any) -> Any:
-    """Returns what a compiled function returns. On a CPU another thread calls it and waits, so the caller can be interrupted.
+    """Calls a compiled function and returns its result. On a CPU another thread calls it, so that the caller can be interrupted.
 
-    An accelerator's programs take a second, and stay in the thread that they were made in.
+    An accelerator's programs take about a second, and stay in the calling thread.
     """
     if jax.default_backend() != "cpu" or threading.current_thread() is not threading.main_thread():
         return function(*args)
@@ -27,5 +27,5 @@ def result_of(function: Callable[..., Any], *args: Any) -> Any:
         except BaseException as error:
             found.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()  # a program that is interrupted ends without it
+    threading.Thread(target=work, daemon=True).start()  # an interrupted program does not wait for it
     return found.result()

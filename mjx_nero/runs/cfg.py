@@ -43,13 +43,13 @@ class RunCfg:
     eval_every: Whole = flag(0, free=True)  # env steps between evaluations; 0: 12 per run
     checkpoint_every: Whole = flag(0, free=True)  # env steps between checkpoints; 0: 5 per run
     eval_episodes: Annotated[int, Bounds(1, 100_000)] = dataclasses.field(default=256, metadata={"kept": True})
-    checkpoint_minutes: NonNegative = flag(10.0, free=True)  # greatest time between checkpoints [min]; 0: only env steps decide
-    keep: Count = flag(3, free=True)  # checkpoints to keep besides the best
-    on_nan: OnNan = flag("stop", free=True)  # when training diverges: stop, or rewind once and learn more slowly
+    checkpoint_minutes: NonNegative = flag(10.0, free=True)  # maximum time between checkpoints [min]; 0: no limit
+    keep: Count = flag(3, free=True)  # number of newest checkpoints to keep, besides the best
+    on_nan: OnNan = flag("stop", free=True)  # when training diverges: stop, or rewind once with a lower learning rate
     auto: bool = False  # resume if ``out`` holds a checkpoint, else start
-    max_minutes: NonNegative = flag(0.0, free=True)  # training time before the run stops, without compilation [min]; 0: no limit
-    num_devices: Annotated[int, Bounds(1, 4096)] = flag(1, free=True)  # GPUs to spread the environments over
-    track: Annotated[str, OneOf("", "wandb")] = flag("")  # service to report metrics to as well (needs the extra track)
+    max_minutes: NonNegative = flag(0.0, free=True)  # maximum training time, without compilation [min]; 0: no limit
+    num_devices: Annotated[int, Bounds(1, 4096)] = flag(1, free=True)  # number of GPUs that share the environments
+    track: Annotated[str, OneOf("", "wandb")] = flag("")  # service that also receives the metrics (needs the extra track)
 
     def __post_init__(self):
         bounds.check(self)
@@ -77,7 +77,7 @@ def resolve(
     """Builds a run's config from names and dotted fields.
 
     Args:
-        robot: robot in place of the environment's own, by name or folder.
+        robot: robot instead of the environment's own, by name or folder.
 
     Raises:
         UserError: a name or field is unknown, or a value has the wrong type.

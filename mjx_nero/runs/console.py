@@ -1,4 +1,4 @@
-"""Output for people: lines, tables and progress. No word is broken, however narrow the terminal."""
+"""Terminal output: lines, tables and progress. Words are never broken, however narrow the terminal."""
 
 import contextlib
 import dataclasses
@@ -14,35 +14,35 @@ from rich.console import Console, ConsoleOptions
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-_GAP = 3  # between two columns of a table, at most
-_BAR = (BarColumn(bar_width=14), TextColumn("{task.percentage:3.0f}%  {task.fields[text]}"))  # 80 columns hold it all
+_GAP = 3  # maximum gap between two columns of a table
+_BAR = (BarColumn(bar_width=14), TextColumn("{task.percentage:3.0f}%  {task.fields[text]}"))  # fits 80 columns
 
 
 def screen(stderr: bool = False, quiet: bool = False) -> Console:
-    """Console for tables and lines, as wide as the terminal; without one, wide enough for names."""
+    """Makes a console for tables and lines, as wide as the terminal; without a terminal, wide enough for names."""
     console = Console(stderr=stderr, quiet=quiet)
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = 160  # a pipe has no width of its own, and rich would take 80
+        console.width = 160  # a pipe has no width, and rich would use 80
     return console
 
 
 def line(console: Console, text: str, style: str = "") -> None:
-    """A line as it stands: neither wrapped nor coloured by what is in it."""
+    """Prints a line unchanged: not wrapped, and not coloured by its content."""
     console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def wrote(console: Console, what: str, path: pathlib.Path) -> None:
-    """Says where a file went."""
+    """Prints where a file was written."""
     line(console, f"{what}: {path}")
 
 
 @dataclasses.dataclass
 class Table:
-    """Cells of text. Print it on a ``screen()``; where it is too wide, it becomes several with the first column in each.
+    """A table of text. Print it on a ``screen()``. If it is too wide, it is split into several, each with the first column.
 
     Attributes:
-        columns: their heads; all empty: no line of heads.
-        left: columns whose cells begin at the left; the first one always does.
+        columns: headings of the columns; if all are empty, there is no heading row.
+        left: columns that are aligned left; the first column always is.
     """
 
     title: str
@@ -52,7 +52,7 @@ class Table:
     rows: list[tuple[str, ...]] = dataclasses.field(default_factory=list)
 
     def add(self, *cells: str) -> None:
-        """A row."""
+        """Adds a row."""
         self.rows.append(cells)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[table.Table]:
@@ -78,7 +78,7 @@ class Table:
             yield view
 
     def _parts(self, width: int) -> list[list[int]]:
-        """Columns that fit side by side."""
+        """Groups the columns so that each group fits the width."""
         widths = [
             max(len(line) for row in (self.columns, *self.rows) for line in row[i].split("\n")) for i in range(len(self.columns))
         ]
@@ -94,25 +94,25 @@ class Table:
 
 def compiling(impl: str) -> str:
     """Announces the wait before training."""
-    if impl == "native":  # a program that calls back is none that JAX keeps
-        return "compiling (half a minute or so; programs that call MuJoCo's C library are compiled at every start) ..."
+    if impl == "native":  # JAX's cache cannot hold programs with callbacks
+        return "compiling (about half a minute; programs that call MuJoCo's C library are compiled at every start) ..."
     return "compiling (a minute or two the first time, a few seconds once the compiled programs are kept) ..."
 
 
 def clock(seconds: float) -> str:
-    """Hours, minutes and seconds."""
+    """Formats seconds as hours, minutes and seconds."""
     seconds = round(seconds)
     minutes = f"{seconds % 3600 // 60:02}:{seconds % 60:02}"
     return f"{seconds // 3600}:{minutes}" if seconds >= 3600 else minutes
 
 
 def time_left(steps: int, steps_per_s: float, minutes: float, wall: float) -> float:
-    """Seconds until the steps are made or the minutes are over, whichever comes first.
+    """Returns the seconds until the steps are made or the time limit is reached, whichever comes first.
 
     Args:
-        steps: still to make.
-        minutes: a run's limit; 0: none.
-        wall: how long it has been training [s].
+        steps: steps that are left.
+        minutes: the run's time limit; 0: none.
+        wall: training time so far [s].
     """
     left = steps / steps_per_s if steps_per_s else math.inf
     return max(0.0, min(left, 60 * minutes - wall) if minutes else left)
@@ -142,7 +142,7 @@ class Show:
         self._bar.update(self._task, completed=min(1.0, done), text=f"{text}  ETA {clock(left)}")
 
     def evaluated(self, steps: int, wall: float, evaluation: dict[str, Any]) -> None:
-        """A line, for logs."""
+        """Prints a line about an evaluation, if the output is not a terminal."""
         if not self._console.is_terminal:
             text = f"{steps:>12,} steps {wall:7.1f} s  return {evaluation['return_mean'] or 0.0:8.2f}"
             line(self._console, f"{text}  success {evaluation['success_rate']:.3f}")
@@ -150,7 +150,7 @@ class Show:
 
 @contextlib.contextmanager
 def drawing(console: Console, name: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress line for a video: call what comes with frames drawn and frames in all."""
+    """Shows a progress line for a video. Yields a function to call with the number of frames drawn and of all frames."""
     with Progress(*_BAR, console=console, disable=not console.is_terminal, transient=True) as bar:
         task, begun = bar.add_task("", total=1.0, text=f"drawing {name}"), time.monotonic()
 

@@ -50,7 +50,7 @@ def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[s
     """
     able = env.cfg.controllers
     if not able:
-        raise UserError(f"{env_name} has no controller, only policies")
+        raise UserError(f"{env_name} has no controller: play a policy instead")
     if name not in able:
         raise UserError(f"controller {name!r} cannot do {env_name}: choose one of {', '.join(able)}")
     return control.make(name, env.cfg.robot, env.dt, {**able[name], **(fields or {})}, env.cfg.scene.robots)
@@ -114,7 +114,7 @@ def play(cfg: EvalCfg) -> Played:
 
 
 def _by_shape(env: ManipulationEnv, episodes: rollout.Episodes) -> dict[str, list[float]]:
-    """The success rate of each shape that objects with a bank had, and in how many episodes it was there."""
+    """Returns, for objects with a bank of shapes, the success rate with each shape, and the number of its episodes."""
     out = {}
     for name, item in env.cfg.scene.objects.items():
         if (which := episodes.metrics.get(f"shape/{name}")) is None:
@@ -129,7 +129,7 @@ def _impl(backend: str, impl: str) -> str:
     """Returns the physics of a backend; ``impl`` chooses among MJX's own."""
     native = backend == "mujoco"
     if backend != "auto" and impl != "auto" and native != (impl == "native"):
-        raise UserError(f"--backend {backend} cannot play with --impl {impl}: give one of them")
+        raise UserError(f"--backend {backend} cannot play with --impl {impl}: pass only one of them")
     if impl == "auto" and backend != "auto":
         return "native" if native else "warp" if warp_available() else "jax"
     return impl

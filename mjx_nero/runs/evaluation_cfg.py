@@ -1,4 +1,4 @@
-"""Settings of an evaluation. Imports neither Brax nor MJX, so that ``--help`` comes at once."""
+"""Settings of an evaluation. Imports neither Brax nor MJX, so that ``--help`` is fast."""
 
 import dataclasses
 import pathlib
@@ -19,13 +19,13 @@ class EvalCfg:
     """Settings of an evaluation.
 
     Attributes:
-        robot: robot in place of the environment's own, by name or folder.
-        agent: policy, zero or random (default: the bundled policy, or the task's controller if there is none).
-        policy: policy file (default: the bundled one of the environment).
-        any_robot: play a policy that was trained for another model of the robot.
-        controller: play one of the task's controllers, or expert for the first of them, instead of an agent.
+        robot: robot instead of the environment's own, by name or folder.
+        agent: who plays (default: the bundled policy, or the task's controller if there is none).
+        policy: policy file (default: the environment's bundled policy).
+        any_robot: also play a policy that was trained for another model of the robot.
+        controller: play one of the task's controllers instead of an agent; expert: the first of them.
         episodes: number of episodes, played side by side.
-        backend: mjx, or mujoco for the C library on the CPU; auto: as impl says.
+        backend: mjx, or mujoco (the C library on the CPU); auto: as --impl says.
         impl: physics, one of ``physics.impls()``.
         record: number of episodes whose steps are kept, for example for a video.
         env_fields, control_fields: fields of the environment's and the controller's config by dotted name.
@@ -48,6 +48,6 @@ class EvalCfg:
 
     def __post_init__(self):
         if self.controller and (self.agent or self.policy):
-            raise UserError("only one can play: give --controller, --agent or --policy")
+            raise UserError("only one can play: pass --controller, --agent or --policy")
         if self.control_fields and (self.agent or self.policy):
             raise UserError("--control.* needs --controller")

@@ -66,7 +66,7 @@ def claim(path: pathlib.Path | None, name: str, goes_on: bool) -> Iterator[pathl
 
 
 def check(folder: pathlib.Path) -> None:
-    """Checks that nothing a run reads or writes leads out of its folder, which a stranger may have made.
+    """Checks that nothing a run reads or writes leads out of its folder, which is not trusted.
 
     Raises:
         UserError: one of the run's files or folders is a link, a pipe or a device.

@@ -22,8 +22,8 @@ from mjx_nero.tasks import registry
 
 # Fields of a run's environment that name files, which may lie outside the run's folder.
 _PATHS = ("identified", "object.file", "robot.folder", "robot.name", "robot.mjcf")
-_MESHES = ("file", "bank")  # how the names of further ones end, of objects
-# Fields that a resumed run may change (how long, on what, what it leaves behind), and all that its config stores.
+_MESHES = ("file", "bank")  # last parts of the names of an object's fields that name files, too
+# Fields that a resumed run may change (its length, machine and outputs), and all fields that its config stores.
 _FREE = config.marked(RunCfg, "free")
 _OWN = (*_FREE, *config.marked(RunCfg, "kept"))
 
@@ -70,7 +70,7 @@ def same_run(
         trust: the user vouches for the run, so files that it names outside its folder may be read.
 
     Raises:
-        UserError: a flag differs from the run's own; or the config is damaged, names files that a stranger may have chosen, or
+        UserError: a flag differs from the run's own; or the config is damaged, names untrusted files outside the folder, or
             comes from a version that this one cannot continue.
     """
     run = _rebuilt(folder, trust)
@@ -80,8 +80,8 @@ def same_run(
     def refuse(flag: str, own: Any, other: Any) -> None:
         if own != other:
             raise UserError(
-                f"--{flag} is {other}, and {folder} is a run with {own}: leave the flag out to resume that run, or start another "
-                "with another --out"
+                f"--{flag} is {other}, but {folder} is a run with {own}: leave the flag out to resume that run, or start a "
+                "new one with another --out"
             )
 
     for flag, name in (("env", "env_name"), ("preset", "preset"), ("learner", "learner"), ("seed", "seed")):
@@ -109,7 +109,7 @@ def overridden(folder: pathlib.Path, run: RunCfg) -> str:
     if before is None:
         return ""
     pairs = [(name, getattr(before, name), getattr(run, name)) for name in ("num_timesteps", *_FREE)]
-    return ", ".join(f"{name} {new} in place of {old}" for name, old, new in pairs if old != new)
+    return ", ".join(f"{name} {new} instead of {old}" for name, old, new in pairs if old != new)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _rebuilt(folder: pathlib.Path, trust: bool) -> RunCfg | None:
         return dataclasses.replace(run, **fields)
     except UserError as error:
         version = values.short(stored.versions.get("mjx-nero", "unknown"))[1:-1]
-        raise UserError(f"{path} is of a run of version {version}, which this version cannot resume: {error}") from None
+        raise UserError(f"{path} is a run of version {version}, which this version cannot resume: {error}") from None
 
 
 def _outside(asked: Asked) -> Iterator[str]:
@@ -178,7 +178,7 @@ def _names_file(field: str) -> bool:
 
 
 def _as_stored(cfg: Any, stored: Any) -> Any:
-    """Restores the numbers that the run began with where this version has others, except the files that it reads."""
+    """Restores the values that the run began with if this version has others, except the files that it reads."""
     was = config.current(cfg, config.flatten(stored))
     now = config.flatten(config.to_dict(cfg))
     own = [name for name in config.flatten(cfg) if name in was and not _names_file(name)]
@@ -218,7 +218,7 @@ def check(source: Source, meta: dict[str, Any]) -> None:
         where = f"{there.get('env')} (preset {there.get('preset')})"
         raise UserError(
             f"{path} does not fit: it was trained in {where} on other observations or actions "
-            f"than those of {meta['env']} (preset {meta['preset']}): give one that was trained on the same"
+            f"than those of {meta['env']} (preset {meta['preset']}): give one that was trained on these"
         )
     if other := learner.find(meta["learner"]).differing(there, meta):
         flags = " ".join(f"--{meta['learner']}.{name} {_flag(x)}" for name, x in other.items())
@@ -226,7 +226,7 @@ def check(source: Source, meta: dict[str, Any]) -> None:
 
 
 def _flag(value: Any) -> str:
-    """Formats a field's value as one types it."""
+    """Formats a field's value for a command line."""
     return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
@@ -258,5 +258,5 @@ def state(source: Source | None, learner: Learner, seed: int, bank: starts.Make 
 
 
 def _shapes(networks: Any) -> dict[str, tuple[int, ...]]:
-    """Shape of each array, by name."""
+    """Returns the shape of each array, by name."""
     return {jax.tree_util.keystr(path): tuple(x.shape) for path, x in jax.tree_util.tree_leaves_with_path(networks)}

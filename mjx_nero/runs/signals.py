@@ -52,7 +52,7 @@ def after_this(say: Callable[[str], None]) -> Iterator[Stop]:
         if stop.number is not None:
             os._exit(128 + number)
         stop.number = number
-        say("stopping after this update or evaluation, to save it (Ctrl-C again: at once, with the last checkpoint) ...")
+        say("stopping after this update or evaluation, to save it (Ctrl-C again: stop at once, with the last checkpoint) ...")
 
     with _handled(handle):
         yield stop

@@ -1,5 +1,5 @@
-"""Expert starts: what a task's expert leaves a learner. A bank of visited states, in which ``wrappers.ExpertStarts`` begins
-training episodes, and the actions that the expert took, to imitate.
+"""Expert starts: what a task's expert gives a learner. It is a bank of visited states, in which ``wrappers.ExpertStarts`` begins
+training episodes, and the expert's actions, to imitate.
 
 The task's first controller plays one episode in each of several environments, side by side in one program, through the
 task's own actions (``Chain.invert``). The program compiles and runs on the CPU while the device's programs compile, so every
@@ -29,15 +29,15 @@ from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
-# Greatest standard deviation of the noise on the expert's actions, if they are velocities or not: noisy positions shake the arm.
+# Maximum standard deviation of the noise on the expert's actions, by whether they are velocities: noisy positions shake the arm.
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 # A controller of 64 arms is thousands of operations that are too small to share among threads.
 _ONE_THREAD: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
-COMING, LIFTED = 1.5, 0.3  # [s] the hand comes down so long before the grasp, and is well above the table so long after
+COMING, LIFTED = 1.5, 0.3  # [s] time that the hand comes down before the grasp, and time after it until well above the table
 _HOLD = "success.hold"
 
-Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` beside its key
+Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` besides its key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,12 +68,12 @@ def none(seed: int) -> dict[str, Any]:
 
 
 def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Make:
-    """Returns a function that makes from a seed what an expert leaves a learner.
+    """Returns a function that makes from a seed what an expert gives a learner.
 
-    It returns nothing, and says why in a line, if there can be none.
+    If the task has no usable expert, it returns nothing and says why in a line.
 
     Args:
-        new: the run begins with a new policy. One that begins with a policy of a file imitates nobody: that policy knows more.
+        new: the run begins with a new policy. A run that begins with a file's policy imitates no expert, as it knows more.
     """
     env, imitates = learner.env, new and getattr(learner, "imitates", False)
     begins = isinstance(env, wrappers.ExpertStarts)
@@ -88,7 +88,7 @@ def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Mak
                 begun = time.perf_counter()
                 found, shown = play(seed)
         except UserError as error:
-            say(f"no expert shows how: {error}")
+            say(f"no expert demonstrates: {error}")
             return {}
         did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} episodes"
         uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if begins else []
@@ -119,7 +119,7 @@ def steps(way: Way, shown: Shown, seed: int) -> Shown:
 
 
 def playground(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task for the expert: the arm's weight carried, no randomization, delays or pushes.
+    """Returns the task for the expert: with gravity compensation, without randomization, delays and pushes.
 
     Its states are valid states of the task itself.
     """
@@ -153,12 +153,12 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
 
 
 def _milestone(cfg: EnvCfg) -> str | None:
-    """Name of the metric that says when the hard part is done; None: no metric does."""
+    """Returns the name of the metric that says when the hard part is done; None if there is none."""
     return next((name for name, term in cfg.metrics.items() if term.milestone), None)
 
 
 def _processor() -> jax.Device | None:
-    """Returns JAX's CPU device; None if JAX was told to do without."""
+    """Returns JAX's CPU device; None if JAX may not use the CPU."""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:

@@ -45,7 +45,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         command: the user's command, for the hint on how to resume.
 
     Raises:
-        UserError: something that the user can mend: impl, folder, checkpoint, sizes.
+        UserError: something that the user can fix: impl, folder, checkpoint, sizes.
         signals.Signalled: a signal came before training began.
     """
     say = speaker()
@@ -190,11 +190,11 @@ def _tally(source: resume.Source) -> Tally:
 
 
 def _over(run: RunCfg, tally: Tally) -> str:
-    """Says why nothing is left to do of a run; empty if something is."""
+    """Says why nothing of a run is left to do; empty if something is."""
     if tally.steps >= run.num_timesteps:
-        return f"has made its {tally.steps:,} steps already: pass a larger --num-timesteps"
+        return f"has already made its {tally.steps:,} steps: pass a larger --num-timesteps"
     if 0 < 60 * run.max_minutes <= tally.wall_s:
-        return f"has used its {run.max_minutes:g} minutes already: pass a larger --max-minutes"
+        return f"has already used its {run.max_minutes:g} minutes: pass a larger --max-minutes"
     return ""
 
 

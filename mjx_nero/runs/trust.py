@@ -1,4 +1,4 @@
-"""Trust: a stranger's run may name any file in its config, so reading such a file needs the user's consent once.
+"""Trust: someone else's run may name any file in its config, so reading such a file needs the user's consent once.
 
 A run that this user started here, or has trusted once, is marked in the user's cache folder by the fingerprint of its config.
 """
@@ -41,8 +41,8 @@ def ask(folder: pathlib.Path, named: Iterable[str], trust: bool) -> None:
     place = _place(folder)
     if place is None or not place.is_file():
         raise UserError(
-            f"{folder / CONFIG} names {named[0]!r}, outside of the run, and this user has not begun it here: "
-            "pass --trust if you know who made the run"
+            f"{folder / CONFIG} names {named[0]!r}, outside the run's folder, and you did not start this run here: "
+            "pass --trust if you trust whoever made it"
         )
 
 

@@ -1,4 +1,4 @@
-"""Command-line plumbing that all commands share. Imports neither JAX nor rich before they are needed."""
+"""Command-line code that all commands share. It imports JAX and rich only when they are needed."""
 
 import argparse
 import contextlib
@@ -21,16 +21,16 @@ from mjx_nero import config
 from mjx_nero.config import bounds, docs, values
 from mjx_nero.errors import UserError, missing
 
-LONGEST_NAME = 255  # bytes of a file's name, on all usual file systems
+LONGEST_NAME = 255  # bytes of a file name; the limit of all common file systems
 
 
 class Parser(argparse.ArgumentParser):
-    """Argparse whose mistakes are one line.
+    """An argument parser that reports mistakes in one line.
 
     Args:
         command: name of the command.
-        says: what it does, for its help.
-        ends: the end of its help.
+        says: what the command does; the help begins with it.
+        ends: text at the end of the help.
     """
 
     def __init__(self, command: str, says: str = "", ends: str | None = None):
@@ -38,16 +38,16 @@ class Parser(argparse.ArgumentParser):
         super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=form)
 
     def add_environment(self) -> None:
-        """``--load``, ``--env``, ``--preset``, ``--robot`` and ``--object``: what an environment is made of."""
+        """Adds ``--load``, ``--env``, ``--preset``, ``--robot`` and ``--object``, which choose an environment."""
         self.add_load()
-        self.add_argument("--env", default="nero_lift", help="environment; list-envs names them all (default: %(default)s)")
+        self.add_argument("--env", default="nero_lift", help="environment; list-envs lists them all (default: %(default)s)")
         self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
         self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
-        text = "object to lift, push or place in place of the task's own: a mesh (.obj, .stl, .glb), a folder, or a name"
-        self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; --env.object.scale: its scale)")
+        text = "object to lift, push or place instead of the task's own: a mesh (.obj, .stl, .glb), a folder or a name"
+        self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; scale it by --env.object.scale)")
 
     def add_load(self) -> None:
-        """``--load``: outside code, run before the other flags are read for what they name."""
+        """Adds ``--load``: outside code, which runs before the names in other flags are looked up."""
         self.add_argument(
             "--load",
             action="append",
@@ -57,27 +57,27 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_impl(self) -> None:
-        """``--impl``: who computes the physics."""
-        text = "physics: warp or jax (both MJX), or native, MuJoCo's C library (default: the fastest on this machine)"
+        """Adds ``--impl``: the physics implementation."""
+        text = "physics: warp or jax (both MJX), or native (MuJoCo's C library) (default: the fastest on this machine)"
         self.add_argument("--impl", default="auto", help=text)
 
     def add_address(self) -> None:
-        """``--host`` and ``--port`` of a page."""
-        self.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
-        self.add_argument("--port", type=at_most(65535), default=8080, help="port to listen at (default: %(default)s)")
+        """Adds ``--host`` and ``--port`` of a web page."""
+        self.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+        self.add_argument("--port", type=at_most(65535), default=8080, help="port to listen on (default: %(default)s)")
 
     def add_seed(self, default: int, several: bool = False) -> None:
-        """``--seed`` and, if several may be given, ``--seeds``."""
+        """Adds ``--seed`` and, if ``several``, ``--seeds``."""
         group = self.add_mutually_exclusive_group()
         group.add_argument("--seed", type=seed, default=default, help="random seed (default: %(default)s)")
         if several:
-            text = "several seeds, as in 0-7 or 0,3,5: one run for each, and a table"
+            text = "several seeds, such as 0-7 or 0,3,5: one run for each, and a table"
             group.add_argument("--seeds", type=seeds, help=text)
 
     def add_fields(self, cls: type) -> None:
-        """A flag for each field that ``config.flag`` makes: named, read, bounded and explained as the field is.
+        """Adds a flag for each field made by ``config.flag``, with the field's name, type, bounds and description.
 
-        A flag that is there already stays as it is.
+        A flag that the parser already has stays as it is.
         """
         about, kinds = docs.fields(cls), values.hints(cls)
         for field in dataclasses.fields(cls):
@@ -92,15 +92,17 @@ class Parser(argparse.ArgumentParser):
                 self.add_argument(name, default=field.default, help=text, **_reader(kinds[field.name]))
 
     def add_video(self) -> None:
-        """Adds flags of videos. The defaults give the best video that the machine draws within half a minute."""
-        self.add_argument("--video-size", type=size, help="size in pixels, as in 1280x720 (default: chosen by the machine)")
-        text = "frames per second (default: 25, or as many as the machine draws)"
+        """Adds the flags of videos. Their defaults give the best video that the machine draws within half a minute."""
+        self.add_argument(
+            "--video-size", type=size, help="size in pixels, such as 1280x720 (default: depends on the machine's speed)"
+        )
+        text = "frames per second (default: 25, or fewer on a slow machine)"
         self.add_argument("--video-fps", type=positive_float, default=0.0, help=text)
-        text = "robots side by side in one picture (default: one by one)"
+        text = "number of robots side by side in one picture (default: 1)"
         self.add_argument("--video-envs", type=at_most(256), default=1, help=text)
 
     def error(self, message: str) -> NoReturn:
-        message = re.sub(r"^argument ([^\s:]+): (?=takes|must)", r"\1 ", message)  # ours read on from the flag's name
+        message = re.sub(r"^argument ([^\s:]+): (?=takes|must)", r"\1 ", message)  # our messages continue from the flag's name
         raise UserError(f"{message} (see --help)")
 
     def parse(
@@ -109,11 +111,11 @@ class Parser(argparse.ArgumentParser):
         prefixes: Sequence[str] | Callable[[], Sequence[str]] = (),
         cfgs: Callable[[argparse.Namespace], Mapping[str, Any]] | None = None,
     ) -> tuple[argparse.Namespace, dict[str, dict[str, str]]]:
-        """Flags, and for each prefix the dotted ones: ``--env.sim.dt 0.005`` -> ``{"env": {"sim.dt": "0.005"}}``.
+        """Parses flags, and dotted flags by prefix: ``--env.sim.dt 0.005`` -> ``{"env": {"sim.dt": "0.005"}}``.
 
         Args:
-            prefixes: a function is called when outside code is loaded, which may bring some.
-            cfgs: of the other flags; their fields are listed at the end of the help.
+            prefixes: names, or a function that returns them. It is called after outside code is loaded, which may add some.
+            cfgs: returns the configs for the other flags; the help lists their fields at its end.
         """
         if cfgs and {"-h", "--help"} & set(argv):
             others, _ = self.parse([word for word in argv if word not in ("-h", "--help")], prefixes)
@@ -137,13 +139,13 @@ class Parser(argparse.ArgumentParser):
         return args, dotted
 
     def only(self, dotted: Mapping[str, Mapping[str, str]], learners: Sequence[str], learner: str) -> None:
-        """Refuses the fields of other learners than the one that is asked for."""
+        """Refuses the fields of learners other than the chosen one."""
         for name in learners:
             if dotted[name] and name != learner:
                 self.error(f"--{name}.* is for --learner {name}, and this is {learner}")
 
     def given(self, argv: Sequence[str]) -> set[str]:
-        """Names of the flags in ``argv``, as they are called in what ``parse`` gives; dotted ones apart."""
+        """Returns the names of the flags in ``argv``, as ``parse`` names them, without the dotted ones."""
         nothing = object()
         absent = {action.dest: None if isinstance(action.default, list) else nothing for action in self._actions}  # lists grow
         found, _ = self.parse_known_args(argv, argparse.Namespace(**absent))
@@ -151,10 +153,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def load_guests(names: Sequence[str] = ()) -> None:
-    """Runs outside code, each once: what installed packages offer under the entry point ``mjx_nero``, and files or modules.
+    """Runs outside code once each: the entry points ``mjx_nero`` of installed packages, and the named files or modules.
 
     Raises:
-        UserError: there is no such file or module, or it fails.
+        UserError: a file or module does not exist, or fails.
     """
     for entry in metadata.entry_points(group="mjx_nero"):
         with _blamed(f"{entry.name} ({entry.value})"):
@@ -162,7 +164,7 @@ def load_guests(names: Sequence[str] = ()) -> None:
     for name in names:
         with _blamed(name):
             if not name.endswith(".py"):
-                if os.getcwd() not in sys.path:  # a module beside the user, as for python -m
+                if os.getcwd() not in sys.path:  # a module in the current folder, as for python -m
                     sys.path.insert(0, os.getcwd())
                 importlib.import_module(name)
             elif (module := f"mjx_nero_guest_{pathlib.Path(name).resolve()}") not in sys.modules:
@@ -185,13 +187,13 @@ def _blamed(name: str) -> Iterator[None]:
 
 
 def listed(title: str, meanings: Mapping[str, str]) -> str:
-    """Names with what each means, a line each, for a help text."""
+    """Lists names and their meanings, one per line, for a help text."""
     width = max(map(len, meanings))
     return "\n".join([f"{title}:", *(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())])
 
 
 def fields_help(cfgs: Mapping[str, Any]) -> str:
-    """The dotted flags of the configs, each with its default and what it is, for the end of a help text."""
+    """Lists the dotted flags of the configs, each with its default and description, for the end of a help text."""
     lines = ["any config field, with its default:"]
     for prefix, cfg in cfgs.items():
         about = config.describe(cfg)
@@ -202,9 +204,9 @@ def fields_help(cfgs: Mapping[str, Any]) -> str:
 
 
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
-    """Runs a program: mistakes of the user end in one line on stderr and exit status 2, Ctrl-C in 130."""
+    """Runs a program. A user's mistake ends in one line on stderr and exit status 2, Ctrl-C in status 130."""
     try:
-        from mjx_nero.files import cache  # which needs what pip installs
+        from mjx_nero.files import cache  # needs installed packages
 
         cache.check_addresses()
         main(sys.argv[1:])
@@ -217,10 +219,10 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
             raise
         print(f"error: {missing(error)}", file=sys.stderr)
         code = 2
-    except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
+    except BrokenPipeError:  # the reader of our output is gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
-    except OSError as error:  # of a path that the user gave: too long a name, no permission, a full disk
+    except OSError as error:  # from a path that the user gave: a name too long, no permission, a full disk
         print(f"error: {UserError(str(error))}", file=sys.stderr)
         code = 2
     except BaseException as error:
@@ -230,20 +232,20 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
         sys.stdout.flush()
         os._exit(
             getattr(error, "code", 130)
-        )  # threads may be compiling still, and JAX before 0.11 crashes at the end of an interrupted compilation
+        )  # threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation
     sys.exit(code)
 
 
 def interrupted(error: BaseException) -> bool:
-    """True of Ctrl-C, also while a program calls native physics: JAX then raises an error of its own that tells of ours."""
+    """Returns whether an error is Ctrl-C. In a call to native physics, JAX raises its own error with ours in its text."""
     return isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error)
 
 
 def setup_jax() -> None:
-    """Settings for programs: full float32 products, and compiled code kept in the user's cache folder between runs."""
+    """Configures JAX for programs: full float32 products, and compiled code kept in the user's cache folder."""
     import jax
 
-    jax.config.update("jax_default_matmul_precision", "highest")  # TF32 in the physics or the learner costs success
+    jax.config.update("jax_default_matmul_precision", "highest")  # TF32 in physics or learner lowers the success rate
     from mjx_nero.files import cache
 
     kept = cache.folder()
@@ -253,11 +255,11 @@ def setup_jax() -> None:
             cache.heal(kept / "jax")
         os.environ.setdefault("WARP_CACHE_PATH", str(kept / "warp"))  # Warp reads it at its first use
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # a run has dozens of small programs
-    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)  # what it logs it raises as well: Ctrl-C, say
+    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)  # it also raises what it logs, such as Ctrl-C
 
 
 def called_as(command: str) -> str:
-    """Start of a command line to show: the program that the user called, the console script or the package."""
+    """Returns the start of a command line to show, for the program that the user called."""
     name = pathlib.Path(sys.argv[0]).name
     if name == f"{command}.py":
         return f"python {name}"
@@ -265,7 +267,7 @@ def called_as(command: str) -> str:
 
 
 def number(kind: Any) -> Callable[[str], Any]:
-    """Argparse type: what ``values.read`` takes for the annotation ``kind``, within its ``bounds``."""
+    """Makes an argparse type: any value that ``values.read`` accepts for the annotation ``kind``, within its ``bounds``."""
 
     def read(text: str) -> Any:
         try:
@@ -277,12 +279,12 @@ def number(kind: Any) -> Callable[[str], Any]:
 
 
 def fields(args: argparse.Namespace, cls: type) -> dict[str, Any]:
-    """The values of the flags that ``Parser.add_fields`` made, by the names of the fields."""
+    """Returns the values of the flags that ``Parser.add_fields`` made, by field name."""
     return {name: getattr(args, name) for name in config.marked(cls)}
 
 
 def _reader(kind: Any) -> dict[str, Any]:
-    """Argparse's words for a field's declared type."""
+    """Returns argparse's arguments for a field's declared type."""
     kind = next((each for each in typing.get_args(kind) if each is not type(None)), kind) if _optional(kind) else kind
     if kind is pathlib.Path:
         return {"type": path()}
@@ -296,7 +298,7 @@ def _optional(kind: Any) -> bool:
     return type(None) in typing.get_args(kind)
 
 
-positive = number(bounds.Count)  # a whole number from 1; 1e6 is one, 1_000 is none
+positive = number(bounds.Count)  # a whole number from 1; 1e6 is allowed, 1_000 is not
 positive_float = number(bounds.Positive)
 non_negative = number(bounds.NonNegative)
 share = number(Annotated[float, bounds.Bounds(0.0, 1.0, above=True)])
@@ -304,10 +306,10 @@ seed = number(bounds.Seed)
 
 
 def choices(text: str, what: str, valid: Collection[str]) -> list[str]:
-    """A list of names, each once, with commas between them.
+    """Reads a comma-separated list of names and drops repeated ones.
 
     Raises:
-        UserError: one that is not among the valid, or none at all.
+        UserError: a name is not valid, or the list is empty.
     """
     chosen = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     unknown = [name for name in chosen if name not in valid]
@@ -317,7 +319,7 @@ def choices(text: str, what: str, valid: Collection[str]) -> list[str]:
 
 
 def seeds(text: str) -> tuple[int, ...]:
-    """Argparse type: seeds and ranges of seeds, as in ``0-7`` or ``0,3,5``."""
+    """Argparse type: seeds and ranges of seeds, such as ``0-7`` or ``0,3,5``."""
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
@@ -330,12 +332,12 @@ def seeds(text: str) -> tuple[int, ...]:
 
 
 def at_most(most: int) -> Callable[[str], int]:
-    """Argparse type: a whole number from 1 to ``most``."""
+    """Makes an argparse type: a whole number from 1 to ``most``."""
     return number(Annotated[int, bounds.Bounds(1, most)])
 
 
 def path(*suffixes: str) -> Callable[[str], pathlib.Path]:
-    """Argparse type: a path that a file system takes, with one of these suffixes if any are given (``.mp4``)."""
+    """Makes an argparse type: a path that a file system accepts, with one of the suffixes (``.mp4``) if any are given."""
 
     def read(text: str) -> pathlib.Path:
         found = pathlib.Path(text)
@@ -354,7 +356,7 @@ def path(*suffixes: str) -> Callable[[str], pathlib.Path]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """Argparse type: width and height in pixels, even as encoders want them."""
+    """Argparse type: width and height in pixels, even numbers because encoders need them."""
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
     if not found or any(int(n) % 2 for n in found.groups()):
         raise argparse.ArgumentTypeError(f"takes even numbers of pixels as in 1280x720, got {values.short(text)}")

@@ -20,7 +20,7 @@ from mjx_nero.tools import cli
 if TYPE_CHECKING:
     from mjx_nero.runs.evaluation import Played
 
-RECORDED = 1000  # episodes at most, among which those that fail are looked for
+RECORDED = 1000  # maximum number of episodes that --failures searches
 
 
 def main(argv: Sequence[str]) -> None:
@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
             overrides=dotted["env"],
         )
     if args.failures and not args.video:
-        raise UserError("--failures chooses what a video shows: give --video FILE.mp4, too")
+        raise UserError("--failures selects the episodes of a video: pass --video FILE.mp4, too")
     for path in filter(None, (args.video, args.json)):
         files.check_writable(path)
     video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """Configs whose fields ``--help`` lists."""
+    """Returns the configs whose fields ``--help`` lists."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
     name = next(iter(env.controllers), "") if args.controller == EXPERT else args.controller
     return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
@@ -82,7 +82,7 @@ def _parser() -> cli.Parser:
     parser.add_impl()
     parser.add_fields(EvalCfg)
     parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three episodes")
-    parser.add_argument("--failures", action="store_true", help="show failed episodes in the video")
+    parser.add_argument("--failures", action="store_true", help="show only failed episodes in the video")
     parser.add_video()
     parser.add_argument("--json", type=cli.path(".json"), help="write the result as JSON")
     parser.add_argument("--view", action="store_true", help="play in a browser instead, until Ctrl-C (the extra view)")
@@ -90,14 +90,14 @@ def _parser() -> cli.Parser:
 
 
 def report(result: dict[str, Any]) -> None:
-    """Prints a result for people."""
+    """Prints a result as a table."""
     console.screen().print(table(result))
     if result.get("warning"):
         print(f"warning: {result['warning']}", file=sys.stderr)
 
 
 def draw(played: "Played", path: pathlib.Path, cfg: render.VideoCfg) -> None:
-    """Writes the video; says so where that cannot be."""
+    """Writes the video, or prints why it cannot."""
     screen, episodes = console.screen(), played.episodes
     try:
         with console.drawing(console.screen(stderr=True), path.name) as update:
@@ -109,7 +109,7 @@ def draw(played: "Played", path: pathlib.Path, cfg: render.VideoCfg) -> None:
 
 
 def table(result: dict[str, Any]) -> console.Table:
-    """The result for people."""
+    """Makes the table of a result."""
     low, high = result["success_rate_95"]
     who = result.get("controller") or result["agent"]
     title = f"{result['env']} · {who} · {result['backend']} · {result['episodes']} episodes"
@@ -138,6 +138,6 @@ def table(result: dict[str, Any]) -> console.Table:
         view.add(f"  {name}", "-" if value is None else f"{value:.3f}")
     view.add("NaN, overflows", f"{result['nan_count']}, {result['overflow_count']}")
     if result["diverged"]:
-        view.add("diverged", f"{result['diverged']} episodes: failures, and in no mean")
+        view.add("diverged", f"{result['diverged']} episodes: counted as failures, excluded from means")
     view.add("time", f"{result['seconds']:.1f} s, compilation included")
     return view

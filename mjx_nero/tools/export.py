@@ -1,4 +1,4 @@
-"""The command ``export``: a policy as ONNX, for machines without this package."""
+"""The command ``export``: writes a policy as ONNX, for machines without this package."""
 
 import pathlib
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ def main(argv: Sequence[str]) -> None:
     """The command line.
 
     Raises:
-        UserError: no such policy, a wrong argument, or the file cannot be written.
+        UserError: the policy does not exist, an argument is wrong, or the file cannot be written.
     """
     parser = cli.Parser(
-        "export", "Writes a policy as ONNX: normalisation and network as a graph, joints, terms, limits and rates as metadata."
+        "export", "Writes a policy as ONNX: normalization and network as a graph; joints, terms, limits and rates as metadata."
     )
     parser.add_load()
     parser.add_argument("policy", help=f"policy file, or name of a bundled policy ({', '.join(bundled.names())})")
@@ -41,12 +41,12 @@ def main(argv: Sequence[str]) -> None:
     made = onnx.model(trained, env)
     difference, p99 = onnx.check(made, trained)
     if difference > TOLERANCE:
-        raise UserError(f"ONNX Runtime and JAX differ by {difference:.1e} on {path}: nothing was written")
+        raise UserError(f"ONNX Runtime and JAX differ by {difference:.1e} on {path}: nothing was written; please report this")
     with files.whole(args.out) as part:
         onnx_package.save(made, str(part))
     print(
         f"{args.out}: {meta['env']}, {made.graph.input[0].type.tensor_type.shape.dim[1].dim_value} observations -> "
         f"{meta['action_size']} actions every {1000 * env.dt:.0f} ms\n"
         f"ONNX Runtime and JAX differ by at most {difference:.1e} over {onnx.tries(meta):,} observations; "
-        f"{1000 * p99:.3f} ms of one core for one (99th percentile)"
+        f"{1000 * p99:.3f} ms per observation on one core (99th percentile)"
     )

@@ -17,11 +17,11 @@ from mjx_nero.urdf.importer import import_urdf
 from mjx_nero.urdf.report import Report
 from mjx_nero.urdf.units import Units
 
-MOST_LINES = 12  # of warnings shown; report.json has all
+MOST_LINES = 12  # warnings to print; report.json has all
 
 _EPILOG = """\
-Files are read from the URDF's folder, from its package (a package.xml up to five folders above, or else the folder above urdf/,
-robots/ or xacro/), from packages beside these that it names, and from those given with --package.
+Files are read from the URDF's folder, from its package (the folder of a package.xml up to five levels above, or else the folder
+above urdf/, robots/ or xacro/), from packages beside that one, and from the packages given with --package.
 
   python -m mjx_nero import-urdf my_arm.urdf --out my_arm
   python -m mjx_nero import-urdf urdf/arm.urdf --out arm --package arm_description=. --gripper finger_joint --ee tcp
@@ -30,10 +30,10 @@ robots/ or xacro/), from packages beside these that it names, and from those giv
 
 
 def main(argv: Sequence[str]) -> None:
-    """Imports a URDF and prints what came of it.
+    """Imports a URDF and prints the result.
 
     Raises:
-        UserError: as ``import_urdf``, or the arguments are wrong.
+        UserError: see ``import_urdf``; or an argument is wrong.
     """
     parser = _parser()
     args, rest = parser.parse_known_args(argv)
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
     _print(report)
     if args.self_test:
         _test(report, args.tries)
-    # A bare name might be one of the package's robots.
+    # A bare name could be mistaken for one of the package's robots.
     out = shlex.quote(str(report.folder) if len(report.folder.parts) > 1 else f"./{report.folder}")
     console.line(console.screen(), f"next: {cli.called_as('inspect')} {out}; {cli.called_as('train')} --env reach --robot {out}")
 
@@ -70,43 +70,43 @@ def main(argv: Sequence[str]) -> None:
 def _parser() -> cli.Parser:
     parser = cli.Parser(
         "import-urdf",
-        "Makes a model folder of a URDF: model.xml, meshes/, robot.yaml (edit it) and report.json.",
+        "Makes a model folder from a URDF: model.xml, meshes/, robot.yaml (which you may edit) and report.json.",
         ends=_EPILOG,
     )
     parser.add_argument("file", type=cli.path(), help="URDF or xacro file")
-    parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to make")
+    parser.add_argument("--out", type=cli.path(), required=True, metavar="DIR", help="folder to create")
     parser.add_argument(
-        "--package", action="append", default=[], metavar="[NAME=]DIR", help="folder of package://NAME/; repeatable"
+        "--package", action="append", default=[], metavar="[NAME=]DIR", help="folder for package://NAME/; repeatable"
     )
     parser.add_argument("--arg", action="append", default=[], metavar="NAME:=VALUE", help="argument of a xacro file; repeatable")
     parser.add_argument("--gains", type=cli.path(), metavar="FILE", help="YAML: joint -> stiffness, damping, effort, speed")
-    parser.add_argument("--chain", metavar="BASE:TIP", help="selects one arm of a larger robot; the rest is held still")
+    parser.add_argument("--chain", metavar="BASE:TIP", help="import one arm of a larger robot and hold the rest still")
     parser.add_argument("--fix", action="append", default=[], metavar="JOINT[=VALUE]", help="hold a joint still; repeatable")
+    parser.add_argument("--gripper", metavar="J1,J2", help="joints that drive the gripper, or none (default: guessed)")
+    parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point [m] (default: between the fingertips)")
+    parser.add_argument("--open", metavar="J=VALUE,...", help="gripper positions when open [rad, m] (default: measured)")
     parser.add_argument(
-        "--gripper", metavar="J1,J2", help="joints that drive the gripper; none: there is no gripper (default: guessed)"
+        "--closed", metavar="J=VALUE,...", help="gripper positions when closed [rad, m] (default: where its shapes meet)"
     )
-    parser.add_argument("--ee", metavar="LINK[:X,Y,Z]", help="grasp point [m] (default: between the fingers' ends)")
-    parser.add_argument("--open", metavar="J=VALUE,...", help="the gripper's joints when open [rad, m] (default: measured)")
-    parser.add_argument("--closed", metavar="J=VALUE,...", help="positions when closed [rad, m] (default: where its shapes meet)")
     parser.add_argument("--home", metavar="J=VALUE,...", help="home positions of some joints [rad, m] (default: guessed)")
-    parser.add_argument("--degrees", action="store_true", help="read limits and velocities of hinges in degrees")
+    parser.add_argument("--degrees", action="store_true", help="read limits and velocities of hinges as degrees")
     parser.add_argument(
         "--scale",
         type=cli.positive_float,
         metavar="FACTOR",
-        help="factor of lengths except the meshes': 0.001 for millimetres",
+        help="scale of all lengths except those of meshes: 0.001 for millimetres",
     )
-    parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="factor of meshes, on top of their own")
-    parser.add_argument("--tries", type=cli.at_most(1000), metavar="N", help="tries of the self-test (default: 8)")
+    parser.add_argument("--mesh-scale", type=cli.positive_float, metavar="FACTOR", help="scale of meshes, on top of their own")
+    parser.add_argument("--tries", type=cli.at_most(1000), metavar="N", help="number of tries in the self-test (default: 8)")
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test in simulation")
-    parser.add_argument("--fixture", action="store_true", help="a thing with joints for scene.fixtures, not a robot")
+    parser.add_argument("--fixture", action="store_true", help="import a fixture with joints for scene.fixtures, not a robot")
     parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
     parser.add_argument("--force", action="store_true", help="replace an earlier import")
     return parser
 
 
 def _fixture(args: argparse.Namespace) -> None:
-    """Imports a fixture and says what terms may read of it."""
+    """Imports a fixture and prints the joints and sites that terms can use."""
     units = Units(args.degrees, args.scale, args.mesh_scale)
     pairs = _pairs(args.arg, "--arg takes NAME:=VALUE", ":=")
     made = import_fixture(args.file, args.out, _packages(args.package), args=pairs, units=units, force=args.force)
@@ -118,7 +118,7 @@ def _fixture(args: argparse.Namespace) -> None:
 
 
 def _test(report: Report, tries: int | None) -> None:
-    """Tries the robot in simulation. What comes of it stands in its report; a failure undoes nothing."""
+    """Tests the robot in simulation and adds the result to its report. A failure does not undo the import."""
     from mjx_nero.tools import self_test  # with JAX, which reading a URDF does without
 
     cli.setup_jax()
@@ -128,7 +128,7 @@ def _test(report: Report, tries: int | None) -> None:
 
 
 def _packages(items: Sequence[str]) -> Mapping[str, pathlib.Path]:
-    """Name -> folder; where no name is given the folder's package.xml has it."""
+    """Returns package folders by name. If no name is given, the folder's package.xml has it."""
     named = [item if "=" in item else f"{files.package_name(pathlib.Path(item).resolve())}={item}" for item in items]
     return {name: pathlib.Path(folder) for name, folder in _pairs(named, "--package takes NAME=DIR or DIR").items()}
 

@@ -19,16 +19,16 @@ def main(argv: Sequence[str]) -> None:
     parser.add_load()
     parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
     parser.add_argument("--preset", help="preset of the environment (default: the first)")
-    parser.add_argument("--robot", help="robot of the environment, or to inspect alone: a name, or an imported one's folder")
-    parser.add_argument("--object", metavar="FILE", help="show an object made of meshes instead: a file, a folder, or a name")
+    parser.add_argument("--robot", help="robot in the environment, or to inspect alone: a name, or the folder of an imported one")
+    parser.add_argument("--object", metavar="FILE", help="show a mesh object instead: a file, a folder or a name")
     parser.add_argument(
-        "--scale", type=cli.positive_float, default=1.0, help="factor of the lengths in that file (default: %(default)s)"
+        "--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths (default: %(default)s)"
     )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
-    parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="PNG of the robot at home")
+    parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="write a PNG of the robot at home")
     parser.add_argument(
-        "--cameras", type=cli.path(".png"), metavar="FILE", help="PNG of what its cameras see, with fields of --env.*"
+        "--cameras", type=cli.path(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
     )
     parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, dotted = parser.parse(argv, ("env",))
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> None:
     if args.object is not None:
         return _thing(args)
     if dotted["env"] and not args.cameras:
-        parser.error("fields of the environment are for its cameras: pass --cameras FILE, too")
+        parser.error("fields of the environment only affect its cameras: pass --cameras FILE, too")
     if args.name is None and args.robot is None:
         parser.error("name a robot, an environment or the folder of an imported robot")
     from mjx_nero.tools import self_test  # with Brax and MJX, which help does without
@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> None:
         console.wrote(screen, "picture", args.render)
     if args.cameras:
         if cfg is None:
-            parser.error("--cameras needs an environment: its states are what they see")
+            parser.error("--cameras needs an environment whose states it can show: name one")
         _see(config.override(cfg, dotted["env"]), args.cameras)
     if args.json:
         content: dict[str, Any] = {**dataclasses.asdict(report), "moves": [dataclasses.asdict(m) for m in moved]}

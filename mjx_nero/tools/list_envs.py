@@ -13,7 +13,7 @@ from mjx_nero.tools import cli
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    parser = cli.Parser("list-envs", "Lists the environments; inspect NAME shows one of them.")
+    parser = cli.Parser("list-envs", "Lists the environments. To show one of them, use inspect NAME.")
     parser.add_load()
     parser.parse(argv)
     console.screen().print(environment_table(environments()))
@@ -21,7 +21,7 @@ def main(argv: Sequence[str]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Environment:
-    """A line of ``list-envs``; an environment for any robot has no robot of its own."""
+    """A row of ``list-envs``; ``robot`` is None if the environment takes any robot."""
 
     name: str
     task: str
@@ -31,7 +31,7 @@ class Environment:
 
 
 def environments() -> tuple[Environment, ...]:
-    """Lists all environments. Builds no scene and traces no function: ``inspect`` shows the sizes."""
+    """Lists all environments, without building scenes or tracing functions; sizes are shown by ``inspect``."""
     known = [module.name for module in pkgutil.iter_modules(tasks.__path__)]
     out = []
     for name in registry.list_envs():
@@ -42,7 +42,7 @@ def environments() -> tuple[Environment, ...]:
 
 
 def environment_table(rows: Sequence[Environment]) -> console.Table:
-    """A line an environment."""
+    """Makes a table with one row per environment."""
     columns = ("name", "task", "robot", "presets", "policy")
     view = console.Table("environments", columns, left=columns)
     for row in rows:

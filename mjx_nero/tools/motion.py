@@ -1,4 +1,4 @@
-"""Every joint to its limits, in simulation."""
+"""Moves every joint to its limits, in simulation."""
 
 import dataclasses
 
@@ -9,20 +9,20 @@ from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 
-_NEAR = 0.01  # of a joint's range: there, for ``moves``
-_REST, _AFTER = 3.0, 4.0  # [s] before a movement, and after its target has arrived
-_LONGEST = 60.0  # [s] of a movement: a drive may be as slow as its file says
+_NEAR = 0.01  # share of a joint's range within which a target counts as reached
+_REST, _AFTER = 3.0, 4.0  # waiting time before a movement, and after its target has arrived [s]
+_LONGEST = 60.0  # maximum time of a movement [s]: a robot's file may declare very slow drives
 
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """A joint's way to a target that moves at the drive's speed limit.
+    """A joint's movement to a target that moves at the drive's speed limit.
 
     Attributes:
         start, target, end: positions [rad or m].
-        time: until within 1% of the joint's range for good [s]; None: not there.
-        fastest: [rad/s or m/s].
-        saturation: share of the time that the drive pushed with all its effort.
+        time: until the joint stays within 1% of its range of the target [s]; None: never.
+        fastest: maximum speed [rad/s or m/s].
+        saturation: share of time during which the drive was at its effort limit.
     """
 
     joint: str
@@ -35,10 +35,11 @@ class Move:
 
 
 def moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
-    """Every joint to its limits and the gripper closed and opened, in MuJoCo's C library.
+    """Moves every joint to its limits, and closes and opens the gripper, in MuJoCo's C library.
 
-    Position targets change once a control step, at the drives' speed limits, as in an environment; contacts are off. One joint of
-    the arm at a time, from home; the gripper's together, from the other end. A joint without limits is left out.
+    Position targets change once per control step, at the drives' speed limits, as in an environment; contacts are off. The arm's
+    joints move one at a time, from home; the gripper's move together, from one end to the other. Joints without limits are
+    skipped.
     """
     model, home, out = _alone(robot, sim), np.array(robot.home), []
     for i, name in enumerate(robot.arm.joints):
@@ -50,7 +51,7 @@ def moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
 
 
 def gripper_moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
-    """The gripper closed, then opened, as in ``moves``; a line a joint. Empty without a gripper."""
+    """Closes, then opens the gripper, as ``moves`` does; one movement per joint. Empty without a gripper."""
     if not robot.gripper.joints:
         return ()
     model, home, n = _alone(robot, sim), np.array(robot.home), len(robot.arm.joints)
@@ -61,7 +62,7 @@ def gripper_moves(robot: RobotCfg, sim: SimCfg) -> tuple[Move, ...]:
 
 
 def _alone(robot: RobotCfg, sim: SimCfg) -> mujoco.MjModel:
-    """The robot with its drives, without contacts."""
+    """Builds the robot with its drives, without contacts."""
     model = scene.build(robot, SceneCfg(objects={}, table=False), sim, visuals=False)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return model

@@ -1,4 +1,4 @@
-"""The table of public robots: imports each robot of a list and runs its self-test. See --help."""
+"""Makes the table of public robots: imports each robot of a list and runs its self-test. See --help."""
 
 import pathlib
 import re
@@ -17,7 +17,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
 TRIES = 16
-ENOUGH = 14  # of them succeed
+ENOUGH = 14  # successful tries for a robot to count
 _LONGEST = 300  # seconds for an import and its self-test
 _COLUMNS = ("robot", "repository, commit", "file", "flags", "opening", "grasped", "placed", "warnings")
 
@@ -33,18 +33,24 @@ class Public:
     flags: str = ""
     """Further flags of import-urdf."""
     packages: tuple[str, ...] = ()
-    """Folders OWNER+NAME/... of packages that it mentions; NAME=OWNER+NAME/... of one that it calls by another name."""
+    """Folders OWNER+NAME/... of packages that it uses; NAME=OWNER+NAME/... for one that it calls by another name."""
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    parser = cli.Parser("public-robots", "Imports the robots of a list, each with its self-test, and makes the table of it.")
-    parser.add_argument("list", type=cli.path(".yaml"), help="repositories with their commits, and robots")
-    parser.add_argument("--folder", type=cli.path(), required=True, help="folder of the repositories, each as OWNER+NAME")
-    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write the tables of all figures in the JSON file")
-    parser.add_argument("--robots", help="list of robots (default: all that the JSON file lacks); none: only the table")
-    parser.add_argument("--jobs", type=cli.at_most(100), default=1, help="number of robots at once (default: %(default)s)")
+    parser = cli.Parser("public-robots", "Imports every robot of a list, runs its self-test, and writes the table of results.")
+    parser.add_argument("list", type=cli.path(".yaml"), help="YAML file of repositories with their commits, and of robots")
+    parser.add_argument(
+        "--folder", type=cli.path(), required=True, help="folder that contains the repositories, each as OWNER+NAME"
+    )
+    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of results; new ones are added to it")
+    parser.add_argument("--markdown", type=cli.path(".md"), help="write the tables of all results in the JSON file")
+    parser.add_argument(
+        "--robots", help="list of robots, or none to only write the table (default: all robots that the JSON file lacks)"
+    )
+    parser.add_argument(
+        "--jobs", type=cli.at_most(100), default=1, help="number of robots to import at once (default: %(default)s)"
+    )
     args, _ = parser.parse(argv)
     commits, robots = read(args.list)
     files.check_writable(args.json)
@@ -63,10 +69,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
-    """Commits by repository, and robots by name.
+    """Returns commits by repository, and robots by name.
 
     Raises:
-        UserError: the file is no such list.
+        UserError: the file is not such a list.
     """
     held = files.read_yaml(path)
     if (
@@ -74,7 +80,7 @@ def read(path: pathlib.Path) -> tuple[dict[str, str], dict[str, Public]]:
         or set(held) != {"repositories", "robots"}
         or not all(isinstance(v, dict) for v in held.values())
     ):
-        raise UserError(f"{path} is no list of robots: give it the mappings 'repositories' and 'robots'")
+        raise UserError(f"{path} is not a list of robots: give it the mappings 'repositories' and 'robots'")
     commits = {name: values.read(str, commit, name) for name, commit in held["repositories"].items()}
     robots = {name: values.read(Public, robot, f"robots.{name}") for name, robot in held["robots"].items()}
     for name, robot in robots.items():
@@ -89,16 +95,16 @@ def figures(path: pathlib.Path) -> dict[str, Any]:
     """Reads the figures of a JSON file.
 
     Raises:
-        UserError: it is none, or no mapping.
+        UserError: the file is not JSON, or not a mapping.
     """
     held = files.read_json(path)
     if not isinstance(held, dict):
-        raise UserError(f"{path} holds no figures: name another file")
+        raise UserError(f"{path} holds no results of public-robots: name another file")
     return held
 
 
 def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
-    """Imports a robot and reads its self-test, or the line that says why that failed."""
+    """Imports a robot and returns its self-test, or the line that says why the import failed."""
     source = folder / robot.repository.replace("/", "+") / robot.file
     packages = [word for package in robot.packages for word in ("--package", _below(folder, package))]
     with tempfile.TemporaryDirectory() as scratch:
@@ -108,13 +114,13 @@ def trial(robot: Public, folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _below(folder: pathlib.Path, package: str) -> str:
-    """A package of the list as import-urdf takes it."""
+    """Formats a package of the list for import-urdf's --package."""
     name, sign, path = package.rpartition("=")
     return f"{name}{sign}{folder / path}"
 
 
 def _failure(command: str, *words: object) -> str:
-    """Returns the last line of a command that fails; empty if it succeeds."""
+    """Runs a command; returns its last line of output if it fails, else an empty text."""
     line = [sys.executable, "-m", "mjx_nero", command, *map(str, words)]
     try:
         done = subprocess.run(line, capture_output=True, text=True, timeout=_LONGEST, check=False)

@@ -1,4 +1,4 @@
-"""The command ``replay``: a logged run of an arm in a browser, beside what the simulation makes of the same targets."""
+"""The command ``replay``: shows a logged run of an arm in a browser, beside the simulation's prediction for its targets."""
 
 import dataclasses
 import pathlib
@@ -20,18 +20,18 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
-_APART = 0.8  # between the two arms [m]
-_RATE = 25.0  # pictures a second
-_SHORTEST, _FEWEST = 1.0, 20  # [s], readings
+_APART = 0.8  # distance between the two arms [m]
+_RATE = 25.0  # pictures per second
+_SHORTEST, _FEWEST = 1.0, 20  # minimum length of a log [s], and number of readings
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """An arm's run, and the run that the simulation predicts for its targets.
+    """An arm's run, and the simulation's prediction for its targets.
 
     Attributes:
-        times: of readings, from 0 on [s].
-        measured, predicted: of the arm's joints [k, n] [rad or m].
+        times: of the readings, from 0 on [s].
+        measured, predicted: positions of the arm's joints [k, n] [rad or m].
     """
 
     times: np.ndarray
@@ -39,18 +39,18 @@ class Run:
     predicted: np.ndarray
 
     def errors(self) -> np.ndarray:
-        """Root mean square difference of measured and predicted positions, by joint [n] [rad or m]."""
+        """Returns the root mean square of predicted minus measured positions, by joint [n] [rad or m]."""
         return np.sqrt(np.mean((self.predicted - self.measured) ** 2, axis=0))
 
 
 def run_of(path: pathlib.Path, robot: RobotCfg, dt: float, drives: pathlib.Path | None = None) -> Run:
-    """Simulates a log's targets, from its first reading on.
+    """Simulates a log's targets, starting from its first reading.
 
     Args:
-        drives: file of ``identify``; None: the model's own.
+        drives: file from ``identify``; None: the model's own drives.
 
     Raises:
-        UserError: a file is missing, or of another robot.
+        UserError: a file is missing, or from another robot.
     """
     plant = Plant(robot, dt)
     log = logs.read(path, robot.arm.joints, _SHORTEST, _FEWEST)
@@ -62,7 +62,7 @@ def run_of(path: pathlib.Path, robot: RobotCfg, dt: float, drives: pathlib.Path 
 def _drives(path: pathlib.Path, robot: RobotCfg, nominal: Drives) -> Drives:
     found = identified.read(path)
     if found.robot != robot.name or set(found.joints) != set(robot.arm.joints):
-        raise UserError(f"{path} is of {found.robot} with joints {', '.join(found.joints)}, the robot is {robot.name}")
+        raise UserError(f"{path} is for {found.robot} with joints {', '.join(found.joints)}, but the robot is {robot.name}")
     joints, known = [found.joints[name] for name in robot.arm.joints], {}
     for field in ("stiffness", "damping", "armature", "friction", "offset"):
         values = [getattr(joint, field) for joint in joints]
@@ -71,7 +71,7 @@ def _drives(path: pathlib.Path, robot: RobotCfg, nominal: Drives) -> Drives:
 
 
 class Picture:
-    """Two robots in a browser, the predicted one beside the measured one and half transparent.
+    """Two robots in a browser: the measured one, and beside it the predicted one, half transparent.
 
     Args:
         server: a ``viser.ViserServer``.
@@ -100,7 +100,7 @@ class Picture:
         self.show(0.0)
 
     def show(self, time: float) -> None:
-        """Poses both robots as they were at a time [s]."""
+        """Shows both robots as they were at a time [s]."""
         k = min(int(np.searchsorted(self._run.times, time)), len(self._run.times) - 1)
         poses = []
         for positions in (self._run.measured, self._run.predicted):
@@ -114,7 +114,7 @@ class Picture:
                 handle.position, handle.wxyz = position + [0.0, which * _APART, 0.0], quaternion
 
     def step(self) -> None:
-        """Shows the next picture; while playing, time goes on."""
+        """Shows the next picture; advances the time while playing."""
         if self.playing.value:
             self.slider.value = (self.slider.value + 1 / _RATE) % float(self._run.times[-1])
         self.show(self.slider.value)
@@ -126,14 +126,14 @@ def main(argv: Sequence[str]) -> None:
     Raises:
         UserError: a file is missing or malformed, or the port is taken.
     """
-    says = "Shows a logged run of an arm in a browser, beside the simulation's prediction, and says how far they differ."
+    says = "Shows a logged run of an arm in a browser, beside the simulation's prediction, and prints how far they differ."
     parser = cli.Parser("replay", says)
     add = parser.add_argument
-    add("log", type=cli.path(".csv"), help="log that deploy --log or record wrote")
-    add("--robot", required=True, help="name, or folder of an imported robot")
-    add("--identified", type=cli.path(".yaml", ".yml"), help="file of identify, whose drives the simulation takes")
-    add("--dt", type=cli.positive_float, default=0.005, help="physics step, s (default: %(default)s)")
-    add("--no-view", action="store_true", help="print how far they differ, and open no page")
+    add("log", type=cli.path(".csv"), help="log written by deploy --log or record")
+    add("--robot", required=True, help="name of a robot, or folder of an imported one")
+    add("--identified", type=cli.path(".yaml", ".yml"), help="file from identify, whose drives the simulation uses")
+    add("--dt", type=cli.positive_float, default=0.005, help="physics step [s] (default: %(default)s)")
+    add("--no-view", action="store_true", help="only print how far they differ")
     parser.add_address()
     args, _ = parser.parse(argv)
     robot = registry.robot(args.robot)

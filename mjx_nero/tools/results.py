@@ -1,4 +1,4 @@
-"""The tables of results, made by one command for all environments: python -m mjx_nero results --json results.json. See --help."""
+"""Makes the tables of results for all environments: python -m mjx_nero results --json results.json. See --help."""
 
 import argparse
 import dataclasses
@@ -18,8 +18,8 @@ from mjx_nero.tools import cli
 
 Row = dict[str, Any]
 WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
-SEEDS = "seeds"  # of an environment whose training is not complete
-EVALUATIONS = 48  # of a seed, if it needs all of its env steps
+SEEDS = "seeds"  # key of the seeds of an environment whose training is not complete
+EVALUATIONS = 48  # evaluations of a seed that needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
 _PAGE = """# Benchmarks
 
@@ -44,19 +44,25 @@ def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
         "results",
-        "Measures how every environment learns and what the bundled policies achieve, and writes the tables.",
+        "Measures how every environment learns and what the bundled policies achieve, and writes the tables of results.",
         ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_load()
-    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of the figures; new ones are added to it")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write the JSON file's figures as a page, one table per task")
+    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of results; new ones are added to it")
     parser.add_argument(
-        "--what", help=f"list of {', '.join(WHATS)}; none: only the table (default: all)", default=",".join(WHATS)
+        "--markdown", type=cli.path(".md"), help="write all results in the JSON file as a page, one table per task"
     )
-    parser.add_argument("--envs", help="list of environments (default: all that can be learnt)")
-    parser.add_argument("--preset", default="default", help="preset that learns, or whose policies play (default: %(default)s)")
+    parser.add_argument(
+        "--what", help=f"list of {', '.join(WHATS)}, or none to only show the table (default: all)", default=",".join(WHATS)
+    )
+    parser.add_argument("--envs", help="list of environments (default: all that can be trained)")
+    parser.add_argument(
+        "--preset", default="default", help="preset to train, or whose policies to measure (default: %(default)s)"
+    )
     parser.add_argument("--seeds", type=cli.positive, default=8, help="seeds per environment (default: %(default)s)")
-    parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes a policy (default: %(default)s)")
+    parser.add_argument(
+        "--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes per policy (default: %(default)s)"
+    )
     args, _ = parser.parse(argv)
     whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
     files.check_writable(args.json)
@@ -64,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
     envs = cli.choices(args.envs, "env", registry.list_envs()) if args.envs else learnable()
     envs = [env for env in envs if args.preset in registry.list_presets(env)]
     if not envs:
-        raise UserError(f"none of these environments has the preset {args.preset!r}")
+        raise UserError(f"none of these environments has the preset {args.preset!r}: pass another --preset or other --envs")
     cli.setup_jax()
     from mjx_nero.tools.benchmark import machine
 
@@ -97,15 +103,15 @@ def learnable() -> list[str]:
 
 
 def named(env: str, preset: str) -> str:
-    """The name under which a preset's figures are kept: ``nero_lift`` for the default, ``nero_lift sim2real`` for another."""
+    """Returns the key of a preset's results: ``nero_lift`` for the default preset, ``nero_lift sim2real`` for another."""
     return env if preset == "default" else f"{env} {preset}"
 
 
 def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
-    """Figures by environment and kind.
+    """Reads the results by environment and kind; empty if there is no file yet.
 
     Raises:
-        UserError: the file is none that this command wrote.
+        UserError: the file was not written by this command.
     """
     if not path.exists():
         return {}
@@ -118,10 +124,12 @@ def read(path: pathlib.Path) -> dict[str, dict[str, Row]]:
 
 
 def _learning(env: str, args: argparse.Namespace, before: Row | None, here: Row) -> Iterator[tuple[str, Row]]:
-    """All seeds of an environment, by the settings that ``train.py --env`` has: the seeds so far after each, then their summary.
+    """Trains all seeds of an environment with the settings of ``train.py --env``. Yields the seeds so far after each of them,
+    then their summary.
 
     Args:
-        before: the seeds that an interrupted command kept. They count if the same was measured ``here``: version and machine.
+        before: seeds that an interrupted command kept. They count if settings, version and machine are the same.
+        here: this version and machine.
     """
     from mjx_nero.runs import cfg as run_cfg  # with Brax and MJX, which help does without
     from mjx_nero.tools.benchmark import learning
@@ -145,7 +153,7 @@ def _learning(env: str, args: argparse.Namespace, before: Row | None, here: Row)
 
 
 def _policies(env: str, args: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """The preset's bundled policy, in MuJoCo's C library and, where there is a GPU, on Warp."""
+    """Measures the preset's bundled policy in MuJoCo's C library and, if there is a GPU, on Warp."""
     from mjx_nero.runs import evaluation, signals
     from mjx_nero.sim.physics import warp_available
 
@@ -165,7 +173,7 @@ def rows(held: dict[str, dict[str, Row]]) -> Iterator[tuple[str, ...]]:
     for env, kinds in held.items():
         learnt, native, warp = (kinds.get(name) for name in ("learning", "native", "warp"))
         if not (learnt or native or warp):
-            continue  # its first seeds are not complete
+            continue  # training is not complete
         of = dict.fromkeys(f"{row['version']}, {row['machine']}" for row in (learnt, native, warp) if row)
         spread = [""] * 4
         if learnt:
@@ -188,7 +196,7 @@ def page(cells: Sequence[tuple[str, ...]], json_name: str, page_name: str) -> st
 
 
 def task_of(env: str) -> str:
-    """The task's name: an environment's name without the arm's, as ``nero_lift_obstacles`` is ``lift_obstacles``."""
+    """Returns the task's name, which is the environment's without the arm's: ``lift_obstacles`` for ``nero_lift_obstacles``."""
     env, *preset = env.split(" ")
     names = [name for name in registry.list_envs() if registry.robot_of(name) is None and env.endswith(f"_{name}")]
     return " ".join([max(names, key=len, default=env), *preset])
@@ -202,7 +210,7 @@ def _table(lines: Sequence[tuple[str, ...]]) -> str:
 
 
 def _said(name: str, row: Row) -> str:
-    """A line's end: what was measured."""
+    """Formats a measurement for the end of a log line."""
     if name == SEEDS:
         last = row["rows"][-1]
         return f"{last['seed']}: success {last['success_rate']:.3f} after {last['env_steps'] / 1e6:.1f} M steps"
@@ -214,7 +222,7 @@ def _seeds(row: Row) -> str:
 
 
 def _spread(row: Row, name: str, unit: float = 1.0, word: str = "") -> str:
-    """Median and worst of the seeds."""
+    """Formats the median and the worst of the seeds."""
 
     def text(which: str) -> str:
         value = row[f"{name}_{which}"]

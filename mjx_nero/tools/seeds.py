@@ -47,7 +47,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
         the rows of all seeds in the folder, the folder, and an exit status.
 
     Raises:
-        UserError: something that the user can mend.
+        UserError: something that the user can fix.
         signals.Signalled: a signal came before training began.
     """
     if machines.several():
@@ -115,10 +115,9 @@ def _earlier(path: pathlib.Path) -> list[Row]:
 
 
 def summary(rows: list[Row]) -> Row:
-    """Summarises all seeds, with intervals at 95%: how many reached 95% success (Wilson), mean success (Student's t), and seconds
-    until then.
+    """Summarizes all seeds, with 95% intervals: how many reached 95% success (Wilson), and the mean success (Student's t).
 
-    The seconds are the median over seeds that got there, and the mean's interval if all did.
+    The seconds to 95% success are a median over the seeds that reached it, and an interval of the mean if all did.
     """
     seconds = [row["seconds_to_95"] for row in rows if row["seconds_to_95"] is not None]
     successes = [row["success_rate"] for row in rows]

@@ -23,7 +23,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
 
     Args:
         dotted: fields by prefix.
-        flags: those that the user gave.
+        flags: names of the flags that the user passed.
     """
     sizes = {k: v for k, v in (("num_envs", args.num_envs), ("num_timesteps", args.num_timesteps)) if v}
     learner.find(args.learner)
@@ -59,15 +59,15 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
 
 
 def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[str, Any]], trust: bool = False) -> RunCfg:
-    """The run itself, or that of the folder which it is to go on with.
+    """Returns the run itself, or the run of the folder that it resumes.
 
     Raises:
-        UserError: flags that contradict each other or that run.
+        UserError: flags contradict each other or the resumed run.
     """
     folder = run.restore
     if run.auto:
         if not run.out or run.restore:
-            raise UserError("--resume auto needs --out, the folder to go on with or to start in, and no --restore")
+            raise UserError("--resume auto needs --out, the folder to resume or to start in, and no --restore")
         folder = run.out if saved(run.out) else None
     if folder is None or not (folder / CONFIG).is_file() or run.out not in (None, folder):
         return run
@@ -75,23 +75,23 @@ def going_on(run: RunCfg, flags: Collection[str], dotted: Mapping[str, Mapping[s
 
 
 def report(summary: dict[str, Any], films: bool) -> None:
-    """Describes a run's result for people."""
+    """Prints a run's result."""
     pace = f"{summary['env_steps']:,} env steps in {summary['train_s']:.0f} s ({summary['steps_per_s']:,} steps/s)"
     success, best = summary["evaluation"]["success_rate"], summary.get("best")
     print(f"{pace}, success {success:.1%}")
     if best and best["success_rate"] > success:
         print(f"best.safetensors did better: {best['success_rate']:.1%}, after {best['env_steps']:,} env steps")
     names = "policy.safetensors, best.safetensors, curve.png, metrics.jsonl, checkpoints/"
-    print(f"{summary['folder']}: {names}{', video.mp4 (to be drawn now)' if films else ''}", flush=True)
+    print(f"{summary['folder']}: {names}{', video.mp4 (drawn next)' if films else ''}", flush=True)
     if summary["nan_count"] or summary["overflow_count"]:
-        diverged = f"{summary['nan_count']} episodes ended as they diverged (NaN, or faster than {MAX_SPEED:,.0f} rad/s or m/s)"
+        diverged = f"{summary['nan_count']} episodes diverged and ended (NaN, or faster than {MAX_SPEED:,.0f} rad/s or m/s)"
         print(f"physics: {diverged}, {summary['overflow_count']} steps with lost contacts")
     if summary["lost"]:
-        print(f"lost for want of a disk to write to: {', '.join(f'{n} x {name}' for name, n in summary['lost'].items())}")
+        print(f"lost because the disk could not be written: {', '.join(f'{n} x {name}' for name, n in summary['lost'].items())}")
 
 
 def report_seeds(rows: list[dict[str, Any]], folder: pathlib.Path) -> None:
-    """A row a seed, and what they come to together, for people."""
+    """Prints one row per seed, and a summary."""
     table = console.Table(
         f"{folder}", ("seed", "success", "95% interval", "s to 95%", "env steps", "s", "ended"), left=("ended",)
     )

@@ -36,7 +36,7 @@ def test_what_is_written_in_pieces_is_read(form, tmp_path):
         for name in own.arrays:
             assert back.arrays[name].dtype == own.arrays[name].dtype
             np.testing.assert_array_equal(back.arrays[name], own.arrays[name])
-    with pytest.raises(UserError, match="the data set has no 'pictures': it has observation.state, action"):
+    with pytest.raises(UserError, match="the data set has no 'pictures': choose from observation.state, action"):
         found.column("pictures")
 
 
@@ -109,7 +109,7 @@ def test_folders_of_something_else_are_refused(form, tmp_path):
             pass
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("")
-    with pytest.raises(UserError, match="is not empty, and holds no demonstrations: pass another --out"):
+    with pytest.raises(UserError, match="is not empty and holds no demonstrations: pass another --out"):
         with writer(tmp_path / "full", schema(), form):
             pass
     assert os.listdir(tmp_path / "full") == ["thesis.tex"]
@@ -137,7 +137,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_whole(form, films, tmp_path
     make, about = (filmed, with_camera()) if films else (episode, schema())
     with writer(tmp_path, about, form) as out:
         out.put([make(0)])
-    with pytest.raises(UserError, match="File too large.*; what was written before is whole: make room, and give"):
+    with pytest.raises(UserError, match="File too large.*; everything written before is intact: make room, and repeat"):
         with writer(tmp_path, about, form) as out, full_disk(40_000):
             out.put([make(i, 1200) for i in range(1, 3)])
     found = open_dataset(tmp_path)
@@ -154,7 +154,7 @@ def test_what_is_damaged_is_told(form, tmp_path):
         out.put([episode(0)])
     data = next((tmp_path / "data").rglob("*.*"))
     data.write_bytes(data.read_bytes()[:100])
-    with pytest.raises(UserError, match="is damaged: its steps of action cannot be read, make it anew"):
+    with pytest.raises(UserError, match=r"is damaged \(its steps of action cannot be read\): write the data set again"):
         open_dataset(tmp_path).column("action")
     (tmp_path / "meta/mjx_nero.json").write_text('{"fps": 50}')
     with pytest.raises(UserError, match="does not describe demonstrations of mjx_nero, or it is damaged"):

@@ -143,7 +143,7 @@ def test_closing_leaves_the_motors_on(bench):
 
 def test_a_silent_bus_is_refused(bench):
     bench.emulated.faults.cut = True
-    with pytest.raises(UserError, match="no (Piper|Nero) is heard at virtual:"):
+    with pytest.raises(UserError, match="no (Piper|Nero) answers at virtual:"):
         bench.start()
     assert bench.arm._bus._is_shutdown  # or python-can complains of it in a line of its own
 

@@ -16,7 +16,7 @@ from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.server import Server, Spec
 from mjx_nero.errors import UserError
 
-IN_USE = "is in use by another program of this computer, which goes on: end that one first"
+IN_USE = "is in use by another program on this computer: end that program first"
 
 
 def test_a_port_is_taken_once_until_it_is_let_go():

@@ -106,7 +106,7 @@ def test_the_delay_of_late_drives_is_measured(lift, told):
 
 def test_what_a_person_saw_counts(told):
     found, _ = walked(told, ask=lambda question: "elbow" not in question)
-    assert "nobody saw it move as was said" in wrong(found, "elbow_flex")[0] and wrong(found, "shoulder_pan") == []
+    assert "you did not see it move as announced" in wrong(found, "elbow_flex")[0] and wrong(found, "shoulder_pan") == []
 
 
 def test_somebody_stops_the_walk(told):
@@ -146,12 +146,12 @@ def test_offsets_are_subtracted(told):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[]", "is no file of identify or deploy --check"),
-        ("robot: so_arm101\ndelay: {value: 0}\njoints: 3\n", "is no file of identify or deploy --check"),
-        ("robot: nero\ndelay: {value: 0.01}\njoints: {}\n", "is of nero with joints"),
-        ("robot: so_arm101\ndelay: {value: 0.01}\njoints: {elbow: {offset: {value: 0}}}\n", "is of so_arm101 with joints elbow"),
-        ("robot: so_arm101\ndelay: {value: 3}\njoints: {}\n", "a delay is 0 to 1 s"),
-        ("robot: so_arm101\ndelay: {value: .nan}\njoints: {}\n", "is no file of identify"),
+        ("[]", "is not a file of identify or deploy --check"),
+        ("robot: so_arm101\ndelay: {value: 0}\njoints: 3\n", "is not a file of identify or deploy --check"),
+        ("robot: nero\ndelay: {value: 0.01}\njoints: {}\n", "is for nero with joints"),
+        ("robot: so_arm101\ndelay: {value: 0.01}\njoints: {elbow: {offset: {value: 0}}}\n", "is for so_arm101 with joints elbow"),
+        ("robot: so_arm101\ndelay: {value: 3}\njoints: {}\n", "the delay must be 0 to 1 s"),
+        ("robot: so_arm101\ndelay: {value: .nan}\njoints: {}\n", "is not a file of identify"),
     ],
 )
 def test_files_of_others_are_one_line(told, tmp_path, text, message):

@@ -226,7 +226,7 @@ def test_nobody_at_the_address_is_one_line(told, bench):
     with pytest.raises(UserError, match="no controller answers at 127.0.0.1:1: "):
         cobotta.of(told, arms.Clock(), "127.0.0.1:1").connect()
     for port in (":5", "host:port", "host:99999"):
-        with pytest.raises(UserError, match="--port of a Cobotta is HOST or HOST:PORT"):
+        with pytest.raises(UserError, match="--port of a Cobotta takes HOST or HOST:PORT"):
             cobotta.of(told, arms.Clock(), port)
     with pytest.raises(UserError, match="no RG6 answers at 127.0.0.1:1"):
         cobotta.of(told, arms.Clock(), bench.port.name, "127.0.0.1:1").connect()

@@ -56,9 +56,9 @@ def test_what_does_not_fit_is_refused(name, value):
 
 @pytest.mark.parametrize("name", [name for name in feetech.REGISTERS if name not in feetech.WRITABLE])
 def test_nothing_else_can_be_written(name):
-    with pytest.raises(ValueError, match="is not written"):
+    with pytest.raises(ValueError, match="must not be written"):
         feetech.Bus(None).write(1, name, 0)
-    with pytest.raises(ValueError, match="is not written"):
+    with pytest.raises(ValueError, match="must not be written"):
         feetech.Bus(None).write_all(name, {1: 0})
 
 
@@ -265,10 +265,10 @@ def test_a_late_answer_is_not_taken_for_the_next_one(bench):
 @pytest.mark.parametrize(
     ("register", "value", "message"),
     [
-        ("homing_offset", 17, "servo 3 has homing_offset 17, the calibration file -26: it is of another arm"),
+        ("homing_offset", 17, "servo 3 has homing_offset 17, but the calibration file has -26: the file is for another arm"),
         ("max_position", 4000, "servo 3 has max_position 4000"),
         ("mode", 1, "servo 3 has mode 1"),
-        ("model", 1284, "servo 3 is of model 1284, not an STS3215"),
+        ("model", 1284, "servo 3 is a model 1284, not an STS3215"),
     ],
 )
 def test_another_arm_than_the_files_is_refused(bench, register, value, message):
@@ -294,7 +294,7 @@ def test_the_calibrated_range_narrows_the_limits(told):
     narrow = np.array(told["joints"]["lower"]) + 0.1
     limits = setup.safety_of(told, ranges=(narrow, np.array(told["joints"]["upper"]))).limits
     np.testing.assert_allclose(limits.lower[:5], narrow[:5])
-    with pytest.raises(UserError, match=r"home of shoulder_pan is 0\.00, and the arm's own range is 0\.20 to"):
+    with pytest.raises(UserError, match=r"home of shoulder_pan is 0\.00, but the arm's own range is 0\.20 to"):
         setup.safety_of(told, ranges=(np.full(6, 0.2), np.array(told["joints"]["upper"])))
 
 
@@ -312,10 +312,10 @@ def test_degrees_are_lerobots(told):
 
 
 BAD = [
-    ("", "no calibration file of LeRobot"),
-    ("[]", "no calibration file of LeRobot|has no joint"),
+    ("", "not a calibration file of LeRobot"),
+    ("[]", "not a calibration file of LeRobot|has no joint"),
     ("{}", "has no joint shoulder_pan"),
-    ('{"id": 1', "no calibration file of LeRobot"),
+    ('{"id": 1', "not a calibration file of LeRobot"),
 ]
 
 
@@ -329,12 +329,12 @@ def test_files_that_are_no_calibration(tmp_path, told, text, message):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("id", 1, "two joints have one id"),
-        ("id", True, "no calibration file"),
+        ("id", 1, "two joints have the same id"),
+        ("id", True, "not a calibration file of LeRobot"),
         ("range_max", 5000, "elbow_flex has no range within 0 to 4095"),
         ("range_min", 4000, "elbow_flex has no range within 0 to 4095"),
-        ("drive_mode", 1, "elbow_flex has a drive_mode of its own"),
-        ("homing_offset", "x", "no calibration file"),
+        ("drive_mode", 1, "elbow_flex has a drive_mode other than 0"),
+        ("homing_offset", "x", "not a calibration file of LeRobot"),
     ],
 )
 def test_calibrations_that_are_wrong(tmp_path, told, field, value, message):
@@ -346,7 +346,7 @@ def test_calibrations_that_are_wrong(tmp_path, told, field, value, message):
 
 
 def test_another_robots_policy_is_refused(told):
-    with pytest.raises(UserError, match="the policy is for so_arm101, and --arm so100 is a so_arm100"):
+    with pytest.raises(UserError, match="the policy is for so_arm101, but --arm so100 is a so_arm100"):
         drivers.make("so100", {"port": "/dev/null", "calibration": "c.json"}, told, arms.Clock())
 
 

@@ -63,7 +63,7 @@ def test_the_middle_of_the_region_is_the_goal():
 def test_what_an_arm_cannot_give_is_refused():
     told = told_by(mjx_nero.make("nero_push", impl="native"), "nero_push")
     told["observations"][0]["term"] = "object_velocity"
-    with pytest.raises(UserError, match="observes object_velocity, which an arm cannot give: known are joint_pos, "):
+    with pytest.raises(UserError, match="observes object_velocity, not available on an arm: train with joint_pos, "):
         Observer(told, setup.body_of(told), None, places.Known())
     del told["observations"][0]["term"]
     with pytest.raises(UserError, match="export the policy again"):
@@ -126,7 +126,7 @@ def test_a_file_is_read_again_when_it_changes(tmp_path):
     assert source.find("ball", 0.0).position[0] == 0.25
     path.write_text("half a li")
     assert source.find("ball", 0.0).position[0] == 0.25
-    with pytest.raises(UserError, match="holds no place of an object: not JSON"):
+    with pytest.raises(UserError, match="does not hold the position of an object: not JSON"):
         places.of(str(path))
     with pytest.raises(UserError, match="cannot read"):
         places.of(str(tmp_path / "none.json"))

@@ -37,9 +37,9 @@ def test_the_whole_height_where_the_field_is_the_same():
 
 
 def test_cameras_that_see_too_little_are_refused():
-    with pytest.raises(UserError, match="'front' sees 40 degrees from top to bottom, the policy 45"):
+    with pytest.raises(UserError, match="'front' has a fovy of 40 degrees, but the policy needs 45"):
         pictures.View("front", TOLD["front"], 40.0)
-    with pytest.raises(UserError, match="gives 300 x 480 pixels: the policy sees further to the sides"):
+    with pytest.raises(UserError, match="gives 300 x 480 pixels, but the policy needs a wider one"):
         pictures.View("front", TOLD["front"], 45.0)(board(480, 300))
 
 
@@ -78,7 +78,7 @@ def test_a_video_is_a_camera(tmp_path):
 
 
 def test_no_picture_and_no_camera_are_said(tmp_path):
-    with pytest.raises(UserError, match="no camera '/dev/nothing'"):
+    with pytest.raises(UserError, match="cannot open camera '/dev/nothing'"):
         pictures.opened("/dev/nothing")
     pictures._FIRST, before = 0.1, pictures._FIRST
     with pytest.raises(UserError, match="'front' gives no picture"):
@@ -89,7 +89,7 @@ def test_no_picture_and_no_camera_are_said(tmp_path):
 @pytest.mark.parametrize("text", ["", "[]", '{"side": {"camera": 0}}', '{"front": 1}', '{"front": {"camera": 0, "fovy": 200}}'])
 def test_files_that_say_something_else(tmp_path, text):
     (tmp_path / "c.json").write_text(text)
-    with pytest.raises(UserError, match='c.json is to say, as JSON, a "camera"'):
+    with pytest.raises(UserError, match='c.json must be JSON with a "camera"'):
         pictures.read(tmp_path / "c.json", TOLD)
 
 

@@ -63,7 +63,7 @@ def test_a_file_that_nobody_touches_stops(tmp_path, age, holds):
         os.utime(path, (time.time() - age,) * 2)
     with stop.operator(path) as asked:
         assert (asked() is not None) == holds
-        assert not holds or asked().text == f"nobody has touched {path} for 0.5 s"
+        assert not holds or asked().text == f"{path} was not touched for 0.5 s"
 
 
 def test_a_signal_ends_a_run_in_hold(lift, tmp_path):

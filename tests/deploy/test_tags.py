@@ -101,9 +101,9 @@ def test_quaternions_of_any_turn():
     [
         ({"intrinsics": [1, 2, 3]}, "needs camera, intrinsics of four numbers"),
         ({"tags": {"x": {}}}, "needs camera"),
-        ({"tags": {}}, "there is a tag to look for"),
+        ({"tags": {}}, "tags must name at least one"),
         ({"quaternion": [2, 0, 0, 0]}, "quaternion four of length 1"),
-        ({"size": 0}, "size are above zero"),
+        ({"size": 0}, r"size \[m\] must be above 0"),
     ],
 )
 def test_files_that_say_something_else(tmp_path, change, message):

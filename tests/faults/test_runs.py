@@ -183,11 +183,11 @@ def test_one_command_starts_goes_on_and_is_done(train, at_row, undisturbed, tmp_
     (run / "summary.json").unlink()  # killed between the last checkpoint and the summary
     for _ in range(2):
         code, out, err = train(*command)
-        assert code == 0 and "has made its 640 steps already" in err and "nothing is left to do" in err
+        assert code == 0 and "has already made its 640 steps" in err and "nothing is left to do" in err
         assert "640 env steps" in out
     assert json.loads((run / "summary.json").read_text())["env_steps"] == STEPS
     code, _, err = train("--restore", "run", steps=0)
-    assert code == 2 and "has made its 640 steps already: pass a larger --num-timesteps" in err
+    assert code == 2 and "has already made its 640 steps: pass a larger --num-timesteps" in err
 
 
 def stopping_at(steps, save):
@@ -215,12 +215,12 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
 REFUSED = [
     (
         ["--seed", 4],
-        "--seed is 4, and run is a run with 0: leave the flag out to resume that run, or start another with",
+        "--seed is 4, but run is a run with 0: leave the flag out to resume that run, or start a new one with",
     ),
-    (["--env", "nero_reach"], "--env is nero_reach, and run is a run with nero_lift"),
-    (["--num-envs", 16], "--num-envs is 16, and run is a run with 8"),
-    (["--ppo.learning_rate", 0.1], "--ppo.learning_rate is 0.1, and run is a run with 0.0003"),
-    (["--env.sim.iterations", 7], "--env.sim.iterations is 7, and run is a run with 10"),
+    (["--env", "nero_reach"], "--env is nero_reach, but run is a run with nero_lift"),
+    (["--num-envs", 16], "--num-envs is 16, but run is a run with 8"),
+    (["--ppo.learning_rate", 0.1], "--ppo.learning_rate is 0.1, but run is a run with 0.0003"),
+    (["--env.sim.iterations", 7], "--env.sim.iterations is 7, but run is a run with 10"),
 ]
 
 
@@ -243,7 +243,7 @@ def test_minutes_go_on(train, at_row, tmp_path, monkeypatch):
     (tmp_path / "before").write_text((tmp_path / "run" / "summary.json").read_text())
     before = json.loads((tmp_path / "before").read_text())["train_s"]
     code, _, err = train("--restore", "run", "--max-minutes", 1e-9, steps=0)
-    assert code == 2 and "has used its 1e-09 minutes already: pass a larger --max-minutes" in err
+    assert code == 2 and "has already used its 1e-09 minutes: pass a larger --max-minutes" in err
     assert train("--restore", "run", steps=0)[0] == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["train_s"] >= before and rows(tmp_path / "run")[-1]["wall_s"] == pytest.approx(summary["train_s"], abs=0.06)
@@ -303,7 +303,7 @@ def test_divergence_goes_back_once(train, monkeypatch, tmp_path):
 
 def test_a_folder_has_one_owner(tmp_path):
     with run_folder.claim(tmp_path / "run", "x", goes_on=False) as path:
-        with pytest.raises(run_folder.UserError, match=f"is in use by process {os.getpid()} on .*: wait for its end"):
+        with pytest.raises(run_folder.UserError, match=f"is in use by process {os.getpid()} on .*: wait until it ends"):
             with run_folder.claim(tmp_path / "run", "x", goes_on=True):
                 pass
         assert path.exists()

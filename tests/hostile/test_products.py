@@ -28,7 +28,7 @@ def _little_memory():
 
 @pytest.mark.parametrize("fields", [LONG, LATE, LONG | LATE, {"episode_length_s": 5.0}], ids=["long", "late", "both", "many"])
 def test_a_batch(fields):
-    with pytest.raises(UserError, match=r"^num_envs 16,777,216 .* GB of memory, and .* GB are free: pass fewer"):
+    with pytest.raises(UserError, match=r"^num_envs 16,777,216 .* GB of memory, but .* GB are free: pass fewer"):
         VectorEnv("nero_lift", 2**24, impl="native", **fields)
 
 

@@ -122,7 +122,7 @@ def test_a_cell_beyond_reason(tmp_path):
         if cell.startswith("0."):
             log.read(tmp_path / "a.csv", ("joint1", "joint2"))
             continue
-        with pytest.raises(UserError, match=r"takes a number up to 10000, got|has news of some joints") as error:
+        with pytest.raises(UserError, match=r"takes a number up to 10000, got|has values for some joints") as error:
             log.read(tmp_path / "a.csv", ("joint1", "joint2"))
         assert len(str(error.value)) < 500
 

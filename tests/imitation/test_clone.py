@@ -80,7 +80,7 @@ def test_several_folders_are_one(demonstrations, call, tmp_path):
     [
         ([], "--learner clone learns from demonstrations: pass --clone.data DIR, a folder that 'demos' wrote"),
         (["--clone.data", "d,nowhere"], "nowhere holds no demonstrations of mjx_nero"),
-        (["--clone.data", "d", "--preset", "isaac"], "and a policy here has"),
+        (["--clone.data", "d", "--preset", "isaac"], "but a policy here has"),
         (["--clone.data", "d", "--num-devices", 2], "--learner clone learns on one device"),
     ],
 )

@@ -81,7 +81,7 @@ def test_the_bundled_policy_of_the_task_teaches():
     nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, arm=slow))
     with pytest.raises(UserError, match=r"no bundled policy can teach nero this task: train one .* --distill.teacher RUN"):
         teachers.find(ManipulationEnv(nobody, "native"))
-    with pytest.raises(UserError, match=r"cannot teach here: it is of another robot \(piper; here nero\)"):
+    with pytest.raises(UserError, match=r"cannot teach here: it is for another robot \(piper; here nero\)"):
         teachers.find(ManipulationEnv(cfg, "native"), str(policy.shipped("piper_lift")))
 
 

@@ -87,7 +87,7 @@ def test_encoders_of_ones_own(monkeypatch):
     encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
     _, (_, params) = made(dataclasses.replace(CFG, encoders=(("picture", "mean"),)))
     assert params.policy["params"]["MLP_0"]["hidden_0"]["kernel"].shape == (2 + 9, 16)
-    with pytest.raises(UserError, match="there is an encoder 'mean' already: choose another name"):
+    with pytest.raises(UserError, match="there already is an encoder 'mean': choose another name"):
         encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
 
 
@@ -95,7 +95,10 @@ def test_encoders_of_ones_own(monkeypatch):
     ("chosen", "message"),
     [
         ((("picture", "cnm"),), "unknown encoder 'cnm': choose one of flat, mlp"),
-        ((("image", "mlp"),), "network.encoders names image, and terms that stay apart are: joint_pos, picture; an encoder"),
+        (
+            (("image", "mlp"),),
+            "network.encoders names image: an encoder can only read .* not concatenated, and these are joint_pos, picture",
+        ),
     ],
 )
 def test_encoders_that_are_none_are_refused(chosen, message):

@@ -137,7 +137,7 @@ def test_policy_of_another_preset(path):
 
 def test_policy_of_the_same_terms_of_other_sizes(path):
     longer = make("nero_lift", impl="native", **{"observations.state.joint_pos.history": 2})
-    with pytest.raises(UserError, match=r"of size \[47\], here it is \[56\]: pass the --preset \(it had default\) and the"):
+    with pytest.raises(UserError, match=r"of size \[47\], but here it is \[56\]: pass the --preset \(it had default\) and the"):
         policy.load_for(longer, "nero_lift", path)
 
 
@@ -164,9 +164,7 @@ def test_policy_of_another_gripper():
 def test_policy_of_another_robot_of_the_same_name(trained, path):
     """Its arm has other limits to its drives' forces."""
     other = make("nero_lift", impl="native", **{"robot.arm.effort": (1.0,) * 7})
-    with pytest.raises(
-        UserError, match=r"another model of nero .* pass the --robot that it was .*, or the --env.identified, train"
-    ):
+    with pytest.raises(UserError, match=r"another model of nero .* pass the --robot or --env.identified that it was .*, train"):
         policy.load_for(other, "nero_lift", path)
     assert policy.load_for(other, "nero_lift", path, any_robot=True).meta["robot"] == "nero"
 

@@ -49,7 +49,7 @@ def test_nothing_outside_is_reached(theirs, name, kind):
     run, mine = theirs / "run", theirs / "mine"
     put(run / name, kind, mine)
     before = listing(mine)
-    with pytest.raises(UserError, match="is (a link|no file), which is neither read nor written here") as error:
+    with pytest.raises(UserError, match="is (a link|not a regular file) and will not be read or written") as error:
         with run_folder.claim(run, "x", goes_on=True):
             pass
     assert "\n" not in str(error.value)
@@ -83,7 +83,7 @@ def test_reading_a_folder_follows_nothing_either(theirs, kind):
     put(run / "checkpoints", kind, mine)
     asked = run_cfg.resolve("nero_reach", "default", None, {}, {})
     for read in (lambda: resume.same_run(run, asked, (), {}), lambda: checkpoints.saved(run), lambda: agents.newest(run)):
-        with pytest.raises(UserError, match="is (a link|no file)"):
+        with pytest.raises(UserError, match="is (a link|not a regular file)"):
             read()
 
 
@@ -172,7 +172,7 @@ def test_files_elsewhere_are_asked_for_once(theirs, stored, names, tmp_path, mon
     asked = {"robot": None, "env": {}, "learner": {}} | json.loads(json.dumps(names).replace("KEYS", str(keys)))
     run, text = theirs / "run", json.dumps({**stored, "asked": asked})
     message = refused(run, text)
-    assert "pass --trust if you know who made the run" in message and "secret" not in message
+    assert "pass --trust if you trust whoever made it" in message and "secret" not in message
     for trusted in (True, False):  # the second time without being asked
         try:  # a robot is read at once, and this is none
             resume.same_run(run, run_cfg.resolve("nero_reach", "default", None, {}, {}), (), {}, trusted)

@@ -245,7 +245,7 @@ def test_a_task_without_an_expert_says_so():
     cfg = env_cfg("nero_push", **{"curriculum.expert_starts": 0.5})
     env = wrappers.for_training(ManipulationEnv(cfg, impl="native"))
     assert starts.maker(asked(env), told.append)(0) == {}
-    assert told == ["no expert shows how: the task has no script that grasps"]
+    assert told == ["no expert demonstrates: the task has no script that grasps"]
 
 
 def test_a_run_that_begins_with_a_policy_imitates_nobody():

@@ -76,7 +76,7 @@ def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
     argv = [*SHORT, "--side-by-side", 4, "--noise", 0.5, "--out", "d"]
     assert call("mjx_nero", "demos", *argv, "--episodes", 3)[0] == 0
     code, out, err = call("mjx_nero", "demos", *argv, "--episodes", 6)
-    assert code == 0 and "3 new ones of 4 that were played" in out, err
+    assert code == 0 and "3 new, from 4 played" in out, err
     one, other = open_dataset(made), open_dataset(tmp_path / "d")
     for name in (names.QPOS, names.EXECUTED, names.SEEN):
         np.testing.assert_array_equal(one.column(name), other.column(name))
@@ -127,10 +127,10 @@ def test_a_number_has_its_slot_wherever_one_begins():
 def test_it_is_shown_and_played_again(made, call):
     code, out, err = call("mjx_nero", "demos", "--inspect", made)
     assert code == 0, err
-    assert "6, of which 0 succeed (of 6 that were played)" in out and "60, 0.00 h" in out and "cube.z" in out
+    assert "6, of which 0 succeed (6 were played)" in out and "60, 0.00 h" in out and "cube.z" in out
     code, out, err = call("mjx_nero", "demos", "--replay", made, "--episode", 5)
     assert code == 0 and "episode 5 (number 5): 10 steps, fails" in out, err
-    assert float(out.split("differs by at most ")[1].split()[0]) < 1e-4
+    assert float(out.split("differs from the recording by at most ")[1].split()[0]) < 1e-4
     code, _, err = call("mjx_nero", "demos", "--replay", made, "--episode", 6)
     assert code == 2 and "/d has 6 episodes: --episode takes a number from 0 to 5" in err
 
@@ -160,17 +160,17 @@ def test_units_of_lerobots_robots_by_hand():
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ([], "demos takes one of --out DIR (write), --inspect DIR and --replay DIR"),
-        (["--out", "d", "--inspect", "d"], "demos takes one of"),
+        ([], "demos takes exactly one of --out DIR (write), --inspect DIR (show) and --replay DIR"),
+        (["--out", "d", "--inspect", "d"], "demos takes exactly one of"),
         (["--out", "d", "--policy", "p.safetensors"], "--policy needs --agent policy"),
-        (["--out", "d", "--agent", "policy", "--through", "task"], "--through is of experts"),
+        (["--out", "d", "--agent", "policy", "--through", "task"], "--through is for experts"),
         (["--out", "d", "--agent", "juggler"], "controller 'juggler' cannot do nero_lift"),
         (
             ["--out", "d", "--agent", "policy", "--side-by-side", 65536, "--episodes", 65536, "--env.episode_length_s", 3000],
             "--side-by-side 65,536 with",
         ),
         (["--inspect", "d"], "d holds no demonstrations of mjx_nero: give a folder that 'demos --out' wrote"),
-        (["--video", "v.mp4", "--inspect", "d"], "--video is of the episode that is replayed"),
+        (["--video", "v.mp4", "--inspect", "d"], "--video shows a replayed episode"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
@@ -200,4 +200,4 @@ def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(cal
     assert code == 0 and "pictures: sheet.png" in out
     assert imageio.imread(tmp_path / "sheet.png").shape[1] % (6 * 64) == 0  # three moments by two cameras
     code, _, err = call("mjx_nero", "demos", *argv[:-1], "e", "--cameras", "ceiling")
-    assert code == 2 and "ceiling: no camera of this environment: choose from front, wrist, side" in err
+    assert code == 2 and "this environment has no camera ceiling: choose from front, wrist, side" in err

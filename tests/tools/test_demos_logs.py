@@ -56,9 +56,9 @@ def test_logs_become_a_data_set_once(call, tmp_path):
         (tmp_path / f"log{i}.csv").write_text(table(rows))
     argv = ["demos", "--env", "so101_reach", "--form", "arrays", "--out", "real"]
     code, out, err = call("mjx_nero", *argv, "--log", "log0.csv")
-    assert code == 0 and "real: 1 episodes, 3 steps; 1 new ones of 1 logs" in out, err
+    assert code == 0 and "real: 1 episodes, 3 steps; 1 new, from 1 logs" in out, err
     code, out, err = call("mjx_nero", *argv, "--log", "log0.csv", "--log", "log1.csv")
-    assert code == 0 and "real: 2 episodes, 6 steps; 1 new ones of 2 logs" in out, err
+    assert code == 0 and "real: 2 episodes, 6 steps; 1 new, from 2 logs" in out, err
     found = open_dataset(tmp_path / "real")
     assert found.schema.robot == "so101_follower" and found.schema.features["action"].units == ("deg",) * 5 + ("%",)
     assert set(found.schema.features) == {names.STATE, names.ACTION, names.EXECUTED, names.DONE}
@@ -69,13 +69,13 @@ def test_logs_become_a_data_set_once(call, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "needs one column time"),
-        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "needs one column target.wrist_roll"),
-        (table(ROWS[:4]), "has 0 steps of a policy: give the log of a run of 'deploy'"),
+        ("", "needs exactly one column time"),
+        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "needs exactly one column target.wrist_roll"),
+        (table(ROWS[:4]), "has 0 policy steps, and an episode needs two: give a log of 'deploy --log'"),
         (table(ROWS).replace("0.4,0.4", "0.4,nan"), "log.csv line 10 takes a number up to 10000, got 'nan'"),
         (table(ROWS).replace("0.4,0.4", "0.4,", 1), "log.csv line 10 takes a number up to 10000, got ''"),
         (table(ROWS).replace("0.06,,", "0.06,"), "line 9 has"),
-        ("\x00", "needs one column time"),
+        ("\x00", "needs exactly one column time"),
     ],
 )
 def test_what_is_wrong_with_a_log(text, message, call, tmp_path):

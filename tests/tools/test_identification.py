@@ -136,16 +136,16 @@ HEAD = "time,target.a,position.a\n"
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "needs one column time"),
-        (b"\xff\xfe", "is no text"),
-        (b"time,target.a,position.b\n", "needs one column position.a"),
-        (b"time,target.a,position.a,time\n", "needs one column time"),
+        (b"", "needs exactly one column time"),
+        (b"\xff\xfe", "is not text"),
+        (b"time,target.a,position.b\n", "needs exactly one column position.a"),
+        (b"time,target.a,position.a,time\n", "needs exactly one column time"),
         ((HEAD + "0,1\n").encode(), "line 2 has 2 cells, the first line 3"),
         ((HEAD + "0,1,x\n").encode(), "line 2 position.a takes a number up to 10000, got 'x'"),
         ((HEAD + "0,1,nan\n").encode(), "line 2 position.a takes a number"),
         ((HEAD + "0,1,1e300\n").encode(), "line 2 position.a takes a number"),
-        ((HEAD + "0,1,1\n0,,1\n").encode(), "time has to be in every row, and to ascend"),
-        ((HEAD + "0,,1\n1,1,1\n").encode(), "its first row has to have the targets"),
+        ((HEAD + "0,1,1\n0,,1\n").encode(), "every row needs a time, and times must ascend"),
+        ((HEAD + "0,,1\n1,1,1\n").encode(), "the first row needs the targets"),
         ((HEAD + "0,1,1\n1,1,1\n").encode(), "has 2 readings: 500 or more over 10 s or more are needed"),
     ],
 )
@@ -209,9 +209,9 @@ def test_the_commands_write_and_refuse_in_one_line(tmp_path, capsys):
     log = logs.read(out, registry.robot("so_arm101").arm.joints)
     assert len(log.times) == 1200 and len(log.sent) == 600 and "log.csv" in capsys.readouterr().out
     for argv, message in (
-        (["record", "--robot", "nero", "--out", str(out), "--seconds", "3"], "an excitation takes 6 s or more, got 3"),
+        (["record", "--robot", "nero", "--out", str(out), "--seconds", "3"], "the movement takes at least 6 s, got 3"),
         (["record", "--robot", "nero", "--out", str(out), "--dt", "0.5"], "dt takes a physics step from 0.0001 to 0.02 s"),
-        (["identify", str(out), "--robot", "nero"], "needs one column target.joint1"),
+        (["identify", str(out), "--robot", "nero"], "needs exactly one column target.joint1"),
         (["identify", str(tmp_path / "none.csv"), "--robot", "nero"], "there is no file"),
     ):
         with pytest.raises(UserError, match=message):

@@ -214,7 +214,7 @@ def call(call, monkeypatch):
 def test_program_shows_moves_and_writes(call, tmp_path):
     code, out, err = call("cobotta_lift", "--move", "--json", "all.json")
     assert (code, err) == (0, "") and "…" not in out  # nothing cut for want of width
-    for text in ("right_outer_knuckle_joint", "93.7", "geoms that can meet", "goal_tracking_fine", "movements", "27.25"):
+    for text in ("right_outer_knuckle_joint", "93.7", "geoms that can touch", "goal_tracking_fine", "movements", "27.25"):
         assert text in out
     told = json.loads((tmp_path / "all.json").read_text())
     assert told["robot"] == "cobotta_pro_900" and len(told["moves"]) == 16 and len(told["pairs"]) == 9
@@ -258,7 +258,7 @@ def test_list_envs(call, monkeypatch):
     [
         ([], "name a robot, an environment or the folder of an imported robot"),
         (["nerro"], "no robot or environment 'nerro' (did you mean 'nero'?)"),
-        (["nero", "--preset", "isaac"], "nero is a robot: --preset and --robot go with an environment"),
+        (["nero", "--preset", "isaac"], "nero is a robot: leave out --preset and --robot, which are for environments"),
         (["nero_lift", "--preset", "x"], "unknown preset of nero_lift 'x'"),
         (["reach"], "reach is for any robot: pass one"),
         (["."], ". holds no robot.yaml"),

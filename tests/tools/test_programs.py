@@ -54,7 +54,7 @@ MISTAKES = [
     ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--json", "."], "--json takes a name that ends in .json, got '.'"),
-    ("eval", ["--failures"], "--failures chooses what a video shows: give --video FILE.mp4, too"),
+    ("eval", ["--failures"], "--failures selects the episodes of a video: pass --video FILE.mp4, too"),
     ("eval", ["--video", "v.zzz"], "--video takes a name that ends in .mp4, got 'v.zzz'"),
     ("eval", ["--episodes", "1e12"], "--episodes must be at least 1 and at most 1000000, got '1e12'"),
     ("eval", ["--seed", "18446744073709551616"], "--seed takes a whole number, got '18446744073709551616'"),
@@ -67,8 +67,8 @@ MISTAKES = [
     ("train", ["--env.sim.dt", "1e999"], "sim.dt takes a finite number, got '1e999'"),
     ("train", ["--env.sim.decimation", "1_0"], "sim.decimation takes a whole number, got '1_0'"),
     ("train", ["--ppo.num_epochs", "9" * 400], "num_epochs takes a whole number, got '999"),
-    ("eval", ["--backend", "mjx", "--impl", "native"], "--backend mjx cannot play with --impl native: give one of them"),
-    ("eval", ["--backend", "mujoco", "--impl", "jax"], "--backend mujoco cannot play with --impl jax: give one of them"),
+    ("eval", ["--backend", "mjx", "--impl", "native"], "--backend mjx cannot play with --impl native: pass only one of them"),
+    ("eval", ["--backend", "mujoco", "--impl", "jax"], "--backend mujoco cannot play with --impl jax: pass only one of them"),
 ]
 
 
@@ -112,7 +112,7 @@ def test_shared_flags_read_alike_in_every_command(call):
         code, out, _ = call(*program, "--help")
         said = " ".join(out.split())
         assert code == 0 and "--load FILE_OR_MODULE Python code that registers its own environments" in said
-        assert "--env ENV environment; list-envs names them all (default: nero_lift)" in said
+        assert "--env ENV environment; list-envs lists them all (default: nero_lift)" in said
         assert "--preset PRESET preset of the environment (default: default)" in said
         assert "--robot ROBOT name of another robot, or folder of an imported one (default: the environment's own)" in said
 
@@ -126,7 +126,7 @@ def test_what_a_run_came_to_is_said_before_its_video_is_drawn(call, monkeypatch)
     assert code == 0
     first, second, third = out.splitlines()
     assert first == "1,000 env steps in 2 s (500 steps/s), success 75.0%"
-    assert second.startswith("run: policy.safetensors, ") and second.endswith("video.mp4 (to be drawn now)")
+    assert second.startswith("run: policy.safetensors, ") and second.endswith("video.mp4 (drawn next)")
     assert third == "film of run"
 
 
@@ -134,7 +134,7 @@ def test_a_run_tells_what_its_physics_lost(capsys):
     """A thing that is thrown too fast is no NaN, but ends the episode in the same way."""
     summary = {"env_steps": 1000, "train_s": 2.0, "steps_per_s": 500, "evaluation": {"success_rate": 0.75}, "folder": "run"}
     train_run.report({**summary, "nan_count": 1, "overflow_count": 2, "lost": {}}, films=False)
-    says = "physics: 1 episodes ended as they diverged (NaN, or faster than 1,000 rad/s or m/s), 2 steps with lost contacts"
+    says = "physics: 1 episodes diverged and ended (NaN, or faster than 1,000 rad/s or m/s), 2 steps with lost contacts"
     assert capsys.readouterr().out.splitlines()[-1] == says
 
 
@@ -321,7 +321,7 @@ def test_a_run_from_start_over_ctrl_c_to_its_end(call, tmp_path, monkeypatch):
     assert code == 0 and "success rate" in out
 
     code, _, err = call("train", *sizes, "--num-timesteps", stopped, "--restore", "run")
-    assert code == 2 and "has made its" in err and "pass a larger --num-timesteps" in err
+    assert code == 2 and "has already made its" in err and "pass a larger --num-timesteps" in err
     code, _, err = call("train", "--num-envs", 32, "--restore", "run", "--out", "other")
     assert code == 2 and "does not fit" in err and not (tmp_path / "other").exists()
     shutil.rmtree(run)

@@ -26,8 +26,8 @@ def test_the_projects_own_list_names_arms_enough():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[]", "is no list of robots"),
-        ("repositories: {}", "is no list of robots"),
+        ("[]", "is not a list of robots"),
+        ("repositories: {}", "is not a list of robots"),
         ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/c, file: r.urdf}}", "no repository 'a/c'"),
         ("repositories: {a/b: '1'}\nrobots: {r: {repository: a/b}}", "file"),
         ("repositories: {a/b: '1'}\nrobots: {'r, left': {repository: a/b, file: r.urdf}}", "comma"),

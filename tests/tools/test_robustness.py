@@ -132,7 +132,9 @@ def test_two_policies_are_in_one_picture(tmp_path):
 def test_what_holds_no_figures_is_one_line(tmp_path, content):
     path = tmp_path / "other.json"
     path.write_text(content)
-    with pytest.raises(UserError, match=r"other\.json (holds no figures of robustness: make them by --json|is not JSON: )"):
+    with pytest.raises(
+        UserError, match=r"other\.json (holds no results of robustness: give a file written with --json|is not JSON: )"
+    ):
         command.read(path)
-    with pytest.raises(UserError, match="--beside is for the picture: pass --plot, too"):
+    with pytest.raises(UserError, match="--beside adds curves to the plot: pass --plot, too"):
         __main__.main(["robustness", "--env", "nero_lift", "--beside", str(path)])

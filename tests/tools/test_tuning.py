@@ -168,7 +168,7 @@ def test_the_integrator_is_damped_critically(dt):
 
 
 def test_gravity_beyond_the_effort():
-    message = "j: gravity asks up to 5 of a drive limited to 4: raise its effort, or let the robot compensate gravity"
+    message = "j: gravity needs up to 5 from a drive limited to 4: raise its effort, or let the robot compensate gravity"
     with pytest.raises(UserError, match=message):
         propose(dataclasses.replace(LOAD, effort=4.0), 0.1, 10.0, 0.01)
 

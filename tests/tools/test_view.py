@@ -178,12 +178,12 @@ def test_a_training_writes_what_the_view_follows(call, tmp_path):
         (["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?)"),
         (
             ["--agent", "rmpflow"],
-            "nobody called 'rmpflow' can act in nero_lift: choose one of policy nero_lift, pick_up, joint sliders",
+            "no agent 'rmpflow' can act in nero_lift: choose one of policy nero_lift, pick_up, joint sliders",
         ),
-        (["--run", "."], ". is not the folder of a training"),
+        (["--run", "."], ". is not a run folder: give the folder that train.py wrote"),
         (["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
-        (["--episode", "1"], "--episode is of a data set: pass --demos DIR, too"),
-        (["--leader", "/dev/null"], "--leader needs --calibration: LeRobot's file of the leader"),
+        (["--episode", "1"], "--episode selects an episode of a data set: pass --demos DIR, too"),
+        (["--leader", "/dev/null"], "--leader needs --calibration: the leader's file written by lerobot-calibrate"),
         (["--demos", "nowhere", "--episode", "0"], "nowhere holds no demonstrations of mjx_nero"),
     ],
 )

@@ -139,7 +139,7 @@ def test_a_tape_shows_what_was_recorded(shown, tmp_path):
     with pytest.raises(UserError, match="has 1 episodes: --episode takes a number from 0 to 0"):
         tape.of_dataset(tmp_path / "d", 1, live)
     other = dataclasses.replace(live, qpos=live.qpos[:, :5])
-    with pytest.raises(UserError, match="scenes of 16 positions, and this environment 5: pass its --env"):
+    with pytest.raises(UserError, match="has 16 positions, but this environment has 5: pass the data set's --env"):
         tape.of_dataset(tmp_path / "d", 0, other)
     session.recorders.clear()
 
@@ -157,7 +157,7 @@ def test_what_the_hand_did_is_played_again_in_physics(shown, tmp_path, call):
     session.recorders.clear()
     code, out, err = call("mjx_nero", "demos", "--replay", tmp_path / "d")
     assert code == 0 and "episode 0 (number 0): 10 steps, succeeds" in out, err
-    assert float(out.split("differs by at most ")[1].split()[0]) < 0.02
+    assert float(out.split("differs from the recording by at most ")[1].split()[0]) < 0.02
 
 
 def test_corrections_are_recorded_while_the_user_steers(tmp_path):

@@ -1,4 +1,4 @@
-"""Arms behind their drivers. Each module imports what its bus needs when it is asked for."""
+"""Drivers of arms. Each module imports the packages for its bus only when it is used."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,16 +18,16 @@ def check(kind: str, metadata: Mapping[str, Any]) -> None:
     """Checks that an arm is the robot of a policy.
 
     Raises:
-        UserError: it is not, or there is no such arm.
+        UserError: it is not, or the arm is unknown.
     """
     if kind not in KINDS:
         raise UserError(f"no arm {kind!r}: choose one of {', '.join(KINDS)}")
     if (wanted := _ROBOTS.get(kind, metadata["robot"])) != metadata["robot"]:
-        raise UserError(f"the policy is for {metadata['robot']}, and --arm {kind} is a {wanted}")
+        raise UserError(f"the policy is for {metadata['robot']}, but --arm {kind} is a {wanted}: pass another --arm or policy")
 
 
 def ports(kind: str, options: Mapping[str, Any]) -> list[str]:
-    """Returns the ports of an arm, which no other program may use meanwhile; none for the simulated arm.
+    """Returns the ports of an arm, which no other program may use at the same time; none for the simulated arm.
 
     Args:
         options: see ``make``.
@@ -41,16 +41,15 @@ def ports(kind: str, options: Mapping[str, Any]) -> list[str]:
 
 
 def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clock: Clock) -> Arm:
-    """A driver, not connected yet.
+    """Makes a driver, which is not connected yet.
 
     Args:
-        options: of the driver, as plain values: ``model`` and ``tracker`` of the simulated arm, ``port`` and ``calibration`` of
-            the SO-ARMs, ``port`` (``INTERFACE:CHANNEL``) of the Piper and the
-            Nero, ``port`` and ``gripper`` (``HOST:PORT``) of the Cobotta,
-            ``port`` (``TYPE:field=value,...``) and ``calibration`` of LeRobot's.
+        options: the driver's options as plain values: ``model`` and ``tracker`` for the simulated arm; ``port`` and
+            ``calibration`` for SO-ARMs; ``port`` (``INTERFACE:CHANNEL``) for Piper and Nero; ``port`` and ``gripper``
+            (``HOST:PORT``) for the Cobotta; ``port`` (``TYPE:field=value,...``) and ``calibration`` for LeRobot's arms.
 
     Raises:
-        UserError: there is no such arm, a package or file is missing, or it is another robot than the policy's.
+        UserError: the arm is unknown or not the policy's robot, or a package or file is missing.
     """
     check(kind, metadata)
     joints = tuple(metadata["joints"]["names"])

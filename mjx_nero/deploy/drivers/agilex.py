@@ -1,10 +1,10 @@
-"""AgileX's Piper and Nero over CAN, by python-can: the frames that the maker publishes.
+"""AgileX's Piper and Nero over CAN, by python-can, with the frames that the maker publishes.
 
-Those of the Piper stand in agilexrobotics/piper_sdk (``piper_msgs/msg_v2``), those of the Nero in agilexrobotics/pyAgxArm
-(``protocols/can_protocol``): they are the Piper's and a seventh joint's. All numbers are big-endian. Targets go out in joint
-mode, whose frames are the same in all firmware of the Nero up to 1.20; its versions differ in torque mode, which nothing here
-uses. Byte 6 of the mode, which switches the Nero's own messages on and off, is 0: they stay as they are. Nothing here sends
-0x150, whose resume drops the arm, and nothing disables a motor.
+Sources: agilexrobotics/piper_sdk (``piper_msgs/msg_v2``) for the Piper; agilexrobotics/pyAgxArm (``protocols/can_protocol``) for
+the Nero, whose frames are the Piper's plus those of a seventh joint. All numbers are big-endian. Targets are sent in joint mode,
+whose frames are the same in all of the Nero's firmware up to 1.20; versions differ in torque mode, which is not used here. Byte 6
+of the mode, which switches the Nero's own messages on and off, is 0, which leaves them unchanged. The driver never sends 0x150,
+whose resume drops the arm, and never disables a motor.
 """
 
 import dataclasses
@@ -20,14 +20,14 @@ from mjx_nero.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """The frames of one arm.
+    """The CAN frames of one arm.
 
     Attributes:
-        name: for messages.
-        targets, joints: of all joints, two a frame: what they are to do, and where they are.
-        fast, slow: of each joint: speeds, and the motor's state.
-        everyone: the joint number that means all of them.
-        hint: what to look at where nothing is heard.
+        name: the arm's name, for messages.
+        targets, joints: frames of target and present positions, two joints per frame.
+        fast, slow: frames of each joint's speed, and of its motor's state.
+        everyone: joint number that means all joints.
+        hint: what to check if nothing is received.
     """
 
     name: str
@@ -86,33 +86,33 @@ ARM_ERRORS = {
     14: "heat",
     15: "heat",
 }
-_WAIT = 2.0  # [s] for the first feedback, and for motors to be enabled
-_OPENING = 0.1  # [s] that a serial adapter takes
+_WAIT = 2.0  # [s] time limit for the first feedback, and for enabling motors
+_OPENING = 0.1  # [s] time that a serial adapter needs to open
 
 
 def pack(arm: np.ndarray) -> list[bytes]:
-    """Angles [rad], two a frame; the last one may be alone."""
+    """Packs angles [rad], two per frame; the last frame may have only one."""
     counts = [int(x) for x in np.rint(arm / MILLIDEGREE)]
     return [struct.pack(">ii", *(counts[k : k + 2] + [0])[:2]) for k in range(0, len(counts), 2)]
 
 
 def unpack(frames: list[bytes], count: int) -> np.ndarray:
-    """The inverse of ``pack`` [rad]."""
+    """Unpacks the frames of ``pack``; returns angles [rad]."""
     return np.concatenate([struct.unpack(">ii", data) for data in frames])[:count] * MILLIDEGREE
 
 
 def target_frames(model: Model, arm: np.ndarray, stroke: float) -> list[tuple[int, bytes]]:
-    """Frames that send the arm's joints [rad] and the gripper's opening [m]."""
+    """Makes the frames with targets of the arm's joints [rad] and of the gripper's opening [m]."""
     mode = bytes([BY_CAN, JOINT_MODE, FULL_SPEED, 0, 0, 0, 0, 0])
     grip = struct.pack(">ihBB", round(stroke / MICROMETRE), GRIP, 1, 0)
     return [(MODE, mode), *zip(model.targets, pack(arm), strict=True), (GRIPPER, grip)]
 
 
 class Agilex:
-    """The arm on a CAN bus. Its two fingers move as one: their joints are half the opening each, with opposite signs.
+    """The arm on a CAN bus. Its two fingers move together: each joint is half the opening, with opposite signs.
 
     Args:
-        port: ``INTERFACE:CHANNEL`` of python-can.
+        port: python-can's ``INTERFACE:CHANNEL``.
     """
 
     def __init__(self, model: Model, metadata: Mapping[str, Any], port: str, clock: Clock):
@@ -122,7 +122,7 @@ class Agilex:
         self._engaged = False
 
     def ranges(self) -> None:
-        """See ``Arm``: the model's, which are the maker's."""
+        """See ``Arm``: the model's limits, which are the maker's."""
 
     def connect(self) -> None:
         """See ``Arm``."""
@@ -130,7 +130,7 @@ class Agilex:
 
         interface, colon, channel = self._port.partition(":")
         if not colon or not channel:
-            raise UserError(f"--port of a {self._model.name} is INTERFACE:CHANNEL, as in socketcan:can0, got {self._port!r}")
+            raise UserError(f"--port of a {self._model.name} takes INTERFACE:CHANNEL, as in socketcan:can0, got {self._port!r}")
         try:
             if interface == "slcan":
                 from mjx_nero.deploy.drivers.slcan import Slcan
@@ -145,16 +145,16 @@ class Agilex:
         while not all(frame in self._frames for frame in (STATUS, *model.joints, GRIPPED, *model.fast, *model.slow)):
             if self._clock.now() > end:
                 self.close()
-                raise UserError(f"no {model.name} is heard at {self._port}: {model.hint}")
+                raise UserError(f"no {model.name} answers at {self._port}: {model.hint}")
             self._wait()
 
     def _wait(self) -> None:
-        """Lets some frames come."""
+        """Waits briefly, and receives frames."""
         self._clock.sleep_until(self._clock.now() + 0.01)
         self._listen()
 
     def _listen(self) -> None:
-        """Takes what has come."""
+        """Receives all frames that have arrived."""
         try:
             for _ in range(2000):
                 message = self._bus.recv(0.0)
@@ -162,7 +162,7 @@ class Agilex:
                     return
                 if not message.is_extended_id and not message.is_error_frame and len(message.data) == 8:
                     self._frames[message.arbitration_id] = self._clock.now(), bytes(message.data)
-        except (self._error, OSError, ValueError, LookupError) as error:  # a serial adapter's line that is cut short, too
+        except (self._error, OSError, ValueError, LookupError) as error:  # also if a serial adapter's line is cut short
             raise ArmError(f"the CAN bus fails: {error}") from None
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:
@@ -179,7 +179,7 @@ class Agilex:
         return target_frames(self._model, position[:n], float(position[n] - position[n + 1]))
 
     def engage(self) -> None:
-        """See ``Arm``: targets where the joints are, and only then motors on."""
+        """See ``Arm``: sends the present positions as targets before it enables the motors."""
         position = self.read_position()[1]
         self._send(self._targets(position))
         end = self._clock.now() + _WAIT
@@ -192,14 +192,14 @@ class Agilex:
         self._engaged = True
 
     def read_position(self) -> tuple[float, np.ndarray]:
-        """Returns when its oldest part arrived [s], and where the joints are [rad or m]."""
+        """Returns the positions of the joints [rad or m], and when the oldest of them arrived [s], first."""
         frames = [self._frames[frame] for frame in (*self._model.joints, GRIPPED)]
         arm = unpack([data for _, data in frames[:-1]], self._model.count)
         half = struct.unpack(">i", frames[-1][1][:4])[0] * MICROMETRE / 2
         return min(when for when, _ in frames), np.array([*arm, half, -half])
 
     def read(self) -> Feedback:
-        """See ``Arm``: the newest of what the arm sends by itself, some 200 times a second."""
+        """See ``Arm``: the newest feedback, which the arm sends by itself about 200 times per second."""
         self._listen()
         self._check()
         when, position = self.read_position()
@@ -208,10 +208,10 @@ class Agilex:
         return Feedback(when, position, np.array([*speeds, 0.0, 0.0]), None, np.array([*heat, 0.0, 0.0], float))
 
     def _check(self) -> None:
-        """Checks what the arm reports about itself.
+        """Checks the arm's status.
 
         Raises:
-            ArmError: something is wrong.
+            ArmError: the arm reports a fault.
         """
         if (status := self._frames[STATUS][1][1]) in ARM_ERRORS:
             raise ArmError(f"the arm reports {ARM_ERRORS[status]}")
@@ -234,6 +234,6 @@ class Agilex:
 
 
 def of(kind: str, metadata: Mapping[str, Any], clock: Clock, port: str | None, **_: Any) -> Agilex:
-    """The arm at a port."""
+    """Makes the driver of the arm at a port."""
     assert port
     return Agilex(MODELS[kind], metadata, port, clock)

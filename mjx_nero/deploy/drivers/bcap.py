@@ -1,13 +1,13 @@
 """DENSO's b-CAP: packets over TCP or UDP, and a client.
 
-As in DENSORobot/orin_bcap (``Python/bCAPClient``, ``C/include/bcap_funcid.h``). All numbers are little-endian. A packet is
+Source: DENSORobot/orin_bcap (``Python/bCAPClient``, ``C/include/bcap_funcid.h``). All numbers are little-endian. A packet is
 
-    0x01, u32 length of it all, u16 serial, u16, i32 function or result, u16 count of arguments,
+    0x01, u32 length of the whole packet, u16 serial, u16, i32 function or result, u16 count of arguments,
     u32 length and VARIANT of each argument, 0x04
 
-and a VARIANT is u16 type, u32 count, then so many values; text is its length in bytes and UTF-16. Over TCP the second
-u16 is zero; over UDP it is the serial of a request's first try, by which the controller knows a repeated one. (Over a serial line
-two bytes of CRC stand before the last one.)
+and a VARIANT is u16 type, u32 count, then that many values; text is its length in bytes, then UTF-16. The second u16 is zero over
+TCP. Over UDP it is the serial of a request's first try, by which the controller recognizes repeated requests. (Over a serial line
+two bytes of CRC precede the last byte.)
 """
 
 import socket
@@ -19,13 +19,13 @@ from mjx_nero.deploy.arm import ArmError
 
 PORT = 5007
 SERVICE_START, SERVICE_STOP, CONNECT, DISCONNECT, GET_ROBOT, ROBOT_NAMES, EXECUTE, RELEASE = 1, 2, 3, 4, 7, 13, 64, 84
-EXECUTING = 0x900  # the answer is still to come
-LONGEST = 1 << 16  # bytes of a packet
-_TRIES = 3  # of a datagram
+EXECUTING = 0x900  # the answer will follow
+LONGEST = 1 << 16  # maximum bytes of a packet
+_TRIES = 3  # number of times a datagram is sent
 EMPTY, I2, I4, R4, R8, TEXT, BOOL, VARIANT, UI1, UI4, ARRAY = 0, 2, 3, 4, 5, 8, 11, 12, 17, 19, 0x2000
 _FORMATS = {I2: "h", I4: "i", R4: "f", R8: "d", BOOL: "h", UI1: "B", UI4: "I", 10: "i", 18: "H", 20: "q", 21: "Q"}
 _HEAD = struct.Struct("<BIHHiH")
-# What results mean, as users of slave mode tell.
+# Meanings of results, as reported by users of slave mode.
 ERRORS = {
     0x83201483: "its buffer of targets is full",
     0x84201482: "a target came too late",
@@ -34,11 +34,11 @@ ERRORS = {
 
 
 class Damaged(ValueError):
-    """Bytes that are no packet."""
+    """Bytes that are not a packet."""
 
 
 def encode(value: Any) -> bytes:
-    """A VARIANT: nothing, a whole number, a number, text, or a list of one of these."""
+    """Encodes a VARIANT: None, an integer, a float, text, or a list of one of these."""
     if value is None:
         return struct.pack("<HI", EMPTY, 1)
     if isinstance(value, list | tuple):
@@ -55,10 +55,10 @@ def _plain(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """The value of a VARIANT.
+    """Decodes a VARIANT.
 
     Raises:
-        Damaged: it is none, or of a kind that nobody uses here.
+        Damaged: it is not a VARIANT, or has an unsupported type.
     """
     value, rest = _decode(data)
     if rest:
@@ -99,17 +99,17 @@ def _unpack(form: str, data: bytes) -> tuple[Any, ...]:
 
 
 def packet(serial: int, function: int, arguments: Sequence[Any], first: int = 0) -> bytes:
-    """A request, or, with a result in place of the function, an answer. ``first``: serial of a datagram's first try."""
+    """Makes a request or, with a result instead of the function, an answer. ``first``: serial of a datagram's first try."""
     values = [encode(value) for value in arguments]
     body = b"".join(struct.pack("<I", len(value)) + value for value in values)
     return _HEAD.pack(1, _HEAD.size + len(body) + 1, serial, first, function, len(values)) + body + b"\x04"
 
 
 def parse(data: bytes) -> tuple[int, int, list[Any]]:
-    """Serial, function or result, and the arguments of a whole packet.
+    """Parses a whole packet; returns serial, function or result, and arguments.
 
     Raises:
-        Damaged: it is none.
+        Damaged: it is not a packet.
     """
     if len(data) < _HEAD.size + 1 or data[-1] != 4:
         raise Damaged("no end")
@@ -125,11 +125,11 @@ def parse(data: bytes) -> tuple[int, int, list[Any]]:
 
 
 def receive(channel: socket.socket) -> bytes:
-    """The next packet; nothing where the other side is gone.
+    """Receives the next packet; empty if the other side has closed the connection.
 
     Raises:
-        Damaged: something else came.
-        OSError: nothing came in time.
+        Damaged: something else arrived.
+        OSError: nothing arrived in time.
     """
     head = _exactly(channel, 5)
     if not head:
@@ -155,11 +155,11 @@ class Client:
     """A connection to a controller.
 
     Args:
-        patience: for an answer [s]; it may be changed.
-        udp: by datagrams, where a request that nobody answers is sent again, three times in all.
+        patience: time limit for an answer [s]; it may be changed later.
+        udp: use datagrams; a request without an answer is sent up to three times.
 
     Raises:
-        OSError: nobody is there.
+        OSError: nothing answers.
     """
 
     def __init__(self, host: str, port: int, patience: float, udp: bool = False):
@@ -172,7 +172,7 @@ class Client:
             self._channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def __call__(self, function: int, *arguments: Any) -> Any:
-        """Calls a function and returns what it gives.
+        """Calls a function and returns its result.
 
         Raises:
             ArmError: the controller refuses, or does not answer.
@@ -196,7 +196,7 @@ class Client:
         return values[0] if values else None
 
     def _ask(self, function: int, arguments: Sequence[Any], first: int) -> tuple[int, list[Any]]:
-        """One try: the result and its values."""
+        """Sends a request once; returns the result and its values."""
         self._serial = self._serial % 0xFFFF + 1
         self._channel.settimeout(self.patience)
         self._channel.sendall(packet(self._serial, function, arguments, first))

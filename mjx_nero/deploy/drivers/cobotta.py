@@ -1,9 +1,9 @@
-"""DENSO Cobotta Pro 900 over b-CAP, in slave mode: the controller (RC9) takes the joints' targets every 8 ms.
+"""DENSO Cobotta Pro 900 over b-CAP, in slave mode: the controller (RC9) takes joint targets every 8 ms.
 
-The sequence is that of DENSORobot/denso_robot_ros (``denso_robot_core``): connect to ``CaoProv.DENSO.VRC9``, TakeArm, Motor,
+The sequence follows DENSORobot/denso_robot_ros (``denso_robot_core``): connect to ``CaoProv.DENSO.VRC9``, TakeArm, Motor,
 slvSendFormat, slvRecvFormat, slvChangeMode 0x202 (angles, and each slvMove waits for its turn), then slvMove with eight angles in
-degrees, whose answer is where the joints are. A thread does that; between two targets of the policy it goes straight, smoothed
-over three cycles, and with none it stays where it is. Nothing here switches motors off, gives the arm away or clears an error.
+degrees, which answers with the joint positions. A thread does this. Between two targets of the policy it interpolates linearly,
+smoothed over three cycles; without a new target it stays. It never switches motors off, releases the arm or clears an error.
 """
 
 import collections
@@ -21,18 +21,18 @@ from mjx_nero.errors import UserError
 CYCLE = 0.008  # [s]
 ANGLES, SLAVE, NORMAL = 0x0002, 0x0202, 0
 _SMOOTH = 3  # cycles
-_PATIENCE = 0.5  # [s] for an answer
-_AXES = 8  # that a target has
+_PATIENCE = 0.5  # time limit for an answer [s]
+_AXES = 8  # number of angles in a target
 _UDP = "udp:"
 _JOINTS = 6
 
 
 class Cobotta:
-    """The arm, and its RG6.
+    """The arm and its RG6 gripper.
 
     Args:
-        host: ``HOST`` or ``HOST:PORT`` of the controller, with ``udp:`` before it where it is to be spoken to by datagrams.
-        gripper: None: there is none to talk to, and it seems to be where it is told.
+        host: ``HOST`` or ``HOST:PORT`` of the controller; with the prefix ``udp:`` it is reached by datagrams.
+        gripper: the gripper; None: there is none, and its targets are reported as its positions.
     """
 
     def __init__(self, metadata: Mapping[str, Any], host: str, gripper: rg6.Rg6 | None, clock: Clock):
@@ -46,7 +46,7 @@ class Cobotta:
         self._engaged = False
 
     def ranges(self) -> None:
-        """See ``Arm``: the model's, which are the maker's."""
+        """See ``Arm``: the model's limits, which are the maker's."""
 
     def connect(self) -> None:
         """See ``Arm``."""
@@ -62,8 +62,8 @@ class Cobotta:
             self._remember(self._angles(self._do("HighCurJntEx")[1:]))
         except ArmError as error:
             raise UserError(
-                f"the controller at {self._address} lets nobody in: {error}. Its executable token has to be Ethernet's, "
-                "with this computer's address"
+                f"the controller at {self._address} refuses access: {error}. Set its executable token to Ethernet, with this "
+                "computer's address"
             ) from None
         if self._gripper:
             self._gripper.connect()
@@ -72,10 +72,10 @@ class Cobotta:
         return self._call(bcap.EXECUTE, self._robot, command, argument)
 
     def _angles(self, degrees: Any) -> np.ndarray:
-        """The arm's joints out of an answer [rad].
+        """Reads the arm's joint positions from an answer [rad].
 
         Raises:
-            ArmError: they are not in it.
+            ArmError: the answer does not have them.
         """
         if not isinstance(degrees, list) or len(degrees) < _JOINTS or not all(isinstance(x, float) for x in degrees):
             raise ArmError("the controller's answer has no angles")
@@ -86,7 +86,7 @@ class Cobotta:
             self._past.append((self._clock.now(), angles))
 
     def engage(self) -> None:
-        """See ``Arm``: motors on, then targets where the joints are, cycle for cycle."""
+        """See ``Arm``: switches motors on, then sends the present positions as targets in every cycle."""
         self._do("TakeArm", [0, 1])
         self._do("Motor", [1, 0])
         self._do("slvSendFormat", 0)
@@ -104,7 +104,7 @@ class Cobotta:
         self.turning.start()
 
     def cycle(self) -> None:
-        """One target, and the answer to it."""
+        """Sends one target and reads the answer."""
         with self._lock:
             self._sent.append(self._path(self._clock.now()))
         degrees = np.degrees(np.mean(self._sent, axis=0)).tolist()
@@ -112,12 +112,12 @@ class Cobotta:
         self._remember(self._angles(answer[0] if answer and isinstance(answer[0], list) else answer))
 
     def _path(self, now: float) -> np.ndarray:
-        """Returns where the joints are to be: on the straight way to the last target, there after a control step."""
+        """Returns the present target: on a straight line to the last target, which it reaches after one control step."""
         share = min(max((now - self._since) / self._dt, 0.0), 1.0)
         return self._from + share * (self._to - self._from)
 
     def read(self) -> Feedback:
-        """See ``Arm``: the newest answer; velocities are differences over some cycles."""
+        """See ``Arm``: the newest answer; velocities are differences over a few cycles."""
         self.turning.check()
         if not self._engaged:
             self._remember(self._angles(self._do("HighCurJntEx")[1:]))
@@ -131,7 +131,7 @@ class Cobotta:
         return Feedback(now, np.concatenate([at, grip]), np.concatenate([speed, np.zeros(2)]))
 
     def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """See ``Arm``: the thread goes there within a control step."""
+        """See ``Arm``: the thread moves to the target within one control step."""
         self.turning.check()
         with self._lock:
             now = self._clock.now()
@@ -142,7 +142,7 @@ class Cobotta:
         return position
 
     def close(self) -> None:
-        """See ``Arm``: leaves slave mode at rest. The controller holds the arm, with its motors on."""
+        """See ``Arm``: leaves slave mode at rest. The controller holds the arm with motors on."""
         self.turning.stop()
         try:
             if self._engaged:
@@ -151,21 +151,23 @@ class Cobotta:
                 self._call.patience = _PATIENCE
                 self._do("slvChangeMode", NORMAL)
         except ArmError:
-            pass  # it has left by itself
+            pass  # the controller has left slave mode by itself
         if self._gripper:
             self._gripper.close()
         self._call.close()
 
 
 def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, gripper: str | None = None, **_: Any) -> Cobotta:
-    """The arm at an address.
+    """Makes the driver of the arm at an address.
 
     Raises:
-        UserError: it is none.
+        UserError: the address is invalid.
     """
     assert port
     for flag, address in (("--port", port), ("--gripper", gripper)):
         host, colon, number = (address or "x").removeprefix(_UDP if flag == "--port" else "").partition(":")
         if not host or (colon and not (number.isdecimal() and int(number) < 65536)):
-            raise UserError(f"{flag} of a Cobotta is HOST or HOST:PORT{' (or udp:HOST)' * (flag == '--port')}, got {address!r}")
+            raise UserError(
+                f"{flag} of a Cobotta takes HOST or HOST:PORT{' (or udp:HOST)' * (flag == '--port')}, got {address!r}"
+            )
     return Cobotta(metadata, port, rg6.Rg6(gripper) if gripper else None, clock)

@@ -1,6 +1,6 @@
-"""The serial bus of Feetech's STS servos: packets, and reads and writes of registers. Nothing here can write to a servo's EEPROM.
+"""The serial bus of Feetech's STS servos: packets, and reads and writes of registers. It cannot write to a servo's EEPROM.
 
-Registers and signs are those of huggingface/lerobot, ``src/lerobot/motors/feetech/tables.py`` (STS3215, protocol 0). A packet is
+Source of registers and signs: huggingface/lerobot, ``src/lerobot/motors/feetech/tables.py`` (STS3215, protocol 0). A packet is
 
     0xFF 0xFF id length instruction-or-error parameters checksum,   checksum = ~(id + length + ... + parameters) & 0xFF
 """
@@ -44,8 +44,8 @@ REGISTERS = {
     "current": (69, 2),
 }
 SIGNS = {"homing_offset": 11, "goal_position": 15, "goal_velocity": 15, "position": 15, "velocity": 15, "load": 10, "current": 15}
-WRITABLE = ("torque_enable", "acceleration", "goal_position", "torque_limit")  # all of them RAM
-STATE = (56, 15)  # position to current
+WRITABLE = ("torque_enable", "acceleration", "goal_position", "torque_limit")  # all in RAM
+STATE = (56, 15)  # address and size of the block from position to current
 ERRORS = {1: "voltage", 2: "angle", 4: "overheating", 8: "overcurrent", 32: "overload"}
 
 
@@ -55,20 +55,20 @@ def checksum(body: bytes) -> int:
 
 
 def packet(servo: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A request, or, with an error in place of the instruction, an answer."""
+    """Makes a request or, with an error instead of the instruction, an answer."""
     body = bytes([servo, len(parameters) + 2, instruction]) + parameters
     return b"\xff\xff" + body + bytes([checksum(body)])
 
 
 def decode(name: str, data: bytes) -> int:
-    """A register's value."""
+    """Decodes a register's value."""
     value = int.from_bytes(data, "little")
     sign = 1 << SIGNS[name] if name in SIGNS else 0
     return -(value & (sign - 1)) if sign and value & sign else value
 
 
 def encode(name: str, value: int) -> bytes:
-    """A register's bytes.
+    """Encodes a register's value.
 
     Raises:
         ValueError: it does not fit.
@@ -76,7 +76,7 @@ def encode(name: str, value: int) -> bytes:
     size = REGISTERS[name][1]
     sign = 1 << SIGNS[name] if name in SIGNS else 1 << 8 * size
     if not (-sign if name in SIGNS else -1) < value < sign:
-        raise ValueError(f"{name} takes no {value}")
+        raise ValueError(f"{value} does not fit register {name}")
     return (abs(value) | (sign if value < 0 else 0)).to_bytes(size, "little")
 
 
@@ -84,19 +84,19 @@ class Bus:
     """Servos behind a port.
 
     Args:
-        port: with ``write``, ``read(count)``, which gives fewer bytes when its time is over, ``reset_input_buffer``, ``close``.
-        tries: of a request that is answered wrongly.
+        port: has ``write``, ``read(count)``, which returns fewer bytes on a timeout, ``reset_input_buffer`` and ``close``.
+        tries: number of times to send a request whose answer is wrong or missing.
     """
 
     def __init__(self, port: Any, tries: int = 2):
         self._port, self._tries = port, tries
 
     def close(self) -> None:
-        """Closes the port; the servos go on."""
+        """Closes the port; the servos keep holding."""
         self._port.close()
 
     def read(self, servo: int, name: str) -> int:
-        """A register of one servo.
+        """Reads a register of one servo.
 
         Raises:
             ArmError: it does not answer.
@@ -113,15 +113,15 @@ class Bus:
         self._ask([servo], packet(servo, WRITE, bytes([_ram(name)]) + encode(name, value)), 0)
 
     def read_all(self, servos: Sequence[int], address: int, size: int) -> dict[int, bytes]:
-        """The same registers of some servos, by one request.
+        """Reads the same registers of several servos with one request.
 
         Raises:
-            ArmError: one does not answer, or reports an error.
+            ArmError: a servo does not answer, or reports an error.
         """
         return self._ask(servos, packet(EVERYONE, SYNC_READ, bytes([address, size, *servos])), size)
 
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
-        """Writes a register of some servos, by one request; nobody answers.
+        """Writes a register of several servos with one request, which is not answered.
 
         Raises:
             ArmError: it cannot be sent.
@@ -133,11 +133,11 @@ class Bus:
         try:
             self._port.reset_input_buffer()
             self._port.write(request)
-        except (OSError, termios.error) as error:  # pyserial's are, but for that of emptying a port that is gone
+        except (OSError, termios.error) as error:  # termios.error: pyserial raises it when it flushes a lost port
             raise ArmError(f"the port is gone: {error}") from None
 
     def _ask(self, servos: Sequence[int], request: bytes, size: int) -> dict[int, bytes]:
-        """Answers by servo; asks again where they are damaged."""
+        """Sends a request and returns the answers by servo; repeats it if an answer is damaged."""
         for left in reversed(range(self._tries)):
             self._send(request)
             try:
@@ -149,7 +149,7 @@ class Bus:
         raise AssertionError
 
     def _quiet(self) -> None:
-        """Waits until nothing comes any more: an answer that is late must not be taken for that to the next request."""
+        """Waits until nothing more arrives, so that a late answer is not mistaken for the next one."""
         for _ in range(4):
             try:
                 if not self._port.read(256):
@@ -174,13 +174,13 @@ class Bus:
 
 
 def _ram(name: str) -> int:
-    """The address of a register that may be written."""
+    """Returns the address of a register that may be written."""
     if name not in WRITABLE:
-        raise ValueError(f"{name} is not written: what is in the EEPROM is calibration's")
+        raise ValueError(f"{name} must not be written: only calibration writes the EEPROM")
     return REGISTERS[name][0]
 
 
 def registers(data: bytes, names: Iterable[str], first: int = STATE[0]) -> dict[str, int]:
-    """Values out of a block of registers that begins at ``first``."""
+    """Decodes registers from a block that begins at address ``first``."""
     places = {name: (REGISTERS[name][0] - first, REGISTERS[name][1]) for name in names}
     return {name: decode(name, data[at : at + size]) for name, (at, size) in places.items()}

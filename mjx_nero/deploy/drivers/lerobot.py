@@ -1,13 +1,13 @@
-"""Any arm that LeRobot drives, through its ``Robot`` (huggingface/lerobot, ``src/lerobot/robots/robot.py``).
+"""Any arm that LeRobot drives, through LeRobot's ``Robot`` (huggingface/lerobot, ``src/lerobot/robots/robot.py``).
 
-``--port TYPE:field=value,...`` names its configuration, as in ``so101_follower:port=/dev/ttyACM0,id=mine``; packages named
-``lerobot_robot_*`` are found as LeRobot finds them. ``get_observation`` and ``send_action`` have ``MOTOR.pos`` in degrees, and
-of a gripper 0, closed, to 100, open. Where an arm differs, ``--calibration`` is a JSON by joint:
+``--port TYPE:field=value,...`` is LeRobot's configuration, such as ``so101_follower:port=/dev/ttyACM0,id=mine``. Packages named
+``lerobot_robot_*`` are found as LeRobot finds them. ``get_observation`` and ``send_action`` use ``MOTOR.pos`` in degrees, or for
+a gripper from 0 (closed) to 100 (open). If an arm differs, ``--calibration`` is a JSON file with an entry per joint:
 
     {"joint1": {"motor": "shoulder", "scale": 0.017453, "offset": 0.0}}      position = scale * (MOTOR.pos) + offset [rad or m]
 
-``disconnect`` is never called, as it can switch torque off; what ``connect`` does to the motors is LeRobot's affair: some of its
-robots switch torque off for a moment there, so support the arm.
+``disconnect`` is never called, because it can switch torque off. Some of LeRobot's robots switch torque off for a moment in
+``connect``, so support the arm.
 """
 
 import contextlib
@@ -34,10 +34,10 @@ class Motor:
 
 
 def motors_of(metadata: Mapping[str, Any], path: pathlib.Path | None) -> list[Motor]:
-    """Returns the joints' motors, by a file or by LeRobot's habits.
+    """Returns the joints' motors, from a calibration file or by LeRobot's conventions.
 
     Raises:
-        UserError: there is no such file, or it says something else.
+        UserError: the file does not exist, or is invalid.
     """
     own = metadata["joints"]
     if path is None:
@@ -54,15 +54,15 @@ def motors_of(metadata: Mapping[str, Any], path: pathlib.Path | None) -> list[Mo
     except (ValueError, TypeError, KeyError, RecursionError):
         raise UserError(f"{path} needs motor, scale and offset for each of {', '.join(own['names'])}") from None
     if not all(math.isfinite(m.scale) and math.isfinite(m.offset) and m.scale for m in made):
-        raise UserError(f"{path}: scale takes a number that is not zero, and offset one")
+        raise UserError(f"{path}: scale takes a finite number other than 0, and offset a finite number")
     return made
 
 
 class LeRobotArm:
-    """A robot of LeRobot's.
+    """One of LeRobot's robots.
 
     Args:
-        robot: with ``connect``, ``get_observation``, ``send_action``, ``disconnect`` and ``is_connected``.
+        robot: has ``connect``, ``get_observation``, ``send_action``, ``disconnect`` and ``is_connected``.
     """
 
     def __init__(self, metadata: Mapping[str, Any], robot: Any, motors: list[Motor], clock: Clock):
@@ -73,10 +73,10 @@ class LeRobotArm:
         self._last: tuple[float, np.ndarray] | None = None
         with contextlib.suppress(AttributeError):
             robot.config.disable_torque_on_disconnect = False
-        robot.disconnect = lambda: None  # its destructor calls it, too
+        robot.disconnect = lambda: None  # its destructor also calls it
 
     def ranges(self) -> None:
-        """See ``Arm``: LeRobot does not say."""
+        """See ``Arm``: LeRobot does not report them."""
 
     def connect(self) -> None:
         """See ``Arm``."""
@@ -84,16 +84,16 @@ class LeRobotArm:
         if missing := [key for key in self._keys if key not in known]:
             raise UserError(
                 f"the robot has no {', '.join(missing)}, it has {', '.join(sorted(map(str, self._robot.action_features)))}: "
-                "say which joint is which by --calibration"
+                "pass --calibration with the motor of each joint"
             )
         try:
             if not self._robot.is_connected:
                 self._robot.connect(calibrate=False)
-        except Exception as error:  # each robot has kinds of its own
+        except Exception as error:  # each robot has its own kinds
             raise UserError(f"LeRobot cannot connect: {error}") from None
 
     def engage(self) -> None:
-        """See ``Arm``: where it is becomes its target."""
+        """See ``Arm``: sends the present position as the target."""
         self.command(self.read().position, np.zeros(len(self.joints)))
 
     def read(self) -> Feedback:
@@ -118,14 +118,14 @@ class LeRobotArm:
             raise ArmError(f"LeRobot cannot move the arm: {error}") from None
 
     def close(self) -> None:
-        """See ``Arm``: it stays connected, and under torque, until this process ends."""
+        """See ``Arm``: the arm stays connected, with torque on, until this process ends."""
 
 
 def of(metadata: Mapping[str, Any], clock: Clock, port: str | None, calibration: str | None, **_: Any) -> LeRobotArm:
-    """The robot that ``TYPE:field=value,...`` names.
+    """Makes the robot that ``TYPE:field=value,...`` describes.
 
     Raises:
-        UserError: LeRobot has none such.
+        UserError: LeRobot has no such robot.
     """
     assert port
     from lerobot.robots import make_robot_from_config

@@ -1,7 +1,7 @@
-"""OnRobot's RG6 gripper, by Modbus TCP (pymodbus): registers of its compute box as takuya-ki/onrobot has them.
+"""OnRobot's RG6 gripper, by Modbus TCP (pymodbus). Source of its compute box's registers: takuya-ki/onrobot.
 
-Written: 0 force [0.1 N], 1 width [0.1 mm], 2 control (1 grips). Read: 267 width [0.1 mm], 268 status, whose bit 0 is busy, and
-bits 3 and 5 are tripped safety switches. The gripper takes a width only when it is not busy, so it follows in steps.
+Written: 0 force [0.1 N], 1 width [0.1 mm], 2 control (1 grips). Read: 267 width [0.1 mm], 268 status (bit 0: busy; bits 3 and 5:
+tripped safety switches). The gripper accepts a width only when it is not busy, so it follows in steps.
 """
 
 import math
@@ -14,24 +14,24 @@ from mjx_nero.errors import UserError
 DEVICE, FORCE, WIDTH, GRIP = 65, 0, 267, 1
 BUSY, TRIPPED = 1, 8 | 32
 WIDEST = 0.16  # [m]
-_NEWTONS = 40.0  # of 120
+_NEWTONS = 40.0  # gripping force [N], of at most 120
 _CRANK, _CLOSED, _OFFSET = 0.08, 0.6331, 0.000488  # the model's linkage: tasks/arms/cobotta_pro_900.py
-_CHANGE = 0.002  # [m] of the target that is worth a new motion
-_PERIOD = 0.02  # [s] between questions
+_CHANGE = 0.002  # minimum change of the target for a new motion [m]
+_PERIOD = 0.02  # time between requests [s]
 
 
 def width(angle: float) -> float:
-    """Distance between the pads [m] at the driven joint's angle [rad]."""
+    """Computes the distance between the pads [m] from the driven joint's angle [rad]."""
     return 2 * (_CRANK * math.sin(_CLOSED - angle) - _OFFSET)
 
 
 def angle(width: float) -> float:
-    """The inverse of ``width``."""
+    """Computes the driven joint's angle [rad] from the distance between the pads [m]."""
     return _CLOSED - math.asin(min(max((width / 2 + _OFFSET) / _CRANK, -1.0), 1.0))
 
 
 class Rg6:
-    """The gripper, asked and told by a thread of its own, as its answers take longer than a cycle of the arm.
+    """The gripper. A separate thread reads and commands it, because its answers take longer than a cycle of the arm.
 
     Args:
         address: ``HOST`` or ``HOST:PORT``.
@@ -47,7 +47,7 @@ class Rg6:
         """Opens the connection and reads the width.
 
         Raises:
-            UserError: no gripper is there.
+            UserError: no gripper answers.
         """
         import pymodbus
         from pymodbus.client import ModbusTcpClient
@@ -55,18 +55,18 @@ class Rg6:
         self._failures: Any = (pymodbus.ModbusException, OSError)
         self._client = ModbusTcpClient(self._host, port=self._port, timeout=0.3, retries=0)
         if not self._client.connect():
-            raise UserError(f"no RG6 answers at {self._address}: it is the address of its compute box")
+            raise UserError(f"no RG6 answers at {self._address}: give the address of its compute box")
         try:
             self._step()
         except ArmError as error:
             raise UserError(f"no RG6 answers at {self._address}: {error}") from None
 
     def engage(self) -> None:
-        """Starts to ask and to tell it."""
+        """Starts the thread."""
         self.turning.start()
 
     def _step(self) -> None:
-        """Reads it, and tells it a new width where there is one and it listens.
+        """Reads the gripper, and sends a new width if there is one and the gripper is not busy.
 
         Raises:
             ArmError: it does not answer, or a safety switch has tripped.
@@ -77,7 +77,7 @@ class Rg6:
                 raise ArmError("the gripper refuses to be read")
             self._seen, status = answer.registers[0] * 1e-4, answer.registers[1]
             if status & TRIPPED:
-                raise ArmError("a safety switch of the gripper has tripped: its power has to be switched off and on")
+                raise ArmError("a safety switch of the gripper has tripped: switch its power off and on")
             wanted = self._wanted
             if wanted >= 0 and not status & BUSY and abs(wanted - self._told) >= _CHANGE:
                 values = [round(_NEWTONS * 10), round(wanted * 1e4), GRIP]
@@ -88,16 +88,16 @@ class Rg6:
             raise ArmError(f"the gripper does not answer: {error}") from None
 
     def read(self) -> float:
-        """The width [m].
+        """Returns the width [m].
 
         Raises:
-            ArmError: it was lost.
+            ArmError: the connection was lost.
         """
         self.turning.check()
         return self._seen
 
     def command(self, width: float) -> None:
-        """A width to go to [m], as soon as it listens."""
+        """Requests a width [m], which is sent as soon as the gripper is not busy."""
         self._wanted = min(max(width, 0.0), WIDEST)
 
     def close(self) -> None:

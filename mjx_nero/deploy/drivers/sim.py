@@ -13,10 +13,10 @@ from mjx_nero.deploy.places import sender
 
 
 class SimArm:
-    """An arm of a ``Plant``.
+    """An arm in a ``Plant``.
 
     Args:
-        lead: of ``executor.Lag``: how far targets have to lead positions that move [s].
+        lead: lead of targets over moving positions, from ``executor.Lag`` [s].
     """
 
     def __init__(self, plant: Plant, joints: tuple[str, ...], lead: np.ndarray, clock: Clock):
@@ -26,7 +26,7 @@ class SimArm:
         """See ``Arm``."""
 
     def ranges(self) -> None:
-        """See ``Arm``: the model's."""
+        """See ``Arm``: the model's limits."""
 
     def engage(self) -> None:
         """See ``Arm``: the simulated drives hold from the start."""
@@ -58,12 +58,12 @@ def of(
     objects: Mapping[str, Sequence[float]] | None = None,
     **faults: Any,
 ) -> SimArm:
-    """The arm of a model's file (``.mjb``).
+    """Makes the arm of a model file (``.mjb``).
 
     Args:
-        tracker: port of this machine that is told where objects are.
-        start: where the joints are at first; None: at home [rad or m].
-        objects: where objects are at first, in the root frame [m].
+        tracker: port of this machine to which object positions are sent.
+        start: first positions of the joints [rad or m]; None: home.
+        objects: first positions of the objects, in the root frame [m].
         faults: fields of ``emulators.plant.Faults``.
     """
     at = np.array(metadata["joints"]["home"] if start is None else start, float)

@@ -1,4 +1,4 @@
-"""SO-101's leader arm: the servos of a follower, limp, that a person moves by hand. It is read, and never commanded."""
+"""The SO-101's leader arm: a follower's servos without torque, which a person moves by hand. It is only read."""
 
 import pathlib
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ from mjx_nero.errors import UserError
 
 
 class SoLeader(SoArm):
-    """See ``SoArm``, whose calibration file it has."""
+    """A leader arm, with the same calibration file as ``SoArm``."""
 
     def connect(self) -> None:
         """Opens the port, and cuts the servos' torque."""
-        self._taken = alone(self._port)  # that of an arm which another program moves would drop it
+        self._taken = alone(self._port)  # cutting the torque of an arm that another program moves would drop it
         try:
             super().connect()
         except UserError:
@@ -27,7 +27,7 @@ class SoLeader(SoArm):
             self._bus.write(servo, "torque_enable", 0)
 
     def close(self) -> None:
-        """Closes the port, which others may have then."""
+        """Closes the port, so that other programs can use it."""
         super().close()
         self._taken.close()
 
@@ -37,7 +37,7 @@ class SoLeader(SoArm):
         Raises:
             ArmError: always.
         """
-        raise ArmError("a leader arm is moved by hand alone")
+        raise ArmError("a leader arm can only be moved by hand")
 
     def command(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Refuses.
@@ -45,16 +45,16 @@ class SoLeader(SoArm):
         Raises:
             ArmError: always.
         """
-        raise ArmError("a leader arm is moved by hand alone")
+        raise ArmError("a leader arm can only be moved by hand")
 
 
 def of(metadata: Mapping[str, Any], port: str, calibration: pathlib.Path, clock: Clock) -> SoLeader:
-    """The leader at a port, with positions as the robot's model has them [rad].
+    """Makes the driver of the leader at a port, with positions in the robot model's convention [rad].
 
     Args:
-        metadata: of the robot that has the leader's joints (``interop.description.robot``).
+        metadata: description of the robot that has the leader's joints (``interop.description.robot``).
 
     Raises:
-        UserError: there is no calibration file.
+        UserError: the calibration file does not exist or is invalid.
     """
     return SoLeader("so101", metadata, read_calibration(calibration, tuple(metadata["joints"]["names"])), port, clock)

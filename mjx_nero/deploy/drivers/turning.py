@@ -1,4 +1,4 @@
-"""A thread that asks and tells a device again and again, until it fails."""
+"""A thread that talks to a device repeatedly, until that fails."""
 
 import threading
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from mjx_nero.deploy.arm import ArmError
 
 
 class Turning:
-    """Calls ``work`` in a thread of its own. A failure ends the calls, and ``check`` tells of it.
+    """Calls ``work`` repeatedly in a separate thread. A failure ends the calls, and ``check`` reports it.
 
     Args:
         pause: time between two calls [s].
@@ -18,7 +18,7 @@ class Turning:
         self._over, self._thread = threading.Event(), threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        """Lets the calls begin."""
+        """Starts the calls."""
         self._thread.start()
 
     def _run(self) -> None:
@@ -26,7 +26,7 @@ class Turning:
             self.turn()
 
     def turn(self) -> None:
-        """Makes one call, unless one has failed."""
+        """Makes one call, unless an earlier one failed."""
         try:
             if not self._error:
                 self._work()
@@ -34,7 +34,7 @@ class Turning:
             self._error = str(error)
 
     def check(self) -> None:
-        """Tells of a failure.
+        """Reports a failure.
 
         Raises:
             ArmError: a call has failed.

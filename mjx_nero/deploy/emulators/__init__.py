@@ -1,4 +1,4 @@
-"""Arms in software that speak the real ones' protocols, with MuJoCo behind them."""
+"""Emulated arms, which speak the protocols of real ones, with MuJoCo behind them."""
 
 import contextlib
 import json
@@ -16,10 +16,10 @@ _MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "
 
 @contextlib.contextmanager
 def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """An emulated arm in a process of its own; gives the options of the driver that talks to it.
+    """Starts an emulated arm in a separate process; yields the options of the driver that talks to it.
 
     Args:
-        options: ``model`` (a file), ``tracker``, ``objects``, and perhaps ``start``, ``faults`` and ``bus``.
+        options: ``model`` (a file), ``tracker``, ``objects``, and optionally ``start``, ``faults`` and ``bus``.
 
     Raises:
         UserError: it does not start.
@@ -36,7 +36,7 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
     with subprocess.Popen(argv, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         try:
             if not (said := process.stdout.readline().strip()):
-                raise UserError(f"the emulated {kind} did not start")
+                raise UserError(f"the emulated {kind} did not start: see its error above")
             yield {**json.loads(said), **driver}
         finally:
             process.stdin.close()
@@ -44,7 +44,7 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
 
 
 class Port(Protocol):
-    """An emulated arm at a port of this machine."""
+    """An emulated arm that listens on a port of this machine."""
 
     name: str
 
@@ -52,7 +52,7 @@ class Port(Protocol):
 
 
 def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
-    """An emulator's process: makes the plant that ``started`` describes, says its ports, and serves until its input ends."""
+    """Runs an emulator's process: makes the plant that ``started`` describes, prints the ports, and serves until input ends."""
     import dataclasses
 
     import numpy as np

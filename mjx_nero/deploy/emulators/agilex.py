@@ -1,8 +1,8 @@
-"""A Piper or Nero in software, behind a serial CAN adapter (SLCAN): its frames, 200 times a second.
+"""An emulated Piper or Nero behind a serial CAN adapter (SLCAN), which sends its frames 200 times per second.
 
     python -m mjx_nero.deploy.emulators.agilex '{"model": "scene.mjb", ...}'
 
-prints the port, as ``--port`` takes it, and serves until its input ends. What a runtime must not do is counted: ``torque_cuts``.
+prints the port for ``--port``, and serves until its input ends. It counts what a runtime must never do: ``torque_cuts``.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from mjx_nero.deploy.drivers import agilex
 from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 
-_BRAKES = 1e4  # [N m s/rad]: without power it lies on something
-PERIOD = 0.005  # [s] between feedbacks
-_WAY, _STEPS = 0.02, 8  # [s] to a new target; steps on the way
+_BRAKES = 1e4  # [N m s/rad]: without power the arm lies on something
+PERIOD = 0.005  # time between feedbacks [s]
+_WAY, _STEPS = 0.02, 8  # time to a new target [s]; steps on the way
 
 
 @dataclasses.dataclass
@@ -25,11 +25,11 @@ class BusFaults:
     """Faults of the arm, which can be set while it runs.
 
     Attributes:
-        cut: nothing is heard, nothing arrives.
+        cut: no frame passes in either direction.
         mute: frames that are not sent.
-        status: of the arm, as 0x2A1 tells it.
-        bits: of each joint's state, from 1.
-        heat: of the motors [degrees C].
+        status: the arm's status, in frame 0x2A1.
+        bits: bits of each joint's state, by the joint's number from 1.
+        heat: temperature of the motors [degrees C].
     """
 
     cut: bool = False
@@ -40,7 +40,7 @@ class BusFaults:
 
 
 class Arm:
-    """Answers frames as the arm does, and sends frames by itself."""
+    """Handles frames as the arm does, and makes the frames that it sends by itself."""
 
     def __init__(self, plant: Plant, model: agilex.Model):
         self.plant, self.faults, self.torque_cuts, self._model = plant, BusFaults(), 0, model
@@ -49,7 +49,7 @@ class Arm:
         plant.stiffen()
 
     def take(self, frame: int, data: bytes) -> None:
-        """A frame from the runtime."""
+        """Handles a frame from the runtime."""
         if self.faults.cut:
             return
         n = self._model.count
@@ -69,14 +69,14 @@ class Arm:
             self.torque_cuts += 1
 
     def _aim(self) -> None:
-        """Goes straight to new targets. How the real arm's planner does it is not known."""
+        """Moves straight to new targets. The real arm's planner is not known."""
         self.plant.advance()
         for k in range(1, _STEPS + 1):
             self.plant.target(self._told + (self._goal - self._told) * k / _STEPS, _WAY * k / _STEPS)
         self._told = self._goal.copy()
 
     def frames(self) -> list[tuple[int, bytes]]:
-        """All of one round."""
+        """Makes all frames of one round of feedback."""
         self.plant.advance()
         if self.faults.cut:
             return []
@@ -93,10 +93,10 @@ class Arm:
 
 
 class CanPort:
-    """The arm on a bus of python-can's, such as ``virtual:NAME`` within one process; its owner calls ``take`` and ``say``.
+    """The arm on one of python-can's buses, such as ``virtual:NAME`` within one process. Its owner calls ``take`` and ``say``.
 
     Attributes:
-        name: as ``--port`` takes it.
+        name: the bus, for ``--port``.
     """
 
     def __init__(self, arm: Arm, name: str):
@@ -106,12 +106,12 @@ class CanPort:
         self._message, self._bus = can.Message, can.Bus(interface=interface, channel=channel)
 
     def take(self) -> None:
-        """Takes what has arrived."""
+        """Handles all frames that have arrived."""
         while message := self._bus.recv(0.0):
             self.arm.take(message.arbitration_id, bytes(message.data))
 
     def say(self) -> None:
-        """One round of feedback."""
+        """Sends one round of feedback."""
         for frame, data in self.arm.frames():
             self._bus.send(self._message(arbitration_id=frame, data=data, is_extended_id=False))
 
@@ -121,10 +121,10 @@ class CanPort:
 
 
 class Port:
-    """The serial adapter: SLCAN's lines, ``t`` + three digits of the frame, its length, and its bytes in hexadecimal.
+    """The serial adapter. A line of SLCAN is ``t``, three digits of the frame, its length, and its bytes in hexadecimal.
 
     Attributes:
-        name: as ``--port`` takes it.
+        name: the port, for ``--port``.
     """
 
     def __init__(self, arm: Arm, line: Line):
@@ -132,7 +132,7 @@ class Port:
         self.close, self._bytes, self._left, self._open = line.close, b"", b"", False
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
-        """Sends and takes frames until somebody says so, or until a file descriptor ends."""
+        """Sends and handles frames, until ``until`` returns True or the file descriptor ``other`` ends."""
         self._line.serve(lambda: self._take(self._line.read()), self._say, PERIOD, until, other)
 
     def _take(self, data: bytes) -> None:
@@ -148,7 +148,7 @@ class Port:
                     continue
 
     def _say(self) -> None:
-        """One round of feedback; where nobody reads, frames are lost, as on a bus, but none in its middle."""
+        """Sends one round of feedback. If nobody reads, whole frames are lost, as on a bus."""
         frames = self.arm.frames()
         if self._open and not self._left:
             self._left = "".join(f"t{frame:03X}{len(data)}{data.hex().upper()}\r" for frame, data in frames).encode()
@@ -156,7 +156,7 @@ class Port:
 
 
 def main() -> None:
-    """The process."""
+    """Runs the emulator's process."""
     from mjx_nero.deploy.emulators import process
 
     process(lambda plant, told: Port(Arm(plant, agilex.MODELS[told["kind"]]), Line()))

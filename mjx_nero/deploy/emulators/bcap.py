@@ -1,10 +1,10 @@
-"""A Cobotta Pro's controller and its RG6 in software: b-CAP over TCP and UDP, and Modbus over TCP.
+"""An emulated Cobotta Pro controller with its RG6: b-CAP over TCP and UDP, and Modbus over TCP.
 
     python -m mjx_nero.deploy.emulators.bcap '{"model": "scene.mjb", ...}'
 
-prints both addresses and serves until its input ends. In slave mode a target is taken every 8 ms; three wait for their turn, the
-fourth one's sender has to. Where targets stop coming the controller leaves slave mode and stands. What a runtime must not do is
-counted: ``torque_cuts``.
+prints both addresses and serves until its input ends. In slave mode it executes a target every 8 ms. Three targets can wait; the
+sender of a fourth has to wait itself. If targets stop, the controller leaves slave mode and the arm stands still. It counts what
+a runtime must never do: ``torque_cuts``.
 """
 
 import contextlib
@@ -22,24 +22,24 @@ import numpy as np
 from mjx_nero.deploy.drivers import bcap, cobotta, rg6
 from mjx_nero.deploy.emulators.plant import Plant
 
-_BUFFER, _LATE = 3, 4  # cycles: targets that wait; how late the next one may be
+_BUFFER, _LATE = 3, 4  # targets that can wait; cycles by which the next one may be late
 _FAIL, _TOO_LATE = 0x80004005 - (1 << 32), 0x84201482 - (1 << 32)
 _ARM = 6
 _GRIPS = 0.1  # [m/s]: the RG6 opens and closes at 51 to 160 mm/s, by its data sheet
-_FASTEST = 3.0  # times the model's speed, from one target to the next
+_FASTEST = 3.0  # maximum speed between two targets, as a multiple of the model's
 
 
 @dataclasses.dataclass
 class BusFaults:
-    """Faults of the buses, to be set while they run.
+    """Faults of the buses, which can be set while they run.
 
     Attributes:
-        cut: nobody answers.
+        cut: nothing answers.
         corrupt: answers lose their last byte.
         closed: connections are closed at the next request.
-        lost: every so many a datagram's answer is lost; 0: none.
-        error: result of every slvMove; 0: none.
-        tripped: a safety switch of the gripper is.
+        lost: every ``lost``-th answer to a datagram is lost; 0: none.
+        error: result of every slvMove; 0: no error.
+        tripped: a safety switch of the gripper has tripped.
     """
 
     cut: bool = False
@@ -54,8 +54,8 @@ class Controller:
     """The controller: answers requests, and moves the plant.
 
     Args:
-        speed: of the arm's joints, at most [rad/s].
-        wait: whether senders wait for their turn.
+        speed: maximum speed of the arm's joints [rad/s].
+        wait: whether senders must wait for their turn.
     """
 
     def __init__(self, plant: Plant, speed: np.ndarray, wait: bool = True):
@@ -65,11 +65,11 @@ class Controller:
         self._width = self._grip_to = rg6.width(float(self._goal[_ARM]))
         plant.powered[:_ARM] = False
         plant.gears = 1e5  # brakes
-        plant.model.opt.timestep = cobotta.CYCLE / 2  # answers that come so often must not show the steps of physics
+        plant.model.opt.timestep = cobotta.CYCLE / 2  # frequent answers must not show the physics steps
         plant.stiffen()
 
     def answer(self, data: bytes) -> bytes:
-        """The packet that comes back."""
+        """Returns the answer to a packet."""
         try:
             serial, function, values = bcap.parse(data)
             result, value = self._do(function, values)
@@ -87,7 +87,7 @@ class Controller:
         return (0, None) if function in (bcap.SERVICE_START, bcap.SERVICE_STOP, bcap.DISCONNECT, bcap.RELEASE) else (_FAIL, None)
 
     def _advance(self) -> None:
-        """Catches up with the clock; the gripper goes to its width at its own speed."""
+        """Catches up with the clock; the gripper moves to its width at its own speed."""
         now, left = self.plant.time, self._grip_to - self._width
         if left:
             most = _GRIPS * max(now - self._before, 0.0)
@@ -138,7 +138,7 @@ class Controller:
         return 0, self._degrees()
 
     def grip(self, request: bytes) -> bytes:
-        """The gripper's answer to a Modbus request; of functions 3 and 16."""
+        """Returns the gripper's answer to a Modbus request (functions 3 and 16)."""
         self._advance()
         head, (unit, function, first, count) = request[:4], struct.unpack(">BBHH", request[6:12])
         here = rg6.width(float(self.plant.position()[_ARM]))
@@ -158,10 +158,10 @@ class Controller:
 
 
 class Port:
-    """Both at ports of this machine.
+    """Controller and gripper at ports of this machine.
 
     Attributes:
-        name, gripper: as ``--port`` and ``--gripper`` take them.
+        name, gripper: their addresses, for ``--port`` and ``--gripper``.
     """
 
     def __init__(self, controller: Controller):
@@ -174,7 +174,7 @@ class Port:
         self._before, self._count = (0, b""), 0
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
-        """Answers until somebody says so, or until a file descriptor ends."""
+        """Answers requests, until ``until`` returns True or the file descriptor ``other`` ends."""
         while not until():
             watched: list[Any] = [self._arm, self._hand, self._post, *self._guests, *([] if other is None else [other])]
             ready, _, _ = select.select(watched, [], [], 0.02)
@@ -191,7 +191,7 @@ class Port:
                 self._serve(guest)
 
     def _reply(self) -> None:
-        """Answers a datagram; one that is repeated as it was answered before."""
+        """Answers a datagram; a repeated one gets the same answer as before."""
         with contextlib.suppress(OSError, struct.error):
             data, sender = self._post.recvfrom(bcap.LONGEST)
             faults, (serial, first) = self.controller.faults, struct.unpack_from("<HH", data, 5)
@@ -214,13 +214,13 @@ class Port:
         guest.close()
 
     def close(self) -> None:
-        """Closes all."""
+        """Closes all sockets."""
         for each in (self._arm, self._hand, self._post, *self._guests):
             each.close()
 
 
 def main() -> None:
-    """The process."""
+    """Runs the emulator's process."""
     from mjx_nero.deploy.emulators import process
 
     process(lambda plant, told: Port(Controller(plant, np.array(told["metadata"]["joints"]["speed"])[:_ARM])))

@@ -1,4 +1,4 @@
-"""Pictures of a simulated arm, by MuJoCo's renderer."""
+"""Pictures of a simulated arm, drawn by MuJoCo's renderer."""
 
 import os
 import pathlib
@@ -13,19 +13,19 @@ from mjx_nero.deploy.emulators.plant import Plant
 from mjx_nero.deploy.places import Places
 from mjx_nero.errors import UserError
 
-_UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
-_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # off, as in training
+_UNSEEN = 5  # geom group that no camera sees: the goal's marker is only for viewers
+_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # switched off, as in training
 
 
 class Eyes:
-    """Draws what the policy's cameras see, at once; see ``observe.Pictures``.
+    """Draws what the policy's cameras see, without delay; see ``observe.Pictures``.
 
     Args:
-        model: the scene with visual shapes and the policy's cameras (``scene.cameras.NAME``), or a file of one (``.mjb``).
-        told: the policy's cameras, by name, from its metadata.
-        joints: in the order of a feedback's.
-        base: of the robot's root frame in the world [m].
-        places: where objects are.
+        model: scene with visual shapes and the policy's cameras (``scene.cameras.NAME``), or its file (``.mjb``).
+        told: the policy's cameras by name, from its metadata.
+        joints: names of the joints, in the order of a feedback.
+        base: position of the robot's root frame in the world [m].
+        places: source of object positions.
 
     Raises:
         UserError: this machine cannot draw.
@@ -39,7 +39,7 @@ class Eyes:
         base: Sequence[float],
         places: Places,
     ):
-        os.environ.setdefault("LP_NUM_THREADS", "0")  # OpenGL in software draws in this thread, which is in a hurry
+        os.environ.setdefault("LP_NUM_THREADS", "0")  # software OpenGL then draws in this thread, which has priority
         self._told, self._places = told, places
         clock = _Still()
         model = model if isinstance(model, mujoco.MjModel) else mujoco.MjModel.from_binary_path(str(model))
@@ -53,10 +53,10 @@ class Eyes:
         except Exception as error:  # each GL binding fails in its own way
             raise UserError(f"no offscreen OpenGL here, so no pictures: install libegl1 or libosmesa6 ({error})") from None
         for name, camera in told.items():
-            self._drawn(name, camera)  # the first one takes longer than all after
+            self._drawn(name, camera)  # the first picture takes much longer
 
     def __call__(self, feedback: Feedback, now: float) -> dict[str, np.ndarray]:
-        """The pictures of all cameras, [height, width, 3] each."""
+        """Draws the pictures of all cameras, [height, width, 3] each."""
         places = {name: self._places.find(name, now) for name in self._shown.objects}
         self._shown.reset(feedback.position, {name: place.position for name, place in places.items()})
         for name, place in places.items():
@@ -78,7 +78,7 @@ class Eyes:
 
 
 class _Still:
-    """A clock that stands; see ``arm.Clock``."""
+    """A stopped clock; see ``arm.Clock``."""
 
     def now(self) -> float:
         return 0.0

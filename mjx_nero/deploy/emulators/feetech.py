@@ -1,8 +1,9 @@
-"""STS3215 servos in software, behind a serial line: registers, EEPROM and RAM, answers at the pace of the real bus.
+"""Emulated STS3215 servos behind a serial line: registers in EEPROM and RAM, and answers at the real bus's pace.
 
     python -m mjx_nero.deploy.emulators.feetech '{"model": "scene.mjb", ...}'
 
-prints the port's name and serves until its input ends. What a runtime must not do is counted: ``eeprom_writes``, ``torque_cuts``.
+prints the port's name and serves until its input ends. It counts what a runtime must never do: ``eeprom_writes`` and
+``torque_cuts``.
 """
 
 import dataclasses
@@ -20,9 +21,9 @@ from mjx_nero.deploy.emulators.line import Line
 from mjx_nero.deploy.emulators.plant import Plant
 
 _EEPROM_END, _FACTORY = 40, 80
-_GEARS = 100.0  # [N m s/rad]: 1 to 345, so that an arm without power sinks slowly
-_BYTE = 1e-5  # [s] at 1 Mbaud
-_REFRESH = 0.02  # [s] between looks at the arm where nobody asks
+_GEARS = 100.0  # [N m s/rad]: gears of 1:345, so that an arm without power sinks slowly
+_BYTE = 1e-5  # time of a byte at 1 Mbaud [s]
+_REFRESH = 0.02  # time between updates of the measurements without requests [s]
 
 
 @dataclasses.dataclass
@@ -30,13 +31,13 @@ class BusFaults:
     """Faults of the bus, which can be set while it runs.
 
     Attributes:
-        cut: nobody answers, nothing arrives.
-        corrupt: share of answers that lose a bit.
-        frozen: registers stay as they are.
-        turnaround: of each answer [s]; six of them make the 5 to 6 ms that a read of all joints takes.
-        hiccup, hiccup_s: share of requests that are late, and by how much [s].
-        errors: bits that servos report, by id.
-        heat: of the servos [degrees C].
+        cut: no byte passes in either direction.
+        corrupt: share of answers with a flipped bit.
+        frozen: measurements in the registers no longer change.
+        turnaround: time until each answer [s]; for six servos this makes the 5 to 6 ms that a read of all joints takes.
+        hiccup, hiccup_s: share of requests that are answered late, and by how much [s].
+        errors: error bits that servos report, by id.
+        heat: temperature of the servos [degrees C].
     """
 
     cut: bool = False
@@ -50,17 +51,17 @@ class BusFaults:
 
 
 class Servos:
-    """The servos of an arm; ``answer`` takes a request's bytes.
+    """The servos of an arm; ``answer`` handles a request's bytes.
 
     Args:
-        calibration: LeRobot's, by joint, in the plant's order.
-        limits: of the plant's joints [rad], [n, 2].
-        grips: which joint is the gripper's.
-        middle: what each joint is at the middle of its calibrated range [rad].
+        calibration: LeRobot's calibration of each joint, in the plant's order.
+        limits: limits of the plant's joints [n, 2] [rad].
+        grips: which joints are the gripper's.
+        middle: position of each joint at the middle of its calibrated range [rad].
 
     Attributes:
-        faults: what is wrong with the bus.
-        eeprom_writes, torque_cuts: what nobody may do.
+        faults: faults of the bus.
+        eeprom_writes, torque_cuts: counts of forbidden actions.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class Servos:
         return feetech.decode(name, bytes(self.memory[servo][at : at + size]))
 
     def _span(self, i: int) -> tuple[float, float]:
-        """Counts a radian, and the count where the joint is at zero."""
+        """Returns counts per radian, and the count at the joint's zero."""
         entry, (low, high) = self._calibration[i], self._limits[i]
         first, last = entry["range_min"], entry["range_max"]
         if self._grips[i]:
@@ -105,7 +106,7 @@ class Servos:
         return scale, (first + last) / 2 - self._middle[i] * scale
 
     def refresh(self) -> None:
-        """Updates what the servos measure."""
+        """Updates the servos' measurements."""
         self.plant.advance()
         if self.faults.frozen:
             return
@@ -118,7 +119,7 @@ class Servos:
             self._put(entry["id"], "temperature", self.faults.heat)
 
     def answer(self, request: bytes) -> bytes:
-        """The bytes that come back; none to what is damaged or to everyone."""
+        """Returns the answer to a request; empty if the request is damaged or is a broadcast write."""
         body = request[2:-1]
         if len(body) < 3 or feetech.checksum(body) != request[-1] or self.faults.cut:
             return b""
@@ -162,7 +163,7 @@ class Servos:
         self.plant.powered[i] = torque
 
     def _aim(self) -> None:
-        """Tells the drives the servos' goals."""
+        """Sets the drives' targets to the servos' goals."""
         self.plant.advance()
         goals = []
         for i, entry in enumerate(self._calibration):
@@ -176,7 +177,7 @@ class Port:
     """Servos at the other end of a line.
 
     Attributes:
-        name: of the port to open.
+        name: name of the port to open.
     """
 
     def __init__(self, servos: Servos, line: Line):
@@ -184,11 +185,11 @@ class Port:
         self.close = line.close
 
     def serve(self, until: Callable[[], bool] = lambda: False, other: int | None = None) -> None:
-        """Answers until somebody says so, or until a file descriptor ends."""
+        """Answers requests, until ``until`` returns True or the file descriptor ``other`` ends."""
         self._line.serve(lambda: self._take(self._line.read()), self.servos.refresh, _REFRESH, until, other)
 
     def _take(self, data: bytes) -> None:
-        """Splits what came into packets."""
+        """Splits the received bytes into packets."""
         self._bytes += data
         while (start := self._bytes.find(b"\xff\xff")) >= 0:
             self._bytes = self._bytes[start:]
@@ -209,12 +210,12 @@ class Port:
 
 
 def calibration(metadata: Mapping[str, Any], kind: str) -> dict[str, dict[str, int]]:
-    """A calibration file's content for an emulated arm: ranges as wide as the model's, offsets as any arm has them."""
+    """Makes the calibration of an emulated arm, with the model's ranges and arbitrary offsets."""
     own, out = metadata["joints"], {}
     for i, name in enumerate(own["names"]):
         low, high = own["lower"][i], own["upper"][i]
         wide, grips = (high - low) * 4095 / (2 * np.pi), name in metadata["gripper"]
-        if kind == "so101" and not grips:  # the middle is the model's zero: as far to both sides
+        if kind == "so101" and not grips:  # the middle is the model's zero, so the range is symmetric
             wide = 2 * max(-low, high) * 4095 / (2 * np.pi)
         first = max(0, round(2047 - wide / 2))
         last = 4094 - first
@@ -223,7 +224,7 @@ def calibration(metadata: Mapping[str, Any], kind: str) -> dict[str, dict[str, i
 
 
 def servos_of(metadata: Mapping[str, Any], kind: str, entries: Mapping[str, Mapping[str, int]], plant: Plant) -> Servos:
-    """The servos of an arm in a plant."""
+    """Makes the servos of an arm in a plant."""
     own = metadata["joints"]
     limits = np.array([own["lower"], own["upper"]]).T
     grips = np.array([name in metadata["gripper"] for name in own["names"]])
@@ -232,7 +233,7 @@ def servos_of(metadata: Mapping[str, Any], kind: str, entries: Mapping[str, Mapp
 
 
 def main() -> None:
-    """The process."""
+    """Runs the emulator's process."""
     from mjx_nero.deploy.emulators import process
 
     def port(plant: Plant, told: Mapping[str, Any]) -> Port:

@@ -1,4 +1,4 @@
-"""The far end of a serial line in software: a pseudo-terminal, or a port of this machine that pyserial opens by an address."""
+"""The far end of an emulated serial line: a pseudo-terminal, or a TCP port of this machine that pyserial can open."""
 
 import contextlib
 import os
@@ -10,14 +10,14 @@ from collections.abc import Callable
 
 
 class Line:
-    """A line that one program may open at a time.
+    """A line that one program at a time may open.
 
     Args:
-        terminal: a pseudo-terminal. The kernel carries its bytes in a thread of ordinary priority, which comes up to a tenth of
-            a second late where other programs compute; those of a TCP port come at once.
+        terminal: use a pseudo-terminal instead of a TCP port. The kernel moves its bytes in a thread of ordinary priority, which
+            can be a tenth of a second late while other programs compute; a TCP port has no such delay.
 
     Attributes:
-        name: to be opened with ``serial.serial_for_url``.
+        name: address for ``serial.serial_for_url``.
     """
 
     def __init__(self, terminal: bool = False):
@@ -33,7 +33,7 @@ class Line:
             self._end, self.name = self._door.fileno(), f"socket://127.0.0.1:{self._door.getsockname()[1]}"
 
     def read(self) -> bytes:
-        """Returns what has come; empty where nothing has."""
+        """Returns the bytes that have arrived; may be empty."""
         if self._door and not self._guest:
             self._guest, _ = self._door.accept()
             self._guest.setblocking(False)
@@ -48,7 +48,7 @@ class Line:
             data = b""
         if not self._guest:
             return data
-        if data:  # else the next small packet would wait for the acknowledgement of this one
+        if data:  # otherwise the next small packet would wait for this one's acknowledgement
             self._guest.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         else:
             self._leave()
@@ -60,7 +60,7 @@ class Line:
         self._guest, self._end = None, self._door.fileno()
 
     def write(self, data: bytes) -> int:
-        """Sends; returns how many bytes the line has taken."""
+        """Sends bytes; returns how many the line accepted."""
         if data and (self._guest or not self._door):
             with contextlib.suppress(OSError):
                 return os.write(self._end, data)
@@ -74,10 +74,11 @@ class Line:
         until: Callable[[], bool] = lambda: False,
         other: int | None = None,
     ) -> None:
-        """Calls ``take`` when something has come, and ``tick`` every ``period`` [s].
+        """Calls ``take`` when bytes have arrived, and ``tick`` every ``period`` [s].
 
         Args:
-            until, other: it ends when somebody says so, or a file descriptor ends.
+            until: it ends when this returns True.
+            other: it also ends when this file descriptor does.
         """
         due = time.monotonic()
         while not until():
@@ -92,7 +93,7 @@ class Line:
                 tick()
 
     def close(self) -> None:
-        """Unplugs it."""
+        """Closes the line."""
         for each in (self._guest, self._door):
             if each:
                 each.close()

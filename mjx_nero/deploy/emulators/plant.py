@@ -1,4 +1,4 @@
-"""A scene in MuJoCo's C library that keeps up with a clock: what stands behind the simulated arm and the emulators."""
+"""A scene in MuJoCo's C library that keeps up with a clock, for the simulated arm and the emulators."""
 
 import collections
 import copy
@@ -15,8 +15,8 @@ import numpy as np
 from mjx_nero.deploy.arm import Clock
 from mjx_nero.deploy.places import Sender
 
-_SLOW = 0.02  # [s], damping over stiffness
-_LONGEST = 0.5  # [s] that are caught up at once; a program that stood still longer finds the arm where it left it
+_SLOW = 0.02  # damping over stiffness of a drive that counts as slow [s]
+_LONGEST = 0.5  # maximum time to catch up at once [s]; after a longer pause of the program the arm has not moved on
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -26,9 +26,9 @@ class Faults:
     """Faults of the plant, which can be set while it runs.
 
     Attributes:
-        stalled: joints that stand still, by number.
-        late: from a target's arrival until it is in force [s].
-        stiffness: the drives', as a share of the model's.
+        stalled: indices of joints that stand still.
+        late: delay from a target's arrival until it takes effect [s].
+        stiffness: stiffness of the drives, as a share of the model's.
     """
 
     stalled: frozenset[int] = frozenset()
@@ -37,7 +37,7 @@ class Faults:
 
 
 def _alone(method: Method) -> Method:
-    """Lets one thread at a time into a plant: MuJoCo's data does not survive two, and an emulator may serve in a thread."""
+    """Lets only one thread at a time into a plant, because MuJoCo's data is not thread-safe and an emulator may have a thread."""
 
     @functools.wraps(method)
     def locked(plant: "Plant", *args: Any, **kwargs: Any) -> Any:
@@ -51,16 +51,16 @@ class Plant:
     """Position drives with objects around them. Several threads may use it.
 
     Args:
-        model: compiled scene, or a file of one (``.mjb``) whose actuators are the drives.
-        joints: in the order of targets and readings.
-        start: where they are at first [rad or m].
-        base: of the robot's root frame in the world [m].
-        tracker: told where objects are after every advance.
+        model: compiled scene whose actuators are the drives, or its file (``.mjb``).
+        joints: names of the joints, in the order of targets and readings.
+        start: first positions of the joints [rad or m].
+        base: position of the robot's root frame in the world [m].
+        tracker: called with the objects' positions after every advance.
 
     Attributes:
-        faults: what is wrong with the arm.
+        faults: faults of the arm.
         powered: which drives have torque.
-        gears: how hard the others are to turn [N m s/rad].
+        gears: damping of the drives without torque [N m s/rad].
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Plant:
         self._lock = threading.RLock()
         if not isinstance(model, mujoco.MjModel):
             model = mujoco.MjModel.from_binary_path(str(model))
-        self.model = copy.copy(model)  # the drives' gains change
+        self.model = copy.copy(model)  # a copy, because the drives' gains change
         self.data, self._clock, self._base, self._tracker = mujoco.MjData(self.model), clock, np.asarray(base, float), tracker
         m, ids = self.model, [self.model.joint(name).id for name in joints]
         self._qpos, self._dof = m.jnt_qposadr[ids], m.jnt_dofadr[ids]
@@ -90,7 +90,7 @@ class Plant:
 
     @_alone
     def reset(self, start: np.ndarray, objects: dict[str, np.ndarray] | None = None) -> None:
-        """The arm at rest somewhere, its drives told to stay; objects at positions [m] in the root frame."""
+        """Puts the arm at rest at positions [rad or m] that its drives hold, and objects at positions [m] in the root frame."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._qpos] = self._targets = np.array(start, float)
         self._couple()
@@ -104,7 +104,7 @@ class Plant:
 
     @_alone
     def stiffen(self) -> None:
-        """Makes drives that follow slowly position servos: ten times as stiff, and critically damped."""
+        """Turns slow drives into position servos: ten times as stiff, and critically damped."""
         soft = -self._bias[:, 2] > _SLOW * self._gain
         inertia = 1 / self.model.dof_invweight0[self._dof]
         stiffness = np.where(soft, 10 * self._gain, self._gain)
@@ -112,10 +112,10 @@ class Plant:
         self._gain, self._bias[:, 1], self._bias[:, 2] = stiffness, -stiffness, -damping
         fastest = float(np.sqrt(stiffness / inertia).max())
         while fastest * self.model.opt.timestep > 1:
-            self.model.opt.timestep /= 2  # a servo's swing takes some steps of physics
+            self.model.opt.timestep /= 2  # several physics steps per oscillation of a servo
 
     def _couple(self) -> None:
-        """Joints that follow others, where these have them."""
+        """Puts joints that follow others where these require."""
         m, q = self.model, self.data.qpos
         for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
             if m.eq_obj2id[e] >= 0:
@@ -144,7 +144,7 @@ class Plant:
         self._tell()
 
     def _set_drives(self) -> None:
-        """Sets the drives' present stiffness and power."""
+        """Applies the drives' present stiffness and power to the model."""
         m, share = self.model, np.where(self.powered, self.faults.stiffness, 0.0)
         m.actuator_gainprm[self._act, 0], m.actuator_biasprm[self._act, 1] = self._gain * share, self._bias[:, 1] * share
         m.actuator_biasprm[self._act, 2] = np.where(self.powered, self._bias[:, 2], -self.gears)
@@ -156,30 +156,30 @@ class Plant:
 
     @_alone
     def place(self, name: str) -> np.ndarray:
-        """An object's position in the root frame [m]."""
+        """Returns an object's position in the root frame [m]."""
         return self.data.qpos[self.objects[name] :][:3] - self._base
 
     @_alone
     def position(self) -> np.ndarray:
-        """Present positions of the joints [rad or m]."""
+        """Returns the joints' positions [rad or m]."""
         return self.data.qpos[self._qpos].copy()
 
     @_alone
     def velocity(self) -> np.ndarray:
-        """Present velocities of the joints [rad/s or m/s]."""
+        """Returns the joints' velocities [rad/s or m/s]."""
         return self.data.qvel[self._dof].copy()
 
     @_alone
     def load(self) -> np.ndarray:
-        """Shares of the torque that the drives have, signed."""
+        """Returns the drives' torques as signed shares of their maximum."""
         return self.data.actuator_force[self._act] / self._effort
 
     @property
     def time(self) -> float:
-        """Time since its beginning [s]."""
+        """Time since the last reset [s]."""
         return self._clock.now() - self._begun
 
     @_alone
     def target(self, targets: np.ndarray, later: float = 0.0) -> None:
-        """New targets of the drives [rad or m], in force after what ``faults.late`` says, and ``later`` [s]."""
+        """Sets new targets of the drives [rad or m], which take effect after ``faults.late`` plus ``later`` [s]."""
         self._waiting.append((self.time + self.faults.late + later, np.array(targets, float)))

@@ -1,6 +1,6 @@
-"""Emulated arms in this process and in a time of their own: what takes an arm a minute takes as long as it takes to compute.
+"""Emulated arms in this process, in simulated time, which runs as fast as the computer computes.
 
-Registers, frames and drivers are those of the emulators in processes of their own; bytes take no time, and nothing waits.
+Registers, frames and drivers are the same as in the emulators with separate processes. Bytes take no time, and nothing waits.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ from mjx_nero.deploy.places import Known, Place
 
 
 class Clock:
-    """Time that passes where somebody waits; after every ``period`` of it [s] all in ``ticks`` is called. See ``arm.Clock``."""
+    """Time that passes only while something waits. All of ``ticks`` is called every ``period`` [s]. See ``arm.Clock``."""
 
     def __init__(self, period: float = can.PERIOD):
         self.time, self.ticks, self._period, self._due = 100.0, list[Callable[[], Any]](), period, 100.0
@@ -38,33 +38,33 @@ class Clock:
 
 
 class Wire:
-    """A serial line: what was asked is answered at once."""
+    """A serial line that answers every request at once."""
 
     def __init__(self, servos: serial.Servos):
         self._servos, self._waiting = servos, b""
 
     def reset_input_buffer(self) -> None:
-        """Forgets what has come."""
+        """Discards received bytes."""
         self._waiting = b""
 
     def write(self, data: bytes) -> None:
-        """Asks."""
+        """Sends a request."""
         self._waiting += self._servos.answer(data)
 
     def read(self, count: int) -> bytes:
-        """Gives so many bytes of the answer, or fewer."""
+        """Returns up to ``count`` bytes of the answer."""
         out, self._waiting = self._waiting[:count], self._waiting[count:]
         return out
 
     def close(self) -> None:
-        """Ends nothing."""
+        """Does nothing."""
 
 
 class Sees(Known):
-    """Places that the simulator has.
+    """Object positions from the simulator.
 
     Attributes:
-        plant: the simulator; set it first.
+        plant: the simulator; set it before use.
     """
 
     plant: Plant
@@ -101,7 +101,7 @@ LINES = {"sim": _drives, "so101": _servos, "piper": _frames("piper"), "nero": _f
 
 
 def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> tuple[Arm, Callable[[], None]]:
-    """An arm that holds where it is, and what unplugs it.
+    """Returns an arm that holds its position, and a function that unplugs it.
 
     Args:
         told: metadata of a policy, or of a robot.
@@ -118,5 +118,5 @@ def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> t
 
 
 def home_of(told: Mapping[str, Any]) -> np.ndarray:
-    """Home of all joints [rad or m]."""
+    """Returns the home positions of all joints [rad or m]."""
     return np.array(told["joints"]["home"], float)

@@ -13,14 +13,14 @@ class CloneCfg:
     """Hyperparameters. 0 for ``num_envs`` or ``num_timesteps`` lets the machine decide.
 
     Attributes:
-        data: folders of demonstrations (``demos --out``, ``view --demos``), with commas between them.
+        data: comma-separated folders of demonstrations (``demos --out``, ``view --demos``).
         num_envs: number of environments; only evaluations step them.
         num_timesteps: total steps of demonstrations to learn from, repeats included.
         minibatch_size: steps per update.
         updates: updates per iteration.
         learning_rate: initial learning rate; it falls to zero along half a cosine.
-        max_grad_norm: greatest norm of the gradient.
-        weight_decay: share of a weight that an update removes, times the learning rate.
+        max_grad_norm: maximum norm of the gradient.
+        weight_decay: share of each weight that an update subtracts, times the learning rate.
     """
 
     data: str = ""

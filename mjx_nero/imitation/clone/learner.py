@@ -1,7 +1,6 @@
-"""Cloning (Pomerleau 1989): the policy's network learns the demonstrated action for what the demonstrator saw.
+"""Cloning (Pomerleau 1989): the policy's network learns the demonstrated action for each demonstrated observation.
 
-Only evaluations step the environments. The network is PPO's, so whatever plays or exports a policy takes it, and PPO can continue
-from it.
+Only evaluations step the environments. The network is PPO's, so the policy can be played, exported and fine-tuned by PPO.
 """
 
 import dataclasses
@@ -46,11 +45,11 @@ class Learner(learner.Learner):
 
     Args:
         env: batch of environments, from ``wrappers.for_training``.
-        cfg: with ``num_envs`` and ``num_timesteps`` filled in.
+        cfg: hyperparameters, with ``num_envs`` and ``num_timesteps`` filled in.
         num_devices: must be one.
 
     Raises:
-        UserError: no demonstrations, or those of something else; more devices than one.
+        UserError: there are no demonstrations, they do not fit the environment, or there are several devices.
     """
 
     divisor = 1
@@ -73,7 +72,7 @@ class Learner(learner.Learner):
         )
 
     def init(self, key: Key, bank: Bank | None = None, shown: Shown | None = None) -> CloneState:
-        """Makes new networks; the demonstrations' mean and deviation normalise observations."""
+        """Makes new networks; the demonstrations' mean and deviation normalize observations."""
         k_net, k_seed = jax.random.split(key)
         normalizer, params = init_params(self._networks, self._sizes, k_net)
         normalizer = normalizer.replace(
@@ -112,7 +111,7 @@ class Learner(learner.Learner):
         return self._seen[rows], self._done[rows]
 
     def _loss(self, policy: Any, state: CloneState, seen: Array, done: Array) -> Array:
-        """Mean squared error of the deterministic action."""
+        """Computes the mean squared error of the deterministic action."""
         params = state.normalizer, state.params.replace(policy=policy)
         return jnp.mean((make_act(self._networks, params)({ACTOR: seen}) - done) ** 2)
 
@@ -135,10 +134,10 @@ class Learner(learner.Learner):
 
 
 def _read(path: pathlib.Path, env: Env) -> tuple[np.ndarray, np.ndarray]:
-    """Reads observations and actions [steps, numbers], and checks that they are those of a policy here.
+    """Reads observations and actions [steps, numbers], and checks that they fit the environment's policies.
 
     Raises:
-        UserError: it is of something else.
+        UserError: they do not fit.
     """
     found, own = open_dataset(path), env.unwrapped
     size = own.observation_size[ACTOR]
@@ -158,11 +157,11 @@ def _same(path: pathlib.Path, found: Dataset, what: str, name: str, size: int) -
     if there != size:
         raise UserError(
             f"{path} has {what} of {there} numbers (env {about.get('env')}, preset {about.get('preset')}, through "
-            f"{about.get('through')}), and a policy here has {size}: pass the --env and --preset that it was made with, or make "
+            f"{about.get('through')}), but a policy here has {size}: pass the --env and --preset that it was made with, or make "
             "one with 'demos --agent policy' or 'demos --through task'"
         )
     if not len(found):
-        raise UserError(f"{path} holds no episode yet")
+        raise UserError(f"{path} holds no episode yet: give another folder, or write some with 'demos --out'")
 
 
 KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, held=HELD, differing=differing)

@@ -1,1 +1,1 @@
-"""Distillation: a student with cameras learns from a teacher that is told the state. Its config, networks and learner."""
+"""Distillation: a student with cameras learns from a teacher that observes the state. Config, networks and learner."""

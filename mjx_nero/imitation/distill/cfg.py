@@ -1,4 +1,4 @@
-"""Hyperparameters of distillation and its student: plain data, readable without Brax, whose import takes seconds."""
+"""Hyperparameters of distillation and its student: plain data, readable without importing Brax, which takes seconds."""
 
 import dataclasses
 from typing import Annotated
@@ -13,11 +13,11 @@ ENVS = (32, 4096)  # numbers of environments for a CPU and a GPU
 
 @dataclasses.dataclass(frozen=True)
 class StudentCfg:
-    """The student's networks: convolutions for each camera, then a multilayer perceptron for everything sensed.
+    """The student's networks: convolutions for each camera, then a multilayer perceptron for features and state.
 
     Attributes:
         channels: channels of the convolutions, each of which halves the picture's edges. The first has kernels of 5 x 5 pixels,
-            the others of 3 x 3.
+            the others 3 x 3.
         features: number of features per picture.
         precision: number format of the convolutions: bfloat16 or float32.
         layers: widths of the hidden layers before the action.
@@ -46,13 +46,15 @@ class DistillCfg:
     minibatch_size: Annotated[int, Bounds(1)] = 2048  # env steps per update
     num_epochs: Annotated[int, Bounds(1, 1_000)] = 1  # passes over an iteration's steps
     learning_rate: Annotated[float, Bounds(0.0, 1.0, above=True)] = 1e-3  # initial learning rate of Adam
-    last_rate: Share = 0.1  # share of the learning rate that is left at the end
-    max_grad_norm: Positive = 1.0  # greatest norm of the gradient
-    teacher_share: Share = 0.1  # final share of environments where the teacher acts, showing what the student never does
+    last_rate: Share = 0.1  # final learning rate, as a share of the initial one
+    max_grad_norm: Positive = 1.0  # maximum norm of the gradient
+    teacher_share: Share = (
+        0.1  # final share of environments where the teacher acts, which shows states that the student never reaches
+    )
     teacher_first: Annotated[int, Bounds(0, 1_000_000)] = 20  # iterations in which that share falls from 1
     noise: NonNegative = 0.05  # standard deviation of noise on the student's actions
     max_action: Positive = 1.0  # bound on labels, beyond which nothing changes
-    truth_cost: NonNegative = 0.1  # weight of the loss of object positions, in units of their deviation
+    truth_cost: NonNegative = 0.1  # weight of the loss of predicted object positions, in units of their deviation
     student: StudentCfg = StudentCfg()
 
     def __post_init__(self):

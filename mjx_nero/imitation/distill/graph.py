@@ -1,4 +1,4 @@
-"""The student as an ONNX graph: pictures in, normalisation inside. ``interop.onnx`` brings the graph to draw in (``Graph``)."""
+"""The student as an ONNX graph from pictures to actions, with normalization. ``interop.onnx`` passes the ``Graph`` to fill."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,17 +11,17 @@ from mjx_nero.imitation.distill import networks
 from mjx_nero.learn.policy import Policy
 
 Graph = Any
-TRIES = 300  # observations of a check: pictures take a thousand times as long as vectors
+TRIES = 300  # observations per check: pictures take a thousand times as long as vectors
 
 
 def pictures(meta: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], bool]]:
-    """Lists the inputs of a policy that sees: name -> ([height, width, channels], whether it is whole numbers to 255)."""
+    """Lists the picture inputs of a policy: name -> ([height, width, channels], whether it has whole numbers from 0 to 255)."""
     sizes = meta["observation_size"].get(networks.SEEN, {}) if "student" in meta else {}
     return {f"picture_{name}": (tuple(size), size[-1] == 3) for name, size in sizes.items()}
 
 
 def cameras(meta: Mapping[str, Any], cfg: EnvCfg) -> dict[str, dict[str, Any]]:
-    """Says what gives each picture in training: place, field of view, size, steps a picture and delay; by the camera's name."""
+    """Describes each camera in training, by name: pose, field of view, picture size, control steps per picture, and delay."""
     lenses = [term.params for term in cfg.sensors.values() if "camera" in term.params]
     out: dict[str, dict[str, Any]] = {}
     for picture, (shape, _) in pictures(meta).items():
@@ -34,7 +34,7 @@ def cameras(meta: Mapping[str, Any], cfg: EnvCfg) -> dict[str, dict[str, Any]]:
 
 
 def build(policy: Policy, graph: Graph) -> None:
-    """Adds the student; its inputs are ``observations`` and those of ``pictures``, its output ``actions``."""
+    """Adds the student to a graph. Its inputs are ``observations`` and those of ``pictures``, its output is ``actions``."""
     normalizer, variables = policy.params
     params, shapes = variables["params"], pictures(policy.meta)
     x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
@@ -70,7 +70,7 @@ def _dense(graph: Graph, layer: Mapping[str, Any], x: str, name: str) -> str:
 
 
 def exact(policy: Policy) -> Any:
-    """The policy's act function with convolutions in float32, as ONNX computes."""
+    """Returns the policy's act function with convolutions in float32, as in ONNX."""
     student = {**policy.meta["student"], "precision": "float32"}
     act = networks.from_meta({**policy.meta, "student": student})[1]
     return jax.jit(lambda obs: act(policy.params, obs))

@@ -1,8 +1,8 @@
-"""Distillation on the student's own path (DAgger: Ross, Gordon and Bagnell 2011), all in one compiled program.
+"""Distillation on the student's own states (DAgger: Ross, Gordon and Bagnell 2011), all in one compiled program.
 
-The student acts in nearly all environments. The teacher labels every step with its own action there, and the student learns the
-labels from what it senses and sees. Object positions are a second target, from the same features. Pictures are drawn within the
-step, and none outlives its iteration.
+The student acts in nearly all environments. The teacher labels every step with its own action, and the student learns the labels
+from its sensors and cameras. Object positions are a second target, predicted from the same features. Pictures are drawn within
+the step and kept for one iteration.
 
 Read it from top to bottom.
 """
@@ -62,7 +62,7 @@ class Learner(learner.Learner):
 
     Args:
         env: batch of environments from ``wrappers.for_training``, with the observation groups of ``tasks.seeing``.
-        cfg: with ``num_envs`` filled in.
+        cfg: hyperparameters, with ``num_envs`` filled in.
         num_devices: must be one.
 
     Raises:
@@ -81,7 +81,7 @@ class Learner(learner.Learner):
         self._minibatches = 1 << max(0, (self.steps_per_iteration // cfg.minibatch_size).bit_length() - 1)
         self.divisor = self._minibatches // math.gcd(self._minibatches, cfg.unroll_length)
         if not cfg.num_envs or cfg.num_envs % self.divisor:
-            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of {self.divisor}, as distill.minibatch_size asks for")
+            raise UserError(f"num_envs ({cfg.num_envs}) must be a multiple of {self.divisor}, because of distill.minibatch_size")
         self.network = Student(cfg.student, env.action_size, self.sizes[TRUTH][0])
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
         self._optimizer = optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam)
@@ -94,7 +94,7 @@ class Learner(learner.Learner):
         state = TrainState(
             normalizer, params, self._optimizer.init(params), env_state, key, jnp.zeros((), jnp.int32), jnp.ones(())
         )
-        return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)  # none weakly typed, as ``run`` gives none back
+        return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)  # strongly typed, like what ``run`` returns
 
     def slower(self, state: TrainState) -> TrainState:
         """Returns the state with a tenth of the learning rate, and other random draws."""
@@ -109,7 +109,7 @@ class Learner(learner.Learner):
         return {"student": config.to_dict(self.cfg.student)}
 
     def footprint(self) -> tuple[float, float]:
-        """See ``learner.Learner``. A rollout keeps pictures; an update what the convolutions gave, for the gradient."""
+        """See ``learner.Learner``. A rollout keeps pictures; an update keeps the convolutions' outputs for the gradient."""
         cfg, env = self.cfg, self.env.unwrapped
         state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
         own = device_memory.size(state.env_state)
@@ -119,20 +119,23 @@ class Learner(learner.Learner):
         return fixed, own / cfg.num_envs + 1.1 * cfg.unroll_length * (obs + 8 * env.action_size) + acting
 
     def _seen_bytes(self) -> float:
-        """Bytes of the convolutions' outputs for one step, in bfloat16."""
+        """Returns the bytes of the convolutions' outputs for one step, in bfloat16."""
         total = 0.0
         for height, width, _ in self.sizes[SEEN].values():
             total += sum(2 * count * height * width / 4 ** (i + 1) for i, count in enumerate(self.cfg.student.channels))
         return total
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
-        """``iterations`` of rollout and update; metrics are means over them. Jit with ``iterations`` static, donate ``state``."""
+        """Makes ``iterations`` rollouts and updates; metrics are means over them.
+
+        Jit with static ``iterations``, and donate ``state``.
+        """
         return repeated(self._iterate, state, iterations)
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, k_roll, k_update = jax.random.split(state.key, 3)
         env_state, batch, sums = self.rollout(state, k_roll)
-        # Before the update: the first one would otherwise learn in units that nobody has measured.
+        # Updated before the networks, because the first update would otherwise have no measured units.
         normalizer = running_statistics.update(state.normalizer, {name: batch.obs[name] for name in (SENSED, TRUTH)})
         state = dataclasses.replace(state, normalizer=normalizer)
         params, opt_state, metrics = self._update(state, batch, k_update)
@@ -173,7 +176,7 @@ class Learner(learner.Learner):
         return env_state, batch, {f"sum/{name}": jnp.sum(value) for name, value in totals.items()}
 
     def loss(self, params: Any, normalizer: Any, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
-        """Squared error of the actions, and ``truth_cost`` of that of the truth in units of its deviation."""
+        """Computes the squared error of the actions, plus ``truth_cost`` times that of the truth in units of its deviation."""
         action, where = apply(self.network, (normalizer, params), batch.obs)
         of_truth = running_statistics.NestedMeanStd(mean=normalizer.mean[TRUTH], std=normalizer.std[TRUTH])
         error = where - running_statistics.normalize(batch.obs[TRUTH], of_truth)
@@ -201,6 +204,6 @@ class Learner(learner.Learner):
         return params, opt_state, {name: jnp.mean(value) for name, value in metrics.items()}
 
 
-_PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores some 100 a second"
+_PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores about 100 per second"
 
 KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, held=HELD, graph=graph)

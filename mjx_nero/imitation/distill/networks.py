@@ -17,14 +17,14 @@ from mjx_nero.imitation.distill.cfg import StudentCfg
 from mjx_nero.learn.learner import Act, Observation
 from mjx_nero.types import Key
 
-SENSED, SEEN, TRUTH = "state", "pictures", "truth"  # observation groups: what it reads, and what else it predicts
-MOST = 10.0  # bound on normalised observations
+SENSED, SEEN, TRUTH = "state", "pictures", "truth"  # observation groups: two inputs, and a second target
+MOST = 10.0  # bound on normalized observations
 
 
 class Eye(linen.Module):
-    """Convolutions that make features [..., n] of a picture [..., height, width, channels]; whole numbers are colours to 255.
+    """Convolutions that turn a picture [..., height, width, channels] into features [..., n].
 
-    They compute in ``StudentCfg.precision``, their parameters are float32.
+    Integer pictures are colours from 0 to 255. Convolutions compute in ``StudentCfg.precision``; their parameters are float32.
     """
 
     cfg: StudentCfg
@@ -42,10 +42,10 @@ class Eye(linen.Module):
 
 
 class Student(linen.Module):
-    """(what is sensed [..., n], pictures by camera) -> action [..., na], and where the objects are.
+    """Computes (state [..., n], pictures by camera) -> action [..., na], and object positions.
 
     Attributes:
-        action_size, truth_size: how many numbers these are.
+        action_size, truth_size: sizes of the action and of the object positions.
     """
 
     cfg: StudentCfg
@@ -64,7 +64,7 @@ class Student(linen.Module):
 
 
 def init_params(net: Student, sizes: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
-    """Makes new (statistics of what is sensed and of the truth, network parameters)."""
+    """Makes new (statistics of state and truth, network parameters)."""
     shapes = {name: specs.Array(tuple(sizes[name]), jnp.dtype("float32")) for name in (SENSED, TRUTH)}
     normalizer = running_statistics.init_state(shapes).replace(std_eps=jnp.float32(1e-4))
     pictures = {name: jnp.zeros((1, *shape)) for name, shape in sizes[SEEN].items()}

@@ -1,4 +1,4 @@
-"""Teachers: policies that are told what the student has to see."""
+"""Teachers: policies that observe directly what the student must see."""
 
 import pathlib
 from collections.abc import Mapping
@@ -17,14 +17,14 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
     """Finds the teacher's policy.
 
     Args:
-        given: the policy's file; empty: the bundled policy with the same robot, observations and actions, that of the preset
-            ``sim2real`` where actions are late.
+        given: the policy's file; empty: the bundled policy with the same robot, observations and actions, of the preset
+            ``sim2real`` if actions are delayed.
 
     Raises:
         UserError: there is no such policy, or it does not fit.
     """
     if GROUP not in env.cfg.observations:
-        raise UserError(f"distillation needs the observation group {GROUP!r}, what the teacher is told: pass --preset rgb")
+        raise UserError(f"distillation needs the observation group {GROUP!r}, which the teacher reads: pass --preset rgb")
     if given:
         found = policy.load(pathlib.Path(given))
         if fault := _misfit(found.meta, env):
@@ -45,9 +45,9 @@ def _misfit(meta: Mapping[str, Any], env: ManipulationEnv) -> str:
     """Says why the policy cannot label; empty if it can."""
     robot, told = env.cfg.robot, list(env.cfg.observations[GROUP].terms)
     if meta.get("robot") != robot.name or meta.get("fingerprint") != fingerprint(robot):
-        return f"it is of another robot ({meta.get('robot')}; here {robot.name})"
+        return f"it is for another robot ({meta.get('robot')}; here {robot.name})"
     if meta["observations"]["state"] != told or meta["observation_size"]["state"] != list(env.observation_size[GROUP]):
         return f"it reads other observations (here {', '.join(told)})"
     if meta["action_size"] != env.action_size or not header.acts_alike(meta, {"actions": env.action_kinds}):
-        return "it acts in another way"
+        return "it has other actions"
     return ""

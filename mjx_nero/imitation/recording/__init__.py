@@ -1,1 +1,1 @@
-"""Records the episodes of whoever can do the task, with pictures, as data sets of demonstrations."""
+"""Records the episodes of an agent, with pictures, as data sets of demonstrations."""

@@ -1,4 +1,4 @@
-"""Callers in several threads, served together: a GPU does much at once in hardly more time than a little."""
+"""Serves callers in several threads together, because a GPU takes hardly longer for a large batch than for a small one."""
 
 import collections
 import dataclasses
@@ -19,15 +19,16 @@ class _Asked:
 
 
 class Batches:
-    """Calls a function of rows with the rows of all callers that wait.
+    """Calls a function of rows once for all waiting callers.
 
-    Whoever gets the lock works for all that wait, and lets go of it before the results have come to the host: the device does
-    the next batch meanwhile.
+    The caller that gets the lock works for all that wait. It releases the lock before the results are on the host, so that the
+    device can compute the next batch meanwhile.
 
     Args:
-        function: arrays [rows, ...] in any tree -> an array [rows, ...] of JAX. One call runs at a time, whatever functions there
-            are: a first call may capture a graph, which nothing else on the device may disturb.
-        sizes: rows that it may be called with, ascending; each is a program of its own. No caller has more rows than the last.
+        function: arrays [rows, ...] in any tree -> a JAX array [rows, ...]. Only one call of any such function runs at a time,
+            because a first call may capture a graph, which nothing else on the device may disturb.
+        sizes: numbers of rows that it may be called with, ascending; each is a separate program. No caller may have more rows
+            than the last.
     """
 
     _lock = threading.Lock()
@@ -37,7 +38,7 @@ class Batches:
         self._waiting: collections.deque[_Asked] = collections.deque()
 
     def __call__(self, given: Any) -> np.ndarray:
-        """The results of ``given``, arrays [rows, ...] in a tree. Any thread may call it."""
+        """Returns the results for ``given``, arrays [rows, ...] in a tree. Any thread may call it."""
         mine = _Asked(given, len(jax.tree.leaves(given)[0]))
         self._waiting.append(mine)
         with self._lock:
@@ -50,7 +51,7 @@ class Batches:
         return mine.done.result()
 
     def _take(self) -> list[_Asked]:
-        """The callers that one batch has room for. Each caller takes after it has asked, so none is left."""
+        """Takes as many waiting callers as fit in one batch. Every caller takes after it has queued, so none is left over."""
         served, rows = list[_Asked](), 0
         while self._waiting and rows + self._waiting[0].rows <= self._sizes[-1]:
             served.append(self._waiting.popleft())

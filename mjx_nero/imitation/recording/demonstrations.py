@@ -1,8 +1,7 @@
-"""Demonstrations: episodes that an agent plays side by side, in the form of a data set.
+"""Demonstrations: episodes that an agent plays side by side, as episodes of a data set.
 
-An episode depends only on its number and the seed, so each can be played again. Noise on the agent's actions takes it where it
-would not go by itself. The executed action is kept beside its label, the action that the agent would have taken (Laskey et al.
-2017, DART).
+An episode depends only on its number and the seed, so each can be replayed. Noise on the agent's actions takes it to states that
+it would not reach by itself. The executed action is kept beside its label, the action without noise (Laskey et al. 2017, DART).
 """
 
 import dataclasses
@@ -30,8 +29,8 @@ from mjx_nero.learn.play.rollout import Agent
 from mjx_nero.sim import kinematics
 from mjx_nero.types import DelayMemory, Key, View
 
-SMOOTH_S = 0.2  # [s] time constant of the noise; drives would not follow noise that changes at every step
-SEGMENT = 10  # control steps between two looks at which episodes have ended, where they may end early
+SMOOTH_S = 0.2  # [s] time constant of the noise, because drives do not follow noise that changes at every step
+SEGMENT = 10  # control steps between two checks of which episodes have ended, if they may end early
 _NOISE = 0xDA27  # folded into an episode's key
 
 
@@ -43,14 +42,14 @@ class Player:
         agent: the agent that plays.
         units: units of states and actions in the data set.
         kept: features that episodes keep.
-        deltas: actions are steps of the hand, instead of the joints' targets.
+        deltas: actions are steps of the hand instead of joint targets.
         noise: standard deviation of the noise on the arm's actions, in the agent's units.
         cameras: cameras whose pictures episodes keep.
-        early: an episode ends as soon as success has held for as long as the task asks, and the next one begins in its place.
-        velocities: the state has the joints' velocities, too.
+        early: an episode ends as soon as success has held for as long as the task requires, and the next one takes its place.
+        velocities: the state also has the joints' velocities.
 
     Raises:
-        UserError: so many episodes of such a length do not fit into memory.
+        UserError: so many episodes of this length do not fit into memory.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class Player:
         one = jax.eval_shape(
             self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
         )
-        # Steps come from the device, are put in order of episodes, and are written, each time in a copy.
+        # Three copies of the steps exist: from the device, ordered by episodes, and being written.
         device_memory.check_batch(env, size, "--side-by-side", 3.0 * size * env.episode_length * device_memory.size(one))
 
     def close(self) -> None:
@@ -87,7 +86,8 @@ class Player:
     def __call__(self, first: int, seed: int) -> Iterator[Episode]:
         """Plays episodes in the order of their numbers, from ``first`` on, without end.
 
-        Each number has its slot, wherever one begins: a compiled program rounds not all rows of a batch alike.
+        A number always uses the same slot, wherever playing begins, because a compiled program rounds each row of a batch
+        differently.
         """
         key, numbers = jax.random.PRNGKey(seed), first + (np.arange(self.size) - first) % self.size
         empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(self._begin_all, jnp.asarray(numbers), key))
@@ -120,7 +120,7 @@ class Player:
         return dataclasses.replace(made, pictures=films)
 
     def _begin_all(self, numbers: Array, key: Key) -> tuple:
-        """Starts an episode in every slot: its state, the agent's memory, the noise, the steps played, and whether it goes on."""
+        """Starts an episode in every slot: state, the agent's memory, noise, number of steps, and whether it continues."""
         state = jax.vmap(self.env.reset)(_keys(numbers, key))
         n = self.size
         return state, self.agent.init(state), jnp.zeros((n, self._arm)), jnp.zeros(n, jnp.int32), jnp.ones(n)
@@ -132,8 +132,12 @@ class Player:
         return jax.tree.map(fresh, self._begin_all(numbers, key), slots)
 
     def _play_all(self, slots: tuple, numbers: Array, key: Key) -> tuple[tuple, Any]:
-        """Plays a segment. Returns the slots, and of each step [steps, n, ...] what is kept (features and what pictures need),
-        whether its episode went on before it, and whether it is a success."""
+        """Plays a segment.
+
+        Returns:
+            the slots, and for each step [steps, n, ...]: features and everything that pictures need, whether its episode was
+            still going on, and whether the step made it a success.
+        """
         env, apart = self.env, jax.vmap(jax.random.fold_in, (0, None))(_keys(numbers, key), _NOISE)
 
         def step(slots: tuple, _: None) -> tuple:
@@ -152,7 +156,7 @@ class Player:
         return jax.lax.scan(step, slots, length=self._steps)
 
     def _ended(self, state: State) -> State:
-        """The state as one that ends a success, where that has held."""
+        """Ends an episode with success if that has held long enough."""
         held = state.info["carry"].memory["success.hold"] >= max(1, round(self.env.cfg.success.hold_s / self.env.dt))
         success = jnp.where(held, 1.0, state.metrics["success"])
         return state.replace(done=jnp.where(held, 1.0, state.done), metrics={**state.metrics, "success": success})
@@ -161,7 +165,7 @@ class Player:
         """Filters white noise by a first-order filter that keeps its standard deviation at every step.
 
         Args:
-            at: steps of each episode so far.
+            at: number of steps in each episode so far.
         """
         if not self.noise:
             return off
@@ -175,7 +179,7 @@ class Player:
         view = env.view(state)
         label, told = env.targets(_prompt(state, clean), clean), after.pipeline_state.ctrl
         seen = state.obs["state"]
-        parts = jax.tree.leaves(seen)  # of a group that stays apart, its terms by name
+        parts = jax.tree.leaves(seen)  # the terms by name, if the group stays apart
         label, told = (self._deltas(view, x) if self._hand else self.units.shown(x) for x in (label, told))
         flags = after.done > 0, after.metrics["success"] > 0
         found = {
@@ -193,7 +197,7 @@ class Player:
         return {name: found[name] for name in self.kept if name in found}
 
     def _deltas(self, view: View, targets: Float[Array, " nu"]) -> Float[Array, " n"]:
-        """Motion of the hand from where it is to where the targets put it (m, rotation vector, world), and the gripper's
+        """Returns the motion of the hand from its pose to the targets' pose (m, rotation vector, world), and the gripper's
         targets."""
         assert self._hand
         (pos,), (quat,) = self._hand.poses(targets)
@@ -202,35 +206,35 @@ class Player:
 
 
 def _cut(kept: tuple, slot: int, steps: int) -> tuple:
-    """The steps of a slot out of what is kept of a segment, leaves [n, steps, ...]."""
+    """Selects the steps of one slot from a segment, leaves [n, steps, ...]."""
     features, *drawn = kept
     return {name: x[slot, :steps] for name, x in features.items()}, *jax.tree.map(lambda x: x[slot, :steps], drawn)
 
 
 def joint_state(view: View, units: Units, velocities: bool) -> Float[Array, " n"]:
-    """Positions of the joints in a data set's units, and, if asked for, their velocities in units a second."""
+    """Returns joint positions in a data set's units and, if requested, velocities in these units per second."""
     shown = units.shown(view.joint_pos)
     return jnp.concatenate([shown, view.joint_vel * units.factor]) if velocities else shown
 
 
 def told(env: ManipulationEnv, seen: bool) -> tuple[str, ...]:
-    """Lists what ``environment_state`` has the poses of.
+    """Lists the things whose poses are in ``environment_state``.
 
     Args:
-        seen: pictures show the rest.
+        seen: pictures show everything but the goal.
     """
     return ("goal",) if seen else ("hand", *env.cfg.scene.objects, "goal")
 
 
 def environment_state(env: ManipulationEnv, view: View, seen: bool) -> Float[Array, " n"]:
-    """Poses of the hand, each object and the goal in the world (m, wxyz); the goal's alone, where pictures show the rest."""
+    """Returns the poses of hand, objects and goal in the world (m, wxyz); only the goal's if pictures show the rest."""
     poses = {name: (each.pos_w, each.quat_w) for name, each in view.objects.items()}
     poses |= {"hand": (view.ee_pos_w, view.ee_quat_w), "goal": (view.goal_pos_w, view.goal_quat_w)}
     return jnp.concatenate([x for name in told(env, seen) for x in poses[name]])
 
 
 def _prompt(state: State, action: Float[Array, " na"]) -> State:
-    """The state with ``action`` already in all delays of actions: a label is what the agent asks for now, and comes at once."""
+    """Fills all action delays of a state with ``action``, because a label is the present action without delay."""
     carry = state.info["carry"]
     memory = {
         name: dataclasses.replace(held, past=jnp.broadcast_to(action, held.past.shape))

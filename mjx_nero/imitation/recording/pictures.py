@@ -1,7 +1,7 @@
-"""Pictures of played episodes, drawn afterwards from the physics' positions.
+"""Draws the pictures of played episodes afterwards, from the recorded positions.
 
-MuJoCo's own renderer draws one after another, on several cores. On a GPU the ray tracer draws thousands at a time, by the
-scene's own cameras.
+MuJoCo's own renderer draws one picture after another, on several cores. On a GPU the ray tracer draws thousands at a time, for
+the scene's own cameras.
 """
 
 import concurrent.futures
@@ -24,28 +24,28 @@ from mjx_nero.sim.cameras.cfg import MARK
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
-SIZE = 128, 128  # [pixels] of a camera for people
+SIZE = 128, 128  # default picture size of a model's other cameras [pixels]
 SHADOWS = 0  # no shadow map, which takes three quarters of the time on a CPU
-TOGETHER = 256  # steps of an episode that are drawn in one go, at most
-MOST = 8  # contexts of OpenGL
-EPISODES, PIXELS = 8, 1 << 26  # so many of which a GPU draws in one go, at most
-_UNSEEN = 5  # a group of geoms that is not drawn
+TOGETHER = 256  # maximum number of an episode's steps that are drawn at once
+MOST = 8  # maximum number of OpenGL contexts
+EPISODES, PIXELS = 8, 1 << 26  # maximum numbers that a GPU draws at once
+_UNSEEN = 5  # a geom group that is not drawn
 
 
 class Cameras:
-    """Cameras of an environment: those of its scene, which do not see the goal's marker, and those for people, which do.
+    """Cameras of an environment: those of its scene, which do not see the goal's marker, and the model's others, which do.
 
     Args:
-        names: of the cameras; ``front+wrist`` is one picture of both, side by side.
-        size: width and height [pixels], even, as encoders want them; None: a camera's own.
-        renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp where JAX has a GPU.
+        names: names of cameras; ``front+wrist`` is one picture of both, side by side.
+        size: width and height [pixels], even because encoders need it; None: each camera's own.
+        renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp if JAX has a GPU.
 
     Attributes:
         sizes: width and height of each camera's pictures, by name.
-        renderer: which one draws the scene's own cameras.
+        renderer: renderer of the scene's own cameras.
 
     Raises:
-        UserError: there is no such camera, or the machine cannot draw.
+        UserError: a camera does not exist, or the machine cannot draw.
     """
 
     def __init__(self, env: ManipulationEnv, names: Sequence[str], size: tuple[int, int] | None = None, renderer: str = "auto"):
@@ -54,7 +54,7 @@ class Cameras:
         there = list(dict.fromkeys((*own, *people)))
         single = list(dict.fromkeys(part for name in names for part in name.split("+")))
         if unknown := [name for name in single if name not in there]:
-            raise UserError(f"{', '.join(unknown)}: no camera of this environment: choose from {', '.join(there)}")
+            raise UserError(f"this environment has no camera {', '.join(unknown)}: choose from {', '.join(there)}")
         self.names = tuple(names)
         sizes = {name: size or (own[name].size if name in own else SIZE) for name in single}
         self.sizes = {name: _beside(name, [sizes[part] for part in name.split("+")]) for name in names}
@@ -71,7 +71,7 @@ class Cameras:
             drawer.close()
 
     def frames(self, name: str, qpos: np.ndarray, scenery: Scenery) -> Iterator[np.ndarray]:
-        """Draws a camera's frames of an episode, uint8 [height, width, 3], one after another. Any thread may call it.
+        """Yields a camera's frames of an episode, uint8 [height, width, 3]. Any thread may call it.
 
         Args:
             qpos: [steps, nq].
@@ -84,26 +84,26 @@ class Cameras:
 
 
 def _beside(name: str, sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """Width and height of pictures side by side.
+    """Returns width and height of pictures side by side.
 
     Raises:
-        UserError: they differ in height.
+        UserError: their heights differ.
     """
     widths, heights = zip(*sizes, strict=True)
     if len(set(heights)) > 1:
-        raise UserError(f"{name}: pictures side by side need one height, and these have {heights}: pass --picture")
+        raise UserError(f"{name}: pictures side by side need the same height, but these have {heights}: pass --picture")
     return sum(widths), heights[0]
 
 
 class _Drawer(Protocol):
-    """Draws a camera's frames of several steps, uint8 [height, width, 3] each."""
+    """Draws a camera's frames for several steps, uint8 [height, width, 3] each."""
 
     def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]: ...
     def close(self) -> None: ...
 
 
 class _Drawn:
-    """MuJoCo's renderer, in one thread, to which OpenGL's context belongs."""
+    """MuJoCo's renderer in one thread, which owns the OpenGL context."""
 
     def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
         model, camera = env.mj_model, name
@@ -125,7 +125,7 @@ class _Drawn:
 
 
 class _Several:
-    """Drawers for callers at the same time: each is made when all others are busy, and there are no more of them than cores."""
+    """Several drawers for simultaneous callers. A new one is made when all others are busy, up to the number of cores."""
 
     def __init__(self, make: Callable[[], _Drawer]):
         self._make, self._made, self._lock = make, [make()], threading.Lock()
@@ -152,7 +152,7 @@ class _Several:
 
 
 class _Traced:
-    """MuJoCo Warp's ray tracer; each step is a world of one batch, and episodes that wait are drawn together."""
+    """MuJoCo Warp's ray tracer. Each step is a world of one batch, and waiting episodes are drawn together."""
 
     def __init__(self, env: ManipulationEnv, name: str, size: tuple[int, int]):
         camera = dataclasses.replace(env.cfg.scene.cameras[name], size=size, kinds=("rgb",))
@@ -165,4 +165,4 @@ class _Traced:
         return self._draw((qpos, scenery))
 
     def close(self) -> None:
-        """Does nothing: the buffers are the ray tracer's."""
+        """Does nothing: the ray tracer owns the buffers."""

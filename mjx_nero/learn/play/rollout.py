@@ -56,7 +56,7 @@ def controller_agent(env: ManipulationEnv, controller: Controller) -> Agent:
 
 
 def through_actions(env: ManipulationEnv, agent: Agent) -> Agent:
-    """Lets an agent of drive targets act in any environment, by the actions that give these targets or come nearest."""
+    """Lets an agent of drive targets act in any environment, by the actions whose targets are the same or nearest."""
 
     def act(params, memory, state, key):
         targets, memory = agent.act(params, memory, state, key)
@@ -108,7 +108,7 @@ class Episodes:
         return self.record[: int(self.lengths[index]), index]
 
     def summary(self) -> dict:
-        """Computes the figures for people and for JSON: distances in m, times in s.
+        """Computes the figures to show and to write as JSON: distances in m, times in s.
 
         An episode that became non-finite counts as a failure and is excluded from means; None if no episode remains.
         """

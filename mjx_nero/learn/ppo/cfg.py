@@ -1,4 +1,4 @@
-"""Hyperparameters of PPO and of its networks: plain data, readable without Brax, whose import takes seconds."""
+"""Hyperparameters of PPO and of its networks: plain data, readable without importing Brax, which takes seconds."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class NetworkCfg:
         distribution: ``normal`` learns one log-std per action entry; ``tanh_normal`` squashes actions to +-1.
         init_std: initial standard deviation of a normal distribution.
         output_scale: scale of the initial weights in the actor's last layer; small, so that the policy starts near home.
-        max_observation: bound on normalised observations; 0: none. Past actions are observed, and would otherwise feed back.
+        max_observation: bound on normalized observations; 0: none. Without it, observed past actions could feed back.
         encoders: pairs of observation term and encoder, for groups whose terms stay apart. Other terms use ``flat``.
         encoder_layers: layer widths of the encoder ``mlp``.
     """
@@ -91,23 +91,23 @@ class PpoCfg:
     minibatch_size: Annotated[int, Bounds(0)] = 0  # env steps on all devices together; 0: 6,144 per device at the start
     learning_rate: Rate = 3e-4  # initial learning rate
     desired_kl: NonNegative = 0.02  # target KL that adapts the learning rate; 0: fixed rate
-    min_learning_rate: Rate = 1e-5  # least adapted learning rate
-    max_learning_rate: Rate = 1e-3  # greatest one; with thousands of environments the rate climbs to this bound
+    min_learning_rate: Rate = 1e-5  # minimum adapted learning rate
+    max_learning_rate: Rate = 1e-3  # maximum adapted learning rate; with thousands of environments the rate climbs to it
     discounting: Share = 0.98  # discount of rewards per control step
-    gae_lambda: Share = 0.95  # generalised advantage estimation: 1 trusts returns, 0 trusts the critic
+    gae_lambda: Share = 0.95  # generalized advantage estimation: 1 trusts returns, 0 trusts the critic
     clipping: Positive = 0.2  # bound on the relative change of an action's probability
     normalize_returns: bool = True  # the critic learns returns in units of their running standard deviation
     clip_value: NonNegative = 0.0  # bound on the change of a value estimate; 0: none
     entropy_cost: NonNegative = 0.01  # weight of the entropy bonus, which keeps the policy exploring
-    change_cost: NonNegative = 0.0  # weight of the squared change of mean actions from step to step, which keeps the policy calm
+    change_cost: NonNegative = 0.0  # weight of the squared change of mean actions between steps, which keeps the policy calm
     imitation: NonNegative = 0.0  # weight of the distance from the expert's actions, until half of the episodes succeed
     critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which an imitating policy waits for its critic
-    min_std: NonNegative = 0.2  # least standard deviation of actions, so exploration lasts until the goal is found; 0: none
-    max_std: NonNegative = 1.0  # greatest standard deviation, since noise costs nothing where targets saturate; 0: none
+    min_std: NonNegative = 0.2  # minimum standard deviation of actions, so that exploration lasts; 0: none
+    max_std: NonNegative = 1.0  # maximum standard deviation, since noise costs nothing where targets saturate; 0: none
     value_loss: NonNegative = 1.0  # weight of the critic's loss
-    max_grad_norm: Positive = 1.0  # greatest norm of the gradient
+    max_grad_norm: Positive = 1.0  # maximum norm of the gradient
     reward_scaling: Positive = 1.0  # factor of rewards
-    matmul_precision: str = "tensorfloat32"  # matmul precision of the networks on a GPU; the environment's is always full
+    matmul_precision: str = "tensorfloat32"  # precision of networks' matrix products on a GPU; always full in environments
     network: NetworkCfg = NetworkCfg()
 
     def __post_init__(self):

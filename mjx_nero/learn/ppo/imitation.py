@@ -1,7 +1,7 @@
-"""Imitation: PPO with what an expert has shown. The policy begins as a clone of it, and keeps near it until it succeeds.
+"""PPO with an expert's demonstrations. The policy begins as a clone of the expert, and stays near it until it succeeds.
 
-As DAPG (Rajeswaran et al. 2018), but that the weight of what is shown falls with the policy's own success, not with time, and
-that actions are compared, not their probabilities, as deviations have bounds of their own.
+This follows DAPG (Rajeswaran et al. 2018) with two differences. The weight of the demonstrations falls with the policy's own
+success, not with time. The loss compares actions, not their probabilities, because the deviations have their own bounds.
 """
 
 from typing import Any
@@ -19,30 +19,30 @@ from mjx_nero.learn.learner import ROWS
 from mjx_nero.learn.ppo.networks import ACTOR
 from mjx_nero.types import Key, Shown
 
-STEPS, BATCH, RATE = 2000, 1024, 1e-3  # of cloning
-LONG = 200  # times that the observations' statistics count what is shown: what arms see in their first second is no measure
-STILL = 0.2  # deviation of a cloned policy's actions: with 0.5 it grasps nothing, and unlearns within 4 M env steps what it knew
-BESIDE = 512  # rows beside every minibatch
+STEPS, BATCH, RATE = 2000, 1024, 1e-3  # updates, minibatch size and learning rate of cloning
+LONG = 200  # weight of demonstrations in the observations' statistics, because the first second of training is not typical
+STILL = 0.2  # deviation of a cloned policy's actions: with 0.5 it grasps nothing, and unlearns its skill within 4 M env steps
+BESIDE = 512  # demonstrated steps beside every minibatch
 _SLOW = 0.1  # share of an iteration's success rate in the running one
 
 
 @struct.dataclass
 class School:
-    """Steps that are shown, and how much they count."""
+    """The demonstrated steps, and their weight."""
 
     shown: Shown
     weight: Float[Array, ""]  # from 1 to 0
     success: Float[Array, ""]  # running rate of training's episodes
 
     def after(self, successes: Float[Array, ""], episodes: Float[Array, ""]) -> "School":
-        """Returns the school after an iteration. It counts less the more succeed, nothing once half do, and never more again."""
+        """Returns the school after an iteration. Its weight falls as more episodes succeed, to 0 at half, and never rises."""
         slow = jnp.where(episodes > 0, _SLOW, 0.0)
         rate = self.success + slow * (successes / jnp.maximum(episodes, 1.0) - self.success)
         return School(self.shown, jnp.minimum(self.weight, jnp.maximum(0.0, 1.0 - 2.0 * rate)), rate)
 
 
 def school(env: ManipulationEnv, shown: Shown | None) -> School:
-    """Makes the school of a new run. It counts nothing if nothing is shown."""
+    """Makes the school of a new run, with weight 0 if there are no demonstrations."""
     zero = jnp.zeros(())
     if shown is not None:
         return School(Shown({ACTOR: shown.obs[ACTOR]}, shown.action), zero + 1.0, zero)
@@ -51,7 +51,7 @@ def school(env: ManipulationEnv, shown: Shown | None) -> School:
 
 
 def seen(normalizer: Any, shown: Shown) -> Any:
-    """Returns statistics of the observations that are shown."""
+    """Updates the observations' statistics with the demonstrated observations."""
     normalizer = running_statistics.update(normalizer, {name: shown.obs[name] for name in normalizer.mean})
     longer = normalizer.count.replace(lo=normalizer.count.lo * jnp.uint32(LONG))
     return normalizer.replace(count=longer, summed_variance=jax.tree.map(lambda x: x * LONG, normalizer.summed_variance))
@@ -79,8 +79,8 @@ def cloned(
 def held_back(grads: losses.PPONetworkParams, waits: Bool[Array, ""], school: School) -> losses.PPONetworkParams:
     """Returns the gradient of PPO's loss without the policy's part while the policy waits for its critic.
 
-    A new critic knows nothing, so its advantages are noise, and a clone that follows them unlearns what it knows. Only a clone
-    waits: once the school counts nothing, there is no reason to.
+    A new critic is untrained, so its advantages are noise, and a clone that follows them unlearns its skill. Only a clone waits:
+    once the school's weight is 0, there is no reason to.
     """
     moves = 1.0 - waits * (school.weight > 0)
     return grads.replace(policy=jax.tree.map(lambda x: x * moves, grads.policy))
@@ -89,7 +89,7 @@ def held_back(grads: losses.PPONetworkParams, waits: Bool[Array, ""], school: Sc
 def gradient(
     nets: networks.PPONetworks, normalizer: Any, params: losses.PPONetworkParams, school: School, key: Key
 ) -> losses.PPONetworkParams:
-    """Computes the gradient of the policy's squared distance from some of the steps shown, as far as they count."""
+    """Computes the gradient of the policy's squared distance from some demonstrated actions, times the school's weight."""
     some = _some(school.shown, BESIDE, key)
     return jax.grad(lambda p: school.weight * _distance(nets, normalizer, p.policy, some))(params)
 

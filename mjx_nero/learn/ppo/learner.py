@@ -1,4 +1,4 @@
-"""PPO in a loop of our own, built from Brax's networks, advantages, running statistics and adaptive learning rate.
+"""PPO in our own loop, built from Brax's networks, advantages, running statistics and adaptive learning rate.
 
 Brax's ``ppo.train`` hides its optimiser, environments and random keys, so a run cannot resume exactly. It reports training
 episodes only through a host callback at every step, and release 0.14.2 calls a function that JAX 0.10 removed. This loop hands
@@ -10,8 +10,8 @@ again in each minibatch, because that loop over time is slow on a GPU. At the fi
 
 The learner is in one file, longer than others, so that it reads from top to bottom.
 
-Nothing depends on a task's scale, or can run away: the critic learns returns in units of their running deviation, advantages are
-normalised, and the policy's deviations and the normalised observations are bounded.
+Nothing depends on a task's scale or can grow without bound: the critic learns returns in units of their running deviation,
+advantages are normalized, and the policy's deviations and the normalized observations are bounded.
 
 Each of several devices gets an equal share of the environments and of every minibatch, and a copy of everything else. Sums and
 means run over all devices, so their number changes only which environments share a minibatch, and the noise of the actions. A run
@@ -69,7 +69,7 @@ class TrainState:
     key: Key
     iteration: Int[Array, ""]
     returns: running_statistics.RunningStatisticsState  # statistics of all returns so far: the critic's unit
-    school: imitation.School | None = None  # what an expert has shown; None: nothing is imitated
+    school: imitation.School | None = None  # an expert's demonstrations; None: nothing is imitated
 
 
 _HERE: Any = PartitionSpec()
@@ -351,7 +351,7 @@ class Learner(learner.Learner):
 
 
 def _minibatches(cfg: PpoCfg) -> int:
-    """Number of minibatches per epoch that follows from ``minibatch_size``."""
+    """Returns the number of minibatches per epoch for ``minibatch_size``."""
     wanted = cfg.num_envs * cfg.unroll_length // cfg.minibatch_size
     return max(8, 1 << wanted.bit_length() - 1 if wanted else 0)
 

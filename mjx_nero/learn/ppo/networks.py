@@ -23,7 +23,10 @@ from mjx_nero.types import Key
 Sizes = Mapping[str, Any]  # shape of each group; a dict of shapes for a group whose terms stay apart
 Normalize = Callable[[Any, Any], Any]  # (observations, statistics; None: already normalised) -> normalised observations
 
-ACTOR, CRITIC = "state", "privileged_state"  # the groups that they read; without the second, the critic reads the first
+ACTOR, CRITIC = (
+    "state",
+    "privileged_state",
+)  # observation groups of actor and critic; without the second, the critic reads the first
 
 
 def _is_shape(node: Any) -> bool:
@@ -48,8 +51,8 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
     known = list(dict.fromkeys(term for group in apart.values() for term in group))
     if unknown := [term for term, _ in cfg.encoders if term not in known]:
         raise UserError(
-            f"network.encoders names {', '.join(unknown)}, and terms that stay apart are: {', '.join(known) or 'none'}; "
-            "an encoder can only read a term of a group that is not concatenated"
+            f"network.encoders names {', '.join(unknown)}: an encoder can only read a term of a group that is not concatenated, "
+            f"and these are {', '.join(known) or 'none'}"
         )
     bounded = functools.partial(running_statistics.normalize, max_abs_value=cfg.max_observation or None)
 
@@ -81,7 +84,7 @@ def _encoders(size: Mapping[str, Any], cfg: NetworkCfg) -> dict[str, encoders.En
 
 
 def _width(group: Mapping[str, encoders.Encoder], size: Mapping[str, Any]) -> int:
-    """Number of features of a group's terms."""
+    """Returns the number of features of a group's terms."""
 
     def features():
         terms = {name: jnp.zeros((1, *size[name])) for name in group}

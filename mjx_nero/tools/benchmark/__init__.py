@@ -1,7 +1,7 @@
-"""Speed of this machine: python -m mjx_nero benchmark --env nero_lift --num-envs 1024,4096 --impl native,jax
+"""Measures the speed of this machine: python -m mjx_nero benchmark --env nero_lift --num-envs 1024,4096 --impl native,jax
 
-``throughput`` has steps, resets, training and controllers of many environments; ``learning`` the time to success of several
-seeds; ``inverse_kinematics`` poses; ``drawing`` frames. ``command`` takes the flags, keeps the rows and shows them.
+``throughput`` measures steps, resets, training and controllers of many environments; ``learning`` the time to success of
+several seeds; ``inverse_kinematics`` poses; ``drawing`` frames. ``command`` reads the flags, keeps the rows and shows them.
 """
 
-SIZES = (1024, 4096, 16384)  # numbers of environments, if none are given
+SIZES = (1024, 4096, 16384)  # numbers of environments, unless --num-envs is given

@@ -1,4 +1,4 @@
-"""The command line of the benchmark: what to measure, and what becomes of the rows."""
+"""The command line of ``benchmark``: what to measure, and where the rows go."""
 
 import argparse
 import pathlib
@@ -28,7 +28,7 @@ WHATS = {
     "reset": "batched resets",
     "render": "frames of the offscreen renderer",
     "learning": "seeds trained until they succeed",
-    "start": "what comes before the first training step, in a process of its own",
+    "start": "everything before the first training step, in a separate process",
     "ik": "inverse kinematics",
 }
 _ENDS = ("_min", "_max")
@@ -86,7 +86,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _kept(path: pathlib.Path | None, report: Row) -> list[Row]:
-    """The seeds that the same command measured here before it was interrupted."""
+    """Returns the seeds that the same command measured on this machine before it was interrupted."""
     if path is None or not path.exists():
         return []
     try:
@@ -99,57 +99,57 @@ def _kept(path: pathlib.Path | None, report: Row) -> list[Row]:
 
 
 def command(argv: Sequence[str]) -> str:
-    """Command line of this benchmark, without the folders of files."""
+    """Returns this benchmark's command line, with the folders of files removed."""
     return shlex.join(["python", "-m", "mjx_nero", "benchmark", *map(_without_folders, argv)])
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(
         "benchmark",
-        "Measures what this machine does in a second, and how long it takes to learn.",
+        "Measures the speed of this machine and how long training takes to succeed.",
         ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_environment()
     parser.add_argument(
         "--num-envs",
         type=_sizes,
-        help=f"list of numbers (default: {','.join(map(str, SIZES))}; learning: the number that train.py would take)",
+        help=f"list of numbers of environments (default: {','.join(map(str, SIZES))}; for learning: train.py's default)",
     )
     parser.add_argument("--learner", help="learner for ppo and learning (default: the task's own)")
     parser.add_argument(
         "--num-devices", type=cli.positive, default=1, help="number of GPUs for ppo and learning (default: %(default)s)"
     )
-    parser.add_argument("--impl", default="auto", help=f"list of {', '.join(impls())} (default: %(default)s)")
-    parser.add_argument("--what", default="step", help="list, see below (default: %(default)s)")
+    parser.add_argument("--impl", default="auto", help=f"list of physics: {', '.join(impls())} (default: %(default)s)")
+    parser.add_argument("--what", default="step", help="list of what to measure, see below (default: %(default)s)")
     parser.add_argument("--steps", type=cli.positive, default=100, help="control steps per measurement (default: %(default)s)")
     parser.add_argument(
-        "--repeats", type=cli.positive, default=5, help="number of measurements; the median counts (default: %(default)s)"
+        "--repeats", type=cli.positive, default=5, help="number of measurements; the median is reported (default: %(default)s)"
     )
     parser.add_argument(
-        "--batch", type=_sizes, default="1,100,1000,2000,10000", help="numbers of poses for ik (default: %(default)s)"
+        "--batch", type=_sizes, default="1,100,1000,2000,10000", help="list of ik batch sizes, in poses (default: %(default)s)"
     )
     parser.add_argument("--seeds", type=cli.positive, default=8, help="number of seeds for learning (default: %(default)s)")
     parser.add_argument("--target", type=cli.share, default=0.95, help="success rate that ends learning (default: %(default)s)")
-    parser.add_argument("--num-timesteps", type=cli.positive, help="greatest number of env steps per seed (default: train.py's)")
+    parser.add_argument("--num-timesteps", type=cli.positive, help="maximum env steps per seed (default: train.py's)")
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
     parser.add_argument(
         "--json",
         type=cli.path(".json"),
-        help="write the rows, the machine and all versions as JSON; the same command goes on with the seeds that are missing",
+        help="write the rows, the machine and all versions as JSON; repeating the command measures only the missing seeds",
     )
     parser.add_argument("--plot", type=cli.path(".png"), help="picture (PNG) of rates and memory over the number of environments")
     return parser
 
 
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """Configs whose fields ``--help`` lists."""
+    """Returns the configs whose fields ``--help`` lists."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
     name = args.learner or cfg.learner
     return {"env": cfg, name: run_cfg.learner_cfg(cfg, args.preset, name)}
 
 
 def begin() -> None:
-    """The process of ``--what start``; the first argument is when it was started, the others are the benchmark's."""
+    """Runs the process of ``--what start``. Its first argument is the time at which it was started; the benchmark's follow."""
     from mjx_nero.sim.physics import resolve_impl
     from mjx_nero.tools.benchmark import jobs, start
 
@@ -164,7 +164,7 @@ def begin() -> None:
 
 def _check_files(rows: pathlib.Path | None, picture: pathlib.Path | None, whats: list[str]) -> None:
     if picture and not set(whats) & set(plot.PLOTTED):
-        raise UserError(f"--plot draws {', '.join(plot.PLOTTED)}: name one of them in --what")
+        raise UserError(f"--plot draws only {', '.join(plot.PLOTTED)}: name one of them in --what")
     for path in filter(None, (rows, picture)):
         files.check_writable(path)
 
@@ -178,12 +178,12 @@ def _without_folders(word: str) -> str:
 
 
 def _line(row: Row) -> str:
-    """A row as it comes, in one line."""
+    """Formats a row as one line."""
     return "  ".join(f"{name} {_cell(row, name)}" for name in row if row[name] is not None and not name.endswith(_ENDS))
 
 
 def _cell(row: Row, name: str) -> str:
-    """A value as text, with its range where the row has one; of a row about several seeds, median and worst."""
+    """Formats a value, with its range if the row has one; for a row about several seeds, median and worst."""
     if f"{name}_median" in row:
         return ", ".join(f"{which} {_text(row[f'{name}_{which}'])}" for which in ("median", "worst"))
     if name == "reached" and "seeds" in row:
@@ -207,7 +207,7 @@ def _save(path: pathlib.Path | None, report: dict[str, Any]) -> None:
 
 
 def _show(title: str, rows: list[Row]) -> None:
-    """A table a kind of row, with the columns that any of its rows fills."""
+    """Prints one table per kind of row, with the columns that at least one row fills."""
     for whats, columns in _TABLES.items():
         part = [row for row in rows if row["what"] in whats]
         if not part:

@@ -1,4 +1,4 @@
-"""Frames a second of MuJoCo's offscreen renderer."""
+"""Measures frames per second of MuJoCo's offscreen renderer."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from mjx_nero.tools.benchmark.program import Row, spread
 
 
 def measure_render(env: ManipulationEnv, count: int, repeats: int, width: int = 640, height: int = 480) -> Row:
-    """Draws the starts of ``count`` episodes, one after another, ``repeats`` times; without OpenGL the row says so."""
+    """Draws the first states of ``count`` episodes one by one, ``repeats`` times. Without OpenGL the row says so."""
     row = {"what": "render", "gl": os.environ.get("MUJOCO_GL", "default"), "width": width, "height": height, "frames": count}
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
     qpos, scenery = jax.device_get((states.pipeline_state.qpos, jax.vmap(env.scenery)(states)))

@@ -1,4 +1,4 @@
-"""Inverse kinematics: poses a second, beside the package mink where it is installed."""
+"""Measures inverse kinematics in poses per second, and compares with the package mink if it is installed."""
 
 import statistics
 import time
@@ -17,10 +17,10 @@ _MINK_POSES, _MINK_ITERATIONS = 100, 100
 
 
 def measure_ik(robot: RobotCfg, sizes: Sequence[int], repeats: int) -> list[Row]:
-    """Inverse kinematics from the home position to poses of random configurations within the joint limits.
+    """Measures inverse kinematics from the home position to poses of random configurations within the joint limits.
 
-    Each measurement has a batch of its own, and there are at least a hundred poses of each size. A row of mink's follows, for
-    the first hundred of the same poses.
+    Each measurement has its own batch, and each batch size solves at least a hundred poses. The last row is mink's, for the
+    first hundred of the same poses.
     """
     solver = ik.InverseKinematics(robot)
     counts = {n: max(repeats, -(-_MINK_POSES // n)) for n in sizes}
@@ -50,7 +50,7 @@ def measure_ik(robot: RobotCfg, sizes: Sequence[int], repeats: int) -> list[Row]
 
 
 def measure_mink(robot: RobotCfg, pos: np.ndarray, quat: np.ndarray) -> list[Row]:
-    """One row: differential inverse kinematics with mink, pose after pose, from the home position to our solver's tolerances."""
+    """Measures mink's differential inverse kinematics, pose by pose, from the home position to our solver's tolerances."""
     try:
         import mink
     except ImportError:

@@ -1,4 +1,4 @@
-"""The list of measurements, and their rows."""
+"""The measurements to run, and their rows."""
 
 import argparse
 import dataclasses
@@ -20,7 +20,7 @@ from mjx_nero.tools.benchmark.program import Row
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One entry of the list of measurements. ``size`` orders those that differ in nothing else; 0: has none."""
+    """One measurement. ``size`` is its number of environments; 0: it has no size."""
 
     what: str
     impl: str
@@ -40,10 +40,10 @@ def jobs(
     argv: Sequence[str],
     kept: Sequence[Row] = (),
 ) -> list[Job]:
-    """All measurements, in order. Makes what they need but for compiled code, so that mistakes end here.
+    """Returns all measurements, in order. Builds everything they need except compiled code, so that mistakes show up here.
 
     Args:
-        kept: rows of seeds that an interrupted command left.
+        kept: rows of the seeds that an interrupted command finished.
     """
     make_run = functools.partial(run_of, args, hyperparameters)
     found = []
@@ -92,7 +92,7 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace, make_
 
 
 def run_of(args: argparse.Namespace, asked: Mapping[str, str], cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
-    """The run that a measurement with these flags starts."""
+    """Returns the run that a measurement with these flags starts."""
     sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
     fields = {**asked, **{name: value for name, value in sizes.items() if value}}
     learner = config.override(run_cfg.learner_cfg(cfg, args.preset, args.learner), fields)
@@ -101,7 +101,7 @@ def run_of(args: argparse.Namespace, asked: Mapping[str, str], cfg: EnvCfg, impl
 
 
 def measured(jobs: Iterable[Job]) -> Iterator[Row]:
-    """The rows of all jobs. Where memory ends, a row says so, and larger sizes of the same are passed over."""
+    """Yields the rows of all jobs. If memory runs out, a row says so, and larger sizes of the same measurement are skipped."""
     full: dict[tuple[str, str], int] = {}
     for job in jobs:
         limit = full.get((job.what, job.impl))

@@ -1,4 +1,4 @@
-"""Time to success: several seeds trained one after another in one process, by one compiled program."""
+"""Measures the time to success: trains several seeds one after another in one process, with one compiled program."""
 
 import math
 import statistics
@@ -13,22 +13,22 @@ from mjx_nero.runs import compiled, signals, starts, training
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tools.benchmark.program import Row
 
-_EVALUATIONS = 24  # a whole run, where nothing else is asked for
+_EVALUATIONS = 24  # per full run, unless --eval-every is given
 
 
 def measure_learning(run: RunCfg, seeds: int, target: float, kept: Sequence[Row] = ()) -> Iterator[Row]:
-    """A row a seed, then one about all.
+    """Yields a row for each seed, then one about all seeds.
 
-    Each seed trains until an evaluation's success reaches ``target``, or its env steps are used up. Seconds are wall time of
-    training, evaluations and whatever a training begins with (an expert's states), without compilation. All seeds are judged by
-    the same episodes. A signal ends the seed at its next update, and outside of compiled code, which no exception may cross.
+    Each seed trains until an evaluation's success rate reaches ``target`` or its env steps are used up. Seconds are wall time of
+    training, evaluations and the preparation of start states (by an expert), without compilation. All seeds are evaluated on the
+    same episodes. A signal ends the seed after its next update, outside compiled code, because no exception may cross that.
 
     Args:
-        run: of ``run_cfg.fit_machine``; ``eval_every`` 0 evaluates 24 times a whole run.
-        kept: rows of an earlier, interrupted measurement of the same; their seeds are not trained again.
+        run: from ``run_cfg.fit_machine``; if ``eval_every`` is 0, there are 24 evaluations per full run.
+        kept: rows of an earlier, interrupted measurement of the same run; their seeds are not trained again.
 
     Raises:
-        signals.Signalled: a signal came.
+        signals.Signalled: a signal arrived.
     """
     rows = [row for row in kept if row["seed"] in range(seeds)]
     yield from rows
@@ -86,7 +86,7 @@ def _trained(
 
 
 def summary(rows: list[Row]) -> Row:
-    """Counts the seeds that reached the target; median and worst seconds and env steps, None if that seed did not reach it."""
+    """Counts the seeds that reached the target, with median and worst seconds and env steps (None: that seed did not)."""
     found: Row = {"seed": "all", "seeds": len(rows), "reached": sum(row["reached"] for row in rows)}
     for name, digits in (("seconds", 2), ("env_steps", None)):
         values = [row[name] if row["reached"] else math.inf for row in rows]

@@ -1,4 +1,4 @@
-"""The machine that figures were measured on."""
+"""Describes the machine on which figures are measured."""
 
 import contextlib
 import os
@@ -15,11 +15,11 @@ import jax
 import mjx_nero
 from mjx_nero.learn import machines
 
-Row = dict[str, Any]  # one measurement, as JSON has it
+Row = dict[str, Any]  # one measurement, in JSON types
 
 
 def machine() -> Row:
-    """Devices, processor, memory, system: nothing that names the machine or who uses it."""
+    """Returns devices, processor, memory and system, but nothing that identifies the machine or its user."""
     devices = jax.local_devices()
     return {
         "device": devices[0].device_kind,
@@ -33,7 +33,7 @@ def machine() -> Row:
 
 
 def name(machine: Row) -> str:
-    """Name for titles: the accelerators, or the processor without one."""
+    """Returns a name for titles: the accelerators, or the processor if there are none."""
     many = f"{machine['devices']} x " if machine["devices"] > 1 else ""
     if machine["platform"] == "cpu":
         return f"{machine['cpu']}, {machine['cores']} cores"
@@ -41,7 +41,7 @@ def name(machine: Row) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide a result, and the commit of a checkout."""
+    """Returns the versions of Python and of the packages that affect results, and the commit of a checkout."""
     found = machines.versions()
     del found["device"]
     for package in ("jaxlib", "numpy"):
@@ -59,7 +59,7 @@ def _commit() -> str | None:
     def git(*arguments: str) -> str:
         return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True).stdout.strip()
 
-    with contextlib.suppress(subprocess.CalledProcessError, OSError):  # an empty repository, or one of another user
+    with contextlib.suppress(subprocess.CalledProcessError, OSError):  # an empty repository, or another user's
         return git("rev-parse", "HEAD") + (" with changes" if git("status", "--porcelain", "--untracked-files=no") else "")
     return None
 

@@ -1,4 +1,4 @@
-"""A picture of the rows: rates and memory over the number of environments."""
+"""Plots rates and memory over the number of environments."""
 
 import pathlib
 from typing import Any
@@ -10,7 +10,7 @@ _MEMORY: tuple[tuple[str, Any], ...] = (("memory_mb", "-"), ("warp_mb", ":"))  #
 
 
 def plot(rows: list[Row], title: str, path: pathlib.Path) -> None:
-    """Left the median rates, with bars from the slowest to the fastest of the repeats; right the memory. Both log-log."""
+    """Plots median rates on the left, with bars from the slowest to the fastest repeat, and memory on the right; both log-log."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -50,7 +50,7 @@ def plot(rows: list[Row], title: str, path: pathlib.Path) -> None:
 
 
 def _rate(row: Row) -> tuple[float, float, float] | None:
-    """Least, median, most; None for a row without (another kind, or an error)."""
+    """Returns the lowest, median and highest rate; None if the row has none (another kind of row, or an error)."""
     for name in ("env_steps_per_s", "resets_per_s"):
         if name in row:
             return row[f"{name}_min"], row[name], row[f"{name}_max"]

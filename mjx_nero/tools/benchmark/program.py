@@ -1,4 +1,4 @@
-"""A piece of work that is called again and again: its seconds, counts and memory."""
+"""A program that is called repeatedly, with its seconds, counts and memory."""
 
 import statistics
 import time
@@ -13,12 +13,12 @@ from mjx_nero.tools.benchmark.machine import Row
 
 
 class Program:
-    """Work on a state that goes on from call to call.
+    """A function that is called repeatedly on the state that its last call returned.
 
     Args:
-        call: ``(state, key) -> (state, counts)``, the counts a dict of numbers.
+        call: ``(state, key) -> (state, counts)``, where counts is a dict of numbers.
         state: before the first call.
-        work: env steps, resets or whatever else a call does.
+        work: number of env steps, resets or other units that one call does.
     """
 
     def __init__(self, call: Callable[[Any, jax.Array], tuple[Any, dict[str, Any]]], state: Any, work: int):
@@ -31,7 +31,7 @@ class Program:
     def compiled(
         cls, function: Callable, make_state: Callable[[], Any], work: int, options: Mapping[str, Any] | None = None
     ) -> "Program":
-        """Compiles ``function`` and calls it once, which also loads what the backend compiles at its first call."""
+        """Compiles ``function`` and calls it once, because some backends compile more at their first call."""
         begun = time.perf_counter()
         state = make_state()
         call = jax.jit(function, donate_argnums=0).lower(state, jax.random.PRNGKey(0)).compile(dict(options or {}))
@@ -42,12 +42,12 @@ class Program:
         return program
 
     def warm_up(self, begun: float) -> None:
-        """A first call, which does not count; what it took, with all since ``begun``, is the time of compilation."""
+        """Makes a first call, which is not measured. All time since ``begun`` counts as compilation."""
         self.run()
         self.counts, self.compile_s = {}, time.perf_counter() - begun
 
     def run(self) -> float:
-        """One call; gives its seconds."""
+        """Makes one call and returns its seconds."""
         key = jax.random.PRNGKey(self._calls)
         self._calls += 1
         begun = time.perf_counter()
@@ -57,28 +57,28 @@ class Program:
         return seconds
 
     def rates(self, repeats: int) -> list[float]:
-        """Work a second, of each of ``repeats`` calls."""
+        """Returns the work per second of each of ``repeats`` calls."""
         return [self.work / self.run() for _ in range(repeats)]
 
 
 def spread(name: str, values: list[float]) -> Row:
-    """Median, least and most, whole numbers from 100 on."""
+    """Returns median, minimum and maximum; values from 100 on are rounded to whole numbers."""
     found = {name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values)}
     return {key: round(value) if value >= 100 else round(value, 1) for key, value in found.items()}
 
 
 def mb(size: float) -> float:
-    """Bytes in MB of 2^20."""
+    """Converts bytes to MB of 2^20 bytes."""
     return round(size / 2**20, 2)
 
 
 def device_peak_mb() -> float | None:
-    """The most that JAX has ever held on the first device in this process; None where the backend does not count (CPU)."""
+    """Returns the peak memory of JAX on the first device in this process; None if the backend does not count it (CPU)."""
     stats = jax.local_devices()[0].memory_stats() or {}
     return mb(stats["peak_bytes_in_use"]) if "peak_bytes_in_use" in stats else None
 
 
 def warp_mb(env: ManipulationEnv) -> float | None:
-    """The backend's own buffers for all environments, which JAX does not know of; None where it has none."""
+    """Returns the size of the physics' own buffers for all environments, which JAX does not count; None if there are none."""
     outside = env.footprint().outside
     return mb(env.num_envs * outside) if outside else None

@@ -1,4 +1,4 @@
-"""Measures the start of a training: every second before the first step, with empty and with filled caches."""
+"""Measures the start of a training run: the time before the first step, with empty and with filled caches."""
 
 import json
 import os
@@ -21,13 +21,14 @@ _CHILD = "from mjx_nero.tools.benchmark import command; command.begin()"
 
 
 def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
-    """Yields a row for each stage of a start, twice: with empty caches of JAX and Warp, then with what that start has left there.
+    """Yields a row for each stage of a start, twice: with empty caches of JAX and Warp, then with the caches that this start
+    filled.
 
-    Stages run side by side, so each has when it begins and how long it takes. Each start is a process of its own.
+    Stages overlap, so each row says when its stage begins and how long it takes. Each start is a separate process.
 
     Args:
-        argv: of this benchmark, for the new process.
-        run: what it starts, of ``run_cfg.fit_machine``.
+        argv: this benchmark's arguments, for the new process.
+        run: the run to start, from ``run_cfg.fit_machine``.
 
     Raises:
         UserError: a start failed.
@@ -56,17 +57,17 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> list[Span]:
         text=True,
     )
     if done.returncode:
-        raise UserError("the start that was to be measured failed: see above")
+        raise UserError("the start to be measured failed: see its error above")
     stages = [Span(*row) for row in json.loads(done.stdout.splitlines()[-1])]
     return [*stages, Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iteration"))]
 
 
 def begin(spawned: float, imported: float, run: RunCfg) -> None:
-    """Starts a run, takes one iteration and one evaluation, and prints the stages as JSON in a line.
+    """Starts a run, makes one iteration and one evaluation, and prints the stages as one line of JSON.
 
     Args:
-        spawned, imported: when the process was started, and when its modules were there [s since 1970].
-        run: of ``run_cfg.fit_machine``.
+        spawned, imported: when the process was started, and when its imports were done [s since 1970].
+        run: from ``run_cfg.fit_machine``.
     """
     so_far = time.time() - spawned
     spans = Spans()

@@ -1,4 +1,4 @@
-"""Env steps and resets a second: physics alone, random actions, PPO, controllers."""
+"""Measures env steps and resets per second: bare physics, random actions, PPO, controllers."""
 
 import time
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from mjx_nero.tools.benchmark.program import Program, Row, device_peak_mb, sprea
 
 
 def physics(env: ManipulationEnv, steps: int) -> Program:
-    """Random actions into the bare physics, without rewards, observations and resets: ``steps`` control steps a call."""
+    """Applies random actions to the bare physics, without rewards, observations and resets: ``steps`` control steps per call."""
 
     def step(state, key):
         action = jax.random.normal(key, (env.num_envs, env.action_size))
@@ -27,7 +27,7 @@ def physics(env: ManipulationEnv, steps: int) -> Program:
 
 
 def step(env: ManipulationEnv, steps: int) -> Program:
-    """Random actions (standard normal) in the auto-resetting training environment: ``steps`` control steps a call."""
+    """Applies standard normal actions in the auto-resetting training environment: ``steps`` control steps per call."""
     batch = wrappers.for_training(env)
 
     def step(state, key):
@@ -38,7 +38,7 @@ def step(env: ManipulationEnv, steps: int) -> Program:
 
 
 def reset(env: ManipulationEnv, times: int) -> Program:
-    """Every environment starts afresh, ``times`` times a call."""
+    """Resets every environment ``times`` times per call."""
     batch = wrappers.for_training(env)
 
     def again(state, key):
@@ -48,7 +48,7 @@ def reset(env: ManipulationEnv, times: int) -> Program:
 
 
 def training(learner: Learner, iterations: int) -> Program:
-    """A learner end to end, rollouts, updates and resets, from a fresh policy: ``iterations`` a call."""
+    """Trains a fresh policy end to end, with rollouts, updates and resets: ``iterations`` per call."""
 
     def run(state, key):  # the state has its own key
         state, metrics = learner.run(state, iterations)
@@ -61,7 +61,7 @@ def training(learner: Learner, iterations: int) -> Program:
 
 
 def controlled(env: ManipulationEnv, controller: control.Controller) -> Program:
-    """Whole episodes of a controller and the physics in one compiled program, with new starts and goals at each call."""
+    """Plays whole episodes of a controller in one compiled program, with new starts and goals at each call."""
     run = rollout.runner(env, rollout.controller_agent(env, controller), env.num_envs)
 
     def play(seed, _):
@@ -75,7 +75,7 @@ def controlled(env: ManipulationEnv, controller: control.Controller) -> Program:
 
 
 def measure(what: str, env: ManipulationEnv, make: Callable[[], Program], repeats: int) -> Row:
-    """A row about ``repeats`` calls of a program."""
+    """Measures ``repeats`` calls of a program and returns the row."""
     program, unit = make(), "resets" if what == "reset" else "env_steps"
     row = {
         "what": what,
@@ -100,7 +100,7 @@ def _start(env: ManipulationEnv) -> Callable:
 
 
 def _repeated(function: Callable, times: int) -> Callable:
-    """``function`` of state and key so many times over, in one program; counts are summed."""
+    """Repeats ``function`` of state and key ``times`` times in one program, and sums the counts."""
 
     def run(state, key):
         state, counts = jax.lax.scan(function, state, jax.random.split(key, times))

@@ -18,29 +18,30 @@ class DemosCfg:
     """A data set to write.
 
     Attributes:
-        robot: another than the environment's own, by name or folder.
-        agent: who demonstrates: expert, policy, or one of the task's controllers by name.
-        policy: policy file (default: the bundled one of the environment).
-        through: what an expert acts through: drives (their targets) or task (the actions that a policy takes, of which it then
-            has a label to learn from).
-        episodes: in the data set, in all.
-        all: keep episodes that fail, too.
-        ends: task (an episode ends where the task ends it, most often by its time), or success (as soon as success has held for
-            as long as the task asks).
-        noise: standard deviation of what is added to the arm's actions, smooth in time, in the unit of the action (rad for
-            experts); the clean action stands beside what was done.
-        actions: joints (targets of all drives), or hand (steps of the hand, and targets of the gripper).
-        holds: all of a step; arm: only what a real arm knows, too, so that both go together; or lerobot: only what LeRobot's
-            policies learn from, which they then read faster.
-        velocities: the state has the joints' velocities beside their positions (as ``<joint>.vel``).
+        robot: robot instead of the environment's own, by name or folder.
+        agent: who demonstrates: expert, policy, or the name of one of the task's controllers.
+        policy: policy file (default: the environment's bundled policy).
+        through: how an expert acts: through drives (it sets their targets), or through the task's actions, which a policy can
+            then learn from as labels.
+        episodes: total number of episodes in the data set.
+        all: also keep episodes that fail.
+        ends: when an episode ends: task (as the task says, usually after a fixed time), or success (as soon as success has held
+            for as long as the task requires).
+        noise: standard deviation of noise added to the arm's actions, smooth in time, in the action's unit (rad for experts);
+            the data set has the clean action beside the executed one.
+        actions: joints (targets of all drives), or hand (steps of the hand, and gripper targets).
+        holds: what a step holds: all; arm (only what a real arm can also log, so that simulated and real data sets match); or
+            lerobot (only what LeRobot's policies learn from, which loads faster).
+        velocities: add the joints' velocities to the state, as ``<joint>.vel``.
         units: si (rad, m), or lerobot (degrees, grippers 0 to 100); auto: lerobot for arms that LeRobot drives itself.
-        cameras: of the scene, with commas between them: their pictures are drawn and written as videos; front+wrist is one
-            picture of both, side by side, which LeRobot reads sooner than two.
+        cameras: comma-separated cameras of the scene to draw and write as videos; front+wrist is one picture of both, side by
+            side, which LeRobot reads faster than two.
         picture: width and height of a picture in pixels, even numbers (default: the camera's own, or 128x128).
-        renderer: mujoco (OpenGL, a picture at a time) or warp (the ray tracer, for the scene's own cameras); auto: warp on a GPU.
+        renderer: mujoco (OpenGL, one picture at a time) or warp (the ray tracer, for the scene's own cameras); auto: warp on a
+            GPU.
         form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).
         task: sentence that says what the robot does (default: the environment's).
-        side_by_side: episodes played at a time; each time is written as one piece.
+        side_by_side: number of episodes played at once and written as one piece.
     """
 
     env_name: str
@@ -71,4 +72,4 @@ class DemosCfg:
         if self.policy and self.agent != "policy":
             raise UserError("--policy needs --agent policy")
         if self.agent == "policy" and self.through != "drives":
-            raise UserError("--through is of experts: a policy acts through the task's actions anyway")
+            raise UserError("--through is for experts: a policy always acts through the task's actions, so leave it out")

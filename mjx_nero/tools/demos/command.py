@@ -12,41 +12,44 @@ from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos.cfg import DemosCfg
 
-_LOG = "write a run of 'deploy --log' on a real arm as an episode, in place of simulated ones; give those that succeeded; again"
+_LOG = "write a log of 'deploy --log' on a real arm as an episode, instead of simulated ones; give successful runs; repeatable"
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line.
 
     Raises:
-        UserError: unknown names, a folder of something else, a package is missing, a full disk, or nobody succeeds.
+        UserError: a name is unknown, the folder holds something else, a package is missing, the disk is full, or no episode
+            succeeds.
     """
     parser = cli.Parser(
         "demos",
-        "Writes episodes of an expert or a policy as a data set, by default LeRobot's; or looks at one (--inspect).",
+        "Writes episodes of an expert or a policy as a data set, in LeRobot's format by default, or inspects or replays one.",
     )
     parser.add_environment()
     parser.add_seed(0)
-    parser.add_argument("--out", type=cli.path(), metavar="DIR", help="folder to write to, or to go on with")
+    parser.add_argument("--out", type=cli.path(), metavar="DIR", help="folder to write to, or data set to continue")
     parser.add_fields(DemosCfg)
     parser.add_argument("--log", type=cli.path(".csv"), action="append", metavar="FILE", help=_LOG)
-    parser.add_argument("--inspect", type=cli.path(), metavar="DIR", help="show what a data set holds")
+    parser.add_argument("--inspect", type=cli.path(), metavar="DIR", help="show the contents of a data set")
     parser.add_argument(
         "--sheet", type=cli.path(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
     )
-    parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="play an episode of a data set again, in physics")
-    parser.add_argument("--episode", type=cli.number(int), default=0, help="which one to replay, from 0 (default: %(default)s)")
-    parser.add_argument("--video", type=cli.path(".mp4"), help="also draw the episode that is replayed")
+    parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="replay an episode of a data set in simulation")
+    parser.add_argument(
+        "--episode", type=cli.number(int), default=0, help="with --replay: index of the episode, from 0 (default: %(default)s)"
+    )
+    parser.add_argument("--video", type=cli.path(".mp4"), help="with --replay: write a video of the episode")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     asked = [name for name in ("out", "inspect", "replay") if getattr(args, name)]
     if len(asked) != 1:
-        raise UserError("demos takes one of --out DIR (write), --inspect DIR and --replay DIR (look at what is written)")
+        raise UserError("demos takes exactly one of --out DIR (write), --inspect DIR (show) and --replay DIR (play again)")
     if args.video and not args.replay:
-        raise UserError("--video is of the episode that is replayed: pass --replay, too")
+        raise UserError("--video shows a replayed episode: pass --replay, too")
     if args.log and not args.out:
         raise UserError("--log needs --out DIR, the folder to write to")
     if args.sheet and not args.inspect:
-        raise UserError("--sheet shows what a data set has: pass --inspect, too")
+        raise UserError("--sheet shows pictures of a data set: pass --inspect, too")
     if args.inspect:
         from mjx_nero.tools.demos import inspection
 
@@ -65,10 +68,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def write(cfg: DemosCfg, out: pathlib.Path) -> None:
-    """Plays until the data set has as many episodes as it is to have, piece by piece.
+    """Plays episodes and writes them piece by piece, until the data set has as many as requested.
 
     Raises:
-        UserError: as the command.
+        UserError: see ``main``.
     """
     from mjx_nero.data import writer
     from mjx_nero.tools.demos import making
@@ -92,4 +95,4 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
     took = (
         f"{time.perf_counter() - begun:.1f} s ({time.process_time() - busy:.1f} s of the processor's cores), compilation included"
     )
-    print(f"{out}: {len(form.lengths)} episodes, {frames} steps; {new} new ones of {tries} that were played in {took}")
+    print(f"{out}: {len(form.lengths)} episodes, {frames} steps; {new} new, from {tries} played in {took}")

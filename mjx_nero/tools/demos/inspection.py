@@ -1,4 +1,4 @@
-"""Tables and pictures of a data set, for people."""
+"""Tables and pictures of a data set."""
 
 import itertools
 import pathlib
@@ -12,16 +12,16 @@ from mjx_nero.data import episode as names
 from mjx_nero.errors import UserError
 from mjx_nero.runs import console
 
-BINS, SHEET = 16, 24  # of a histogram; episodes on a sheet
+BINS, SHEET = 16, 24  # bins of a histogram; episodes on a sheet
 _BARS = " ▁▂▃▄▅▆▇█"
 _SHOWN = (names.STATE, names.ACTION, names.ENVIRONMENT)
 
 
 def show(path: pathlib.Path, picture: pathlib.Path | None = None) -> None:
-    """Prints counts, lengths and the distribution of states and actions, and draws a sheet of pictures.
+    """Prints counts, lengths and the distribution of states and actions, and draws a sheet of pictures if asked.
 
     Raises:
-        UserError: there is no data set, it is damaged, or it has no pictures.
+        UserError: there is no data set, it is damaged, or a sheet is asked for and it has no pictures.
     """
     found, screen = open_dataset(path), console.screen()
     if picture:
@@ -36,14 +36,14 @@ def show(path: pathlib.Path, picture: pathlib.Path | None = None) -> None:
 
 
 def sheet(path: pathlib.Path, found: Dataset) -> np.ndarray:
-    """The first episodes in rows, at their beginning, middle and end by each camera, uint8 [height, width, 3].
+    """Draws the beginning, middle and end of the first episodes by each camera, in rows; uint8 [height, width, 3].
 
     Raises:
         UserError: there are no pictures.
     """
     cameras = [name for name, feature in found.schema.features.items() if feature.picture]
     if not cameras:
-        raise UserError(f"{path} has no pictures: make it with --cameras")
+        raise UserError(f"{path} has no pictures: write it with --cameras")
     lengths = found.lengths[:SHEET]
     ends = np.cumsum(lengths)
     wanted = {int(at): None for end, n in zip(ends, lengths, strict=True) for at in (end - n, end - n + n // 2, end - 1)}
@@ -54,7 +54,7 @@ def sheet(path: pathlib.Path, found: Dataset) -> np.ndarray:
         columns.append(np.stack([kept[i] for i in wanted]).reshape(len(lengths), 3, *next(iter(kept.values())).shape))
     rows = np.concatenate(columns, axis=1)  # [episodes, cameras x 3, height, width, 3]
     n, across, height, width, _ = rows.shape
-    beside = max(1, round((n * height / (across * width)) ** 0.5))  # so many episodes in a row make it about square
+    beside = max(1, round((n * height / (across * width)) ** 0.5))  # episodes per row, for an about square sheet
     rows = np.concatenate([rows, np.zeros((-n % beside, *rows.shape[1:]), np.uint8)]).reshape(
         -1, beside * across, height, width, 3
     )
@@ -62,7 +62,7 @@ def sheet(path: pathlib.Path, found: Dataset) -> np.ndarray:
 
 
 def overview(path: pathlib.Path, found: Dataset) -> console.Table:
-    """Lists its maker, its size and its lengths."""
+    """Lists how a data set was made, its size and the lengths of its episodes."""
     schema, lengths = found.schema, found.lengths
     about = schema.about
     table = console.Table(str(path), ("", ""), left=("",))
@@ -72,19 +72,19 @@ def overview(path: pathlib.Path, found: Dataset) -> console.Table:
             table.add(name, str(about[name]))
     table.add("robot", f"{schema.robot}, {schema.fps:g} steps a second")
     played = int(found.numbers.max()) + 1 if len(found) else 0
-    table.add("episodes", f"{len(found)}, of which {int(found.success.sum())} succeed (of {played} that were played)")
+    table.add("episodes", f"{len(found)}, of which {int(found.success.sum())} succeed ({played} were played)")
     table.add("steps", f"{int(lengths.sum())}, {lengths.sum() / schema.fps / 3600:.2f} h")
     if len(found):
         shown = f"{lengths.min()} to {lengths.max()} steps, {lengths.mean():.1f} on average"
         table.add("lengths", f"{shown}  {histogram(lengths)}")
     if names.ACTION in schema.features and names.EXECUTED in schema.features and schema.about.get("actions") != "hand":
         off = found.column(names.ACTION) - found.column(names.EXECUTED)
-        table.add("noise done", f"{off.std():.4g} (deviation of what was done from the label, over all joints)")
+        table.add("noise done", f"{off.std():.4g} (standard deviation of executed actions from their labels, over all joints)")
     return table
 
 
 def distribution(found: Dataset, name: str) -> console.Table:
-    """A line a number of a feature."""
+    """Makes a table with one row for each number of a feature."""
     feature, values = found.schema.features[name], found.column(name)
     table = console.Table(name, ("", "unit", "min", "1%", "mean", "99%", "max", "std", "histogram"), left=("histogram",))
     of = stats.of(values)
@@ -95,7 +95,7 @@ def distribution(found: Dataset, name: str) -> console.Table:
 
 
 def histogram(values: np.ndarray) -> str:
-    """Bars from the least to the greatest value; any that are there at all show."""
+    """Draws a histogram from the least to the greatest value as text; every bin that is not empty shows."""
     counts, _ = np.histogram(values.astype(np.float64), BINS)
     heights = np.ceil(counts / max(1, counts.max()) * (len(_BARS) - 1)).astype(int)
     return "".join(_BARS[height] for height in heights)

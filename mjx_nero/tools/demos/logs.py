@@ -1,4 +1,4 @@
-"""Episodes from logs of real runs (``deploy --log``), one a log, with the features of ``demos --holds arm``."""
+"""Episodes from logs of real runs (``deploy --log``), one per log, with the features of ``demos --holds arm``."""
 
 import csv
 import functools
@@ -20,14 +20,14 @@ from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 MAX_BYTES = 256_000_000
-_JITTER = 0.2  # of a step's length: a log whose steps differ by more on average has no rate
+_JITTER = 0.2  # share of a step by which a log may differ from the others
 
 
 def write(cfg: DemosCfg, logs: Sequence[pathlib.Path], out: pathlib.Path) -> None:
-    """Writes the episodes of logs that are not in the data set yet.
+    """Writes the logs that are not in the data set yet, one episode each.
 
     Raises:
-        UserError: a log is damaged or of another arm, or the folder holds something else.
+        UserError: a log is damaged or from another arm, or the folder holds something else.
     """
     env = ManipulationEnv(registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot), impl="native")
     shown, robot = making.units_of(env, cfg.units), env.cfg.robot
@@ -36,7 +36,7 @@ def write(cfg: DemosCfg, logs: Sequence[pathlib.Path], out: pathlib.Path) -> Non
     for path, (_, _, step) in zip(logs, read, strict=True):
         if abs(step - dt) > _JITTER * dt:
             raise UserError(
-                f"{path} has a step of {1000 * step:.1f} ms, and the others one of {1000 * dt:.1f} ms: write them apart"
+                f"{path} has a step of {1000 * step:.1f} ms, the others of {1000 * dt:.1f} ms: write it to another data set"
             )
     rate = 1 / env.dt if abs(dt - env.dt) < _JITTER * env.dt else round(1 / dt)
     kept = {name: each for name, each in making.features(env, shown, "joints").items() if name in making.ARM}
@@ -61,11 +61,11 @@ def write(cfg: DemosCfg, logs: Sequence[pathlib.Path], out: pathlib.Path) -> Non
         if new:
             form.put(new)
         count, frames = len(form.lengths), int(form.lengths.sum())
-    print(f"{out}: {count} episodes, {frames} steps; {len(new)} new ones of {len(logs)} logs")
+    print(f"{out}: {count} episodes, {frames} steps; {len(new)} new, from {len(logs)} logs")
 
 
 def _episode(path: pathlib.Path, shown: making.units.Units, at: np.ndarray, told: np.ndarray) -> Episode:
-    """A log's number is made of what is in it, so that none comes twice."""
+    """Makes an episode of a log. Its number is a hash of its content, so that no log is added twice."""
     done = np.arange(len(at))[:, None] == len(at) - 1
     state, action = (shown.shown(x).astype(np.float32) for x in (at, told))
     number = int.from_bytes(hashlib.sha256(at.tobytes() + told.tobytes()).digest()[:6], "big")
@@ -74,13 +74,13 @@ def _episode(path: pathlib.Path, shown: making.units.Units, at: np.ndarray, told
 
 
 def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Reads the joints before each step of the policy, and the drives' targets in it, up to the first fault.
+    """Reads the joint positions before each policy step and the drives' targets in it, up to the first fault.
 
     Returns:
         positions and targets [steps, joints] [rad or m], and the length of a step [s].
 
     Raises:
-        UserError: it is no log of these joints, or the policy made no step in it.
+        UserError: the file is not a log of these joints, or the policy made fewer than two steps in it.
     """
     at: list[float] | None = None
     rows: list[tuple[float, list[float], list[float]]] = []
@@ -93,24 +93,24 @@ def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.nda
         if cells["target." + joints[0]] and cells.get("inferred") and at is not None:
             rows.append((read(cells["time"]), at, [read(cells[f"target.{joint}"]) for joint in joints]))
     if len(rows) < 2:
-        raise UserError(f"{path} has {len(rows)} steps of a policy: give the log of a run of 'deploy'")
+        raise UserError(f"{path} has {len(rows)} policy steps, and an episode needs two: give a log of 'deploy --log'")
     times, positions, targets = (np.array(column) for column in zip(*rows, strict=True))
     return positions, targets, float(np.median(np.diff(times)))
 
 
 def _table(path: pathlib.Path, joints: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """The rows of a log by their columns, and the line that each is in."""
+    """Returns the rows of a log, each with its line number, by column name."""
     lines = numbered(path, MAX_BYTES)
     rows = list(csv.reader(line for _, line in lines))
     head = rows[0] if rows else []
     for name in ["time", "inferred", *(f"{what}.{joint}" for what in ("target", "position") for joint in joints)]:
         if head.count(name) != 1:
-            raise UserError(f"{path} needs one column {name}: its first line names {short(','.join(head))}")
+            raise UserError(f"{path} needs exactly one column {name}: its first line is {short(','.join(head))}")
     out = []
     for (line, _), cells in zip(lines[1:], rows[1:], strict=True):
         if len(cells) != len(head):
             if line == lines[-1][0]:
-                break  # its program was killed as it wrote
+                break  # the program was killed while it wrote this line
             raise UserError(f"{path} line {line} has {len(cells)} cells, the first line {len(head)}")
         out.append((line, dict(zip(head, cells, strict=True))))
     return out

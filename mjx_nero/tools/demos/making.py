@@ -1,4 +1,4 @@
-"""Makes the player of a data set and its schema."""
+"""Makes the player and the schema of a data set."""
 
 import argparse
 import dataclasses
@@ -33,9 +33,9 @@ from mjx_nero.tools import cli
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 HOPELESS = 1000  # episodes in a row without a success
-ARM = (names.STATE, names.ACTION, names.EXECUTED, names.DONE)  # what a real arm knows
+ARM = (names.STATE, names.ACTION, names.EXECUTED, names.DONE)  # what a real arm can log
 HOLDS = {"arm": ARM, "lerobot": (names.STATE, names.ENVIRONMENT, names.ACTION)}  # what LeRobot's policies learn from
-SENTENCES = {  # by the end of an environment's name, longer ones first
+SENTENCES = {  # by the end of an environment's name, longest first
     "reach_obstacles": "Bring the hand to the goal without touching an obstacle.",
     "lift_obstacles": "Pick up the cube and carry it past the obstacles to the goal.",
     "pick_place": "Pick up the cube and put it down at the goal.",
@@ -50,10 +50,10 @@ SENTENCES = {  # by the end of an environment's name, longer ones first
 
 
 def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
-    """The schema of the data set, and who plays its episodes.
+    """Returns the schema of the data set and the player of its episodes.
 
     Raises:
-        UserError: unknown names or fields, a policy that does not fit.
+        UserError: a name or field is unknown, or the policy does not fit.
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
     env_cfg = things.overridden(env_cfg, cfg.env_fields)
@@ -61,8 +61,8 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     size = min(cfg.side_by_side, cfg.episodes)
     name = next(iter(env_cfg.controllers), EXPERT) if cfg.agent == EXPERT else cfg.agent
     drives = not acts and cfg.through == "drives"
-    told = not cfg.policy and teachers.GROUP in env_cfg.observations  # who acts is told what others have to see
-    if not acts or told:  # what no term reads is not drawn
+    told = not cfg.policy and teachers.GROUP in env_cfg.observations  # the agent is told what others must see
+    if not acts or told:  # pictures that no term reads are not drawn
         kept = {name: env_cfg.observations[name] for name in ("state", teachers.GROUP) if name in env_cfg.observations}
         env_cfg = dataclasses.replace(env_cfg, observations=kept)
     env = ManipulationEnv(for_controllers(env_cfg) if drives else env_cfg, impl="native", num_envs=size)
@@ -110,10 +110,10 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
 
 
 def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
-    """Those that are asked for; None: none is.
+    """Returns the requested cameras; None if there are none.
 
     Raises:
-        UserError: there is no such camera, it is no size of a picture, or the machine cannot draw.
+        UserError: a camera does not exist, the picture size is invalid, or the machine cannot draw.
     """
     found = list(dict.fromkeys(name.strip() for name in cfg.cameras.split(",") if name.strip()))
     try:
@@ -124,17 +124,17 @@ def cameras_of(env: ManipulationEnv, cfg: DemosCfg) -> Cameras | None:
 
 
 def robot_type(robot: str, shown: units.Units) -> str:
-    """The robot's name; LeRobot's, where units are its own."""
+    """Returns the robot's name: LeRobot's if the units are LeRobot's."""
     return units.LEROBOT.get(robot, robot) if shown.kind == "lerobot" else robot
 
 
 def sentence(env_name: str) -> str:
-    """Says what the robot does in an environment."""
+    """Returns a sentence that says what the robot does in an environment."""
     return next((text for end, text in SENTENCES.items() if env_name.endswith(end)), f"Do {env_name.replace('_', ' ')}.")
 
 
 def units_of(env: ManipulationEnv, kind: str) -> units.Units:
-    """Units of an environment's joints; ``kind``: one of ``units.KINDS``, or ``auto``.
+    """Returns the units of an environment's joints; ``kind`` is one of ``units.KINDS``, or ``auto``.
 
     Raises:
         UserError: the scene has several robots.
@@ -154,7 +154,12 @@ def units_of(env: ManipulationEnv, kind: str) -> units.Units:
 def features(
     env: ManipulationEnv, shown: units.Units, actions: str, seen: bool = False, velocities: bool = False
 ) -> dict[str, Feature]:
-    """Lists the features of a step, without pictures; ``seen``: it has some; ``velocities``: the state has the joints'."""
+    """Returns the features of a step, without its pictures.
+
+    Args:
+        seen: the data set has pictures.
+        velocities: the state has joint velocities.
+    """
     joints = env.cfg.robot.joints
     targets = Feature(tuple(f"{joint}.pos" for joint in joints), shown.names)
     speeds = Feature(tuple(f"{joint}.vel" for joint in joints), tuple(f"{unit}/s" for unit in shown.names))
@@ -180,29 +185,29 @@ def features(
 
 
 def _seen(env: ManipulationEnv) -> tuple[str, ...]:
-    """Names of what a policy sees: by its terms, where their sizes add up to it."""
+    """Names the numbers that a policy observes, after their terms if the terms' sizes add up."""
     shapes = jax.eval_shape(env.named_observations, env.state_shape)["state"]
     size = sum(
         math.prod(shape) for shape in jax.tree.leaves(env.observation_size["state"], is_leaf=lambda x: isinstance(x, tuple))
     )
-    terms = env.cfg.observations["state"].terms  # in their order, which a tree of JAX does not keep
+    terms = env.cfg.observations["state"].terms  # in the config's order, which a JAX tree does not keep
     found = [f"{name}.{i}" for name in terms for i in range(shapes[name].size)]
     return tuple(found) if len(found) == size else tuple(f"state.{i}" for i in range(size))
 
 
 def _digest(path: pathlib.Path) -> str:
-    """Says which policy it was."""
+    """Returns a hash that identifies the policy's file."""
     return hashlib.sha256(files.read_bytes(path, 1 << 30)).hexdigest()[:16]
 
 
 def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
-    """The environment that a data set was made in.
+    """Makes the environment in which a data set was recorded.
 
     Args:
-        drives: by drive targets, whatever the data set's agent acted through.
+        drives: act by drive targets, whatever the data set's agent acted through.
 
     Raises:
-        UserError: it cannot be made here.
+        UserError: it cannot be made on this machine.
     """
     about: dict[str, Any] = dict(schema.about)
     robot = about.get("robot_folder") or about["robot"]
@@ -212,5 +217,5 @@ def env_of(schema: Schema, drives: bool = False) -> ManipulationEnv:
 
 
 def by_drives(cfg: EnvCfg, through: str) -> EnvCfg:
-    """The task by drive targets, with the arm that a data set's agent had: who acts through drives has its weight carried."""
+    """Returns the task with drive targets as actions. An agent that acted through drives also had gravity compensated."""
     return for_controllers(cfg) if through == "drives" else dataclasses.replace(cfg, actions=drive_targets())

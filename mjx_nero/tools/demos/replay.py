@@ -1,4 +1,4 @@
-"""Plays an episode of a data set again: the drives are told what they were told, and physics has to come to the same."""
+"""Replays an episode of a data set: sends the recorded drive targets again and compares the simulated states."""
 
 import dataclasses
 import pathlib
@@ -20,10 +20,10 @@ from mjx_nero.types import Scenery
 
 
 def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
-    """Says how far physics comes from what was recorded; draws the episode, if a video is asked for.
+    """Prints how far the replay differs from the recording, and draws the episode if a video is requested.
 
     Raises:
-        UserError: there is no such episode, or the data set is not of an environment.
+        UserError: there is no such episode, or the data set is not from an environment.
     """
     found = open_dataset(path)
     if not 0 <= index < len(found):
@@ -34,7 +34,7 @@ def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
     screen = console.screen()
     said = "succeeds" if episode.success else "fails"
     console.line(screen, f"episode {index} (number {episode.number}): {len(episode)} steps, {said}; {found.schema.task}")
-    console.line(screen, f"played again, physics differs by at most {off:.2g} (rad, m) from what was recorded")
+    console.line(screen, f"the replay differs from the recording by at most {off:.2g} (rad, m)")
     if video:
         with console.drawing(console.screen(stderr=True), video.name) as update:
             drawn = episode.arrays[names.QPOS].astype(np.float64)[:, None]
@@ -44,22 +44,22 @@ def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
 
 
 def _episode(found: Dataset, index: int) -> Episode:
-    """One episode with what a replay needs.
+    """Returns one episode with the features that a replay needs.
 
     Raises:
-        UserError: the data set lacks it.
+        UserError: the data set lacks them.
     """
     if names.QPOS not in found.schema.features:
-        raise UserError("this data set has no positions of the physics: it is not of an environment here")
+        raise UserError("this data set has no simulated positions: replay one that 'demos' wrote with --holds all")
     known = [name for name in (names.EXECUTED, names.QPOS, names.ENVIRONMENT) if name in found.schema.features]
     return found.episodes(known)[index]
 
 
 def again(env: ManipulationEnv, found: Dataset, episode: Episode) -> tuple[np.ndarray, Scenery]:
-    """Positions before each step [steps, nq], and what else a picture shows, of the episode played again.
+    """Replays an episode; returns positions before each step [steps, nq], and everything else that a picture shows.
 
     Args:
-        env: by drive targets.
+        env: with drive targets as actions.
     """
     targets = units.from_json(found.schema.about["units"]).positions(episode.arrays[names.EXECUTED])
 
@@ -74,7 +74,7 @@ def again(env: ManipulationEnv, found: Dataset, episode: Episode) -> tuple[np.nd
 
 
 def _begin(env: ManipulationEnv, found: Dataset, episode: Episode) -> State:
-    """The state in which an episode starts; that of a user's hand, which no seed draws, at rest where the recording begins."""
+    """Returns the first state of an episode. A demonstration by hand has no seed: it starts at rest in its first pose."""
     about = found.schema.about
     if "seed" in about:
         return start(env, episode.number, about["seed"])

@@ -1,4 +1,4 @@
-"""The command ``deploy``: an exported policy on an arm, real, emulated or simulated, behind the safety layer."""
+"""The command ``deploy``: runs an exported policy on a real, emulated or simulated arm, behind the safety layer."""
 
 from mjx_nero.tools.deploy.command import FAULT, main
 

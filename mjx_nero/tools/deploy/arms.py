@@ -1,4 +1,4 @@
-"""Flags of an arm: which one, where it is, its limits; and, where it is emulated or simulated, its scene."""
+"""Flags that choose an arm, its port and its limits, and the scene of an emulated or simulated arm."""
 
 import argparse
 import contextlib
@@ -14,7 +14,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
 WARNING = (
-    "nobody has tried this on hardware: all that is known comes from the makers' and LeRobot's sources and from emulators. "
+    "nobody has tried this on hardware: the drivers are written from the makers' and LeRobot's sources and tested on emulators. "
     "Keep a hand on the power switch and people out of reach."
 )
 EXTRAS = {
@@ -31,56 +31,56 @@ KEPT = ("joints", "gripper", "body", "base", "regions", "command", "control_dt",
 
 
 def add_arm(parser: cli.Parser) -> None:
-    """Flags of the arm and its bus."""
+    """Adds the flags of the arm and its bus."""
     add = parser.add_argument
     add("--port", help="serial port, INTERFACE:CHANNEL, HOST, or TYPE:field=value,...: see docs/guides/deploy.md")
-    add("--gripper", metavar="HOST", help="compute box of the Cobotta's RG6 (default: the gripper gets no commands)")
-    add("--calibration", type=cli.path(".json"), help="SO-ARM: LeRobot's file; lerobot: which joint is which motor")
-    add("--emulate", action="store_true", help="in place of the arm, a program that speaks its protocol, with MuJoCo behind it")
-    text = "file of identify or deploy --check: its offsets are subtracted, and its delay is that of --delay"
+    add("--gripper", metavar="HOST", help="address of the compute box of the Cobotta's RG6 (default: do not command the gripper)")
+    add("--calibration", type=cli.path(".json"), help="SO-ARM: LeRobot's calibration file; lerobot: which motor is which joint")
+    add("--emulate", action="store_true", help="use an emulator that speaks the arm's protocol, with MuJoCo behind it")
+    text = "file from identify or deploy --check: subtract its offsets, and use its delay as --delay"
     add("--identified", type=cli.path(".yaml", ".yml"), help=text)
 
 
 def add_limits(parser: cli.Parser) -> None:
-    """Flags of the safety layer: they move limits, and switch nothing off."""
+    """Adds the flags of the safety layer. They move limits but switch none off."""
     add = parser.add_argument
     add(
         "--speed",
         type=cli.share,
         default=1.0,
         metavar="SHARE",
-        help="share of the joints' speeds, at most (default: %(default)s)",
+        help="maximum share of the joints' speed limits (default: %(default)s)",
     )
-    add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table's top, m (default: %(default)s)")
-    text = "box that no link may leave, m (default: about home and the task's regions, and 0.3 m on all sides)"
+    add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table top [m] (default: %(default)s)")
+    text = "box that no link may leave [m] (default: around home and the task's regions, with a margin of 0.3 m)"
     add("--workspace", metavar="X0,X1,Y0,Y1,Z0,Z1", help=text)
-    add("--apart", type=cli.non_negative, default=0.0, help="least distance between links, m (default: %(default)s)")
+    add("--apart", type=cli.non_negative, default=0.0, help="minimum distance between links [m] (default: %(default)s)")
     hottest = cli.number(Annotated[float, Bounds(20.0, 90.0)])
     add(
         "--hottest",
         type=hottest,
         default=60.0,
         metavar="CELSIUS",
-        help="hold when a drive is hotter (default: %(default)s)",
+        help="hold if a drive gets hotter than this (default: %(default)s)",
     )
 
 
 def check(parser: cli.Parser, args: argparse.Namespace) -> None:
     """Refuses flags of an arm that contradict one another."""
     if args.arm == "sim" and args.emulate:
-        parser.error("--emulate is for real arms' protocols: --arm sim is simulated already")
+        parser.error("--emulate is for the protocols of real arms: leave it out with --arm sim, which is simulated already")
     if args.arm == "lerobot" and args.emulate:
-        parser.error("--emulate is for the protocols that are spoken here: --arm lerobot is LeRobot's")
+        parser.error("--emulate cannot emulate --arm lerobot, whose protocols are LeRobot's: name the arm itself or leave it out")
     if args.arm != "sim" and not (args.port or args.emulate):
         parser.error(f"--arm {args.arm} needs --port, or --emulate")
 
 
 @contextlib.contextmanager
 def missing() -> Iterator[None]:
-    """A package that is not there is one line, with its extra.
+    """Reports a missing package in one line, with the extra to install.
 
     Raises:
-        UserError: one is missing.
+        UserError: a package is missing.
     """
     try:
         yield
@@ -92,10 +92,13 @@ def missing() -> Iterator[None]:
 
 
 def numbers(text: str | None, counts: Sequence[int], flag: str) -> list[float] | None:
-    """Numbers with commas between them.
+    """Reads comma-separated numbers; None if ``text`` is None.
+
+    Args:
+        counts: how many numbers are allowed.
 
     Raises:
-        UserError: it is something else.
+        UserError: the text is something else.
     """
     if text is None:
         return None
@@ -104,22 +107,22 @@ def numbers(text: str | None, counts: Sequence[int], flag: str) -> list[float] |
     except argparse.ArgumentTypeError:
         found = []
     if len(found) not in counts:
-        raise UserError(f"{flag} takes {' or '.join(map(str, counts))} numbers with commas between them, got {text[:60]!r}")
+        raise UserError(f"{flag} takes {' or '.join(map(str, counts))} comma-separated numbers, got {text[:60]!r}")
     return found
 
 
 def safety_of(args: argparse.Namespace) -> Any:
-    """``SafetyCfg`` of the flags."""
+    """Returns the ``SafetyCfg`` of the flags."""
     from mjx_nero.deploy.safety import SafetyCfg
 
     return SafetyCfg(share=args.speed, temperature=args.hottest)
 
 
 def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping[str, Any], log: pathlib.Path | None, note: str):
-    """Returns what the arm's process has to know, and the delay of its targets [s]; None: nobody has said it.
+    """Returns the specification of the arm's process, and the delay of its targets [s]; None: unknown.
 
     Raises:
-        UserError: a flag says something impossible.
+        UserError: a flag has an impossible value.
     """
     from mjx_nero.deploy import identified
     from mjx_nero.deploy.server import Spec
@@ -139,11 +142,11 @@ def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping
 
 @contextlib.contextmanager
 def options_of(args: argparse.Namespace, metadata: Mapping[str, Any], cfg: Any, tracker: int | None = None) -> Iterator[Any]:
-    """The driver's options; an emulated arm runs meanwhile.
+    """Yields the driver's options. An emulator runs until the context ends.
 
     Args:
-        cfg: makes the config of the scene where the arm is simulated or emulated: robot, scene, sim, and where its objects start.
-        tracker: port that is told where objects are.
+        cfg: makes the scene of a simulated or emulated arm: robot, scene, sim, and where its objects start.
+        tracker: port to which object positions are sent.
     """
     if args.arm != "sim" and not args.emulate:
         calibration = args.calibration and str(args.calibration)
@@ -171,7 +174,7 @@ def _saved(cfg: Any, folder: pathlib.Path) -> str:
 
 
 def warn(args: argparse.Namespace) -> None:
-    """Says what nobody has tried."""
+    """Prints the warning about real arms."""
     if args.arm != "sim" and not args.emulate:
         print(f"warning: {WARNING}", flush=True)
 

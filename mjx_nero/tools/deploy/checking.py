@@ -1,4 +1,4 @@
-"""``deploy --check``: the walk through an arm's joints, what it found, and whether to go on."""
+"""``deploy --check``: moves an arm's joints one by one, and reports what it found and whether to continue."""
 
 import pathlib
 import sys
@@ -13,14 +13,14 @@ from mjx_nero.deploy.safety import Limits
 
 
 def checked(arm: Guarded, limits: Limits, metadata: Mapping[str, Any], clock: Clock, ends: stop.Stop, out: pathlib.Path) -> bool:
-    """Walks through an arm that is at home, prints a go or no-go list, and writes what was found.
+    """Moves the joints of an arm at home one by one, prints a go or no-go list, and writes the findings.
 
     Returns:
-        whether something speaks against going on.
+        True if a joint or a fault forbids going on.
     """
 
     def ask(question: str) -> bool | None:
-        """Waits for y or n while the arm holds; None: there is no terminal."""
+        """Asks for y or n while the arm holds; returns None if there is no terminal or the arm faults."""
         if not sys.stdin or not sys.stdin.isatty():
             return None
         print(f"  {question} [y/n] ", end="", flush=True)
@@ -53,5 +53,5 @@ def checked(arm: Guarded, limits: Limits, metadata: Mapping[str, Any], clock: Cl
     files.write(out, check.yaml_of(metadata["robot"], found, [n for n in limits.names if n not in grips]).encode())
     bad = any(joint.wrong(joint.name in grips) for joint in found)
     print(f"drives: {out}")
-    print("no-go: mend that first" if bad else "go: next --dry-run, then --speed 0.3 --seconds 5 with nothing in reach")
+    print("no-go: fix that first" if bad else "go: next --dry-run, then --speed 0.3 --seconds 5 with nothing in reach")
     return bad

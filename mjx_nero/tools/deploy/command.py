@@ -15,21 +15,21 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import arms
 
-FAULT = 3  # exit status of a run that ended in one
+FAULT = 3  # exit status of a run that ended in a fault
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line.
 
     Raises:
-        UserError: a wrong argument, file or port; the arm cannot start.
-        SystemExit: with ``FAULT``, where the arm holds because something failed.
+        UserError: an argument, file or port is wrong, or the arm cannot start.
+        SystemExit: with ``FAULT``, if the arm holds because something failed.
     """
     parser = _parser()
     args, _ = parser.parse(argv)
     arms.check(parser, args)
     if args.check and args.dry_run:
-        parser.error("--check moves the arm, and --dry-run does not")
+        parser.error("--check moves the arm, and --dry-run does not: pass one of them")
     for path in filter(None, (args.log, args.check)):
         files.check_writable(path)
     try:
@@ -44,45 +44,45 @@ def main(argv: Sequence[str]) -> None:
 def _parser() -> cli.Parser:
     parser = cli.Parser(
         "deploy",
-        "Runs an exported policy on an arm, behind a safety layer. Every fault ends in holding, never in cutting "
-        "torque. Stop it with Ctrl-C, or with space, q or escape.",
+        "Runs an exported policy on an arm, behind a safety layer. After any fault the arm holds its position; torque is "
+        "never cut. Stop it with Ctrl-C, space, q or escape.",
     )
     add = parser.add_argument
-    add("policy", type=cli.path(".onnx"), help="file that export wrote")
-    add("--arm", choices=drivers.KINDS, required=True, help="which arm")
+    add("policy", type=cli.path(".onnx"), help="policy file written by export")
+    add("--arm", choices=drivers.KINDS, required=True, help="arm to drive")
     arms.add_arm(parser)
-    add("--robot", help="imported robot's folder, for --arm sim and --emulate, where the policy was trained with one")
-    text = "where the object is: X,Y,Z, a JSON file of its place or of a camera, udp://HOST:PORT to listen at, or tcp://HOST:PORT"
-    add("--object", metavar="PLACE", help=f"{text} (default: where the simulator has it)")
-    text = "JSON file that says which camera, video or folder each camera of a policy is that looks at pictures"
+    add("--robot", help="folder of the imported robot that the policy was trained with, for --arm sim and --emulate")
+    text = "where the object is: X,Y,Z, a JSON file of its place or of a camera, udp://HOST:PORT to listen on, or tcp://HOST:PORT"
+    add("--object", metavar="PLACE", help=f"{text} (default: the simulator's)")
+    text = "for a policy with cameras: JSON file that names the camera, video or folder for each of them"
     add("--cameras", type=cli.path(".json"), metavar="FILE", help=f"{text} (default: the simulator's)")
     add(
         "--goal",
         metavar="X,Y,Z",
-        help="commanded point, and perhaps orientation W,X,Y,Z (default: the middle of the task's region)",
+        help="goal position [m], optionally followed by its orientation W,X,Y,Z (default: the middle of the task's region)",
     )
-    add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts (default: %(default)s)")
-    text = "until a target is in force, s, as identify finds it: what the policy sees of its targets is then as late"
+    add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts [s] (default: %(default)s)")
+    text = "time until a target takes effect [s], as identify measures it; the policy then sees its own targets equally late"
     add(
         "--delay",
         type=cli.number(Annotated[float, Bounds(0.0, 1.0)]),
-        help=f"{text} (default: that of --identified, or found as it moves)",
+        help=f"{text} (default: from --identified, or measured while the arm moves)",
     )
-    add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line of its joints")
-    add("--dry-run", action="store_true", help="read the arm, and show what would be sent; nothing is")
-    text = "in place of the policy, move one joint after another a little, ask what you saw, and write offsets and delay"
+    add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line in joint space")
+    add("--dry-run", action="store_true", help="read the arm and show what would be sent, but send nothing")
+    text = "instead of running the policy, move each joint a little, ask what you saw, and write offsets and delay"
     add("--check", type=cli.path(".yaml", ".yml"), metavar="FILE", help=text)
-    add("--log", type=cli.path(".csv"), help="table of what was read and sent, as identify reads it")
-    add("--alive", type=cli.path(), metavar="FILE", help="hold unless somebody touches this file every half second")
+    add("--log", type=cli.path(".csv"), help="write a table of everything read and sent, which identify reads")
+    add("--alive", type=cli.path(), metavar="FILE", help="hold unless this file is touched at least every half second")
     arms.add_limits(parser)
     return parser
 
 
 def _brain(args: argparse.Namespace) -> Any:
-    """The policy.
+    """Loads the policy.
 
     Raises:
-        UserError: the file is none, or is for another arm.
+        UserError: the file is not a policy, or is for another arm.
     """
     from mjx_nero.deploy import setup
     from mjx_nero.deploy.loop import Brain
@@ -92,15 +92,15 @@ def _brain(args: argparse.Namespace) -> Any:
         brain = Brain(args.policy)
     except ModuleNotFoundError:
         raise
-    except Exception as error:  # ONNX Runtime has kinds of its own
-        raise UserError(f"{args.policy} is no policy that export wrote: {error}") from None
+    except Exception as error:  # ONNX Runtime has its own kinds
+        raise UserError(f"{args.policy} is not a policy written by export: {error}") from None
     setup.check(brain.metadata)
     drivers.check(args.arm, brain.metadata)
     return brain
 
 
 def _run(args: argparse.Namespace) -> bool:
-    """Returns whether it ended in a fault."""
+    """Runs the policy or the check; returns whether it ended in a fault."""
     from mjx_nero.deploy import setup
     from mjx_nero.deploy.guard import WallClock, urgent
     from mjx_nero.deploy.loop import go_home, run
@@ -147,11 +147,11 @@ def _run(args: argparse.Namespace) -> bool:
 def _tell(args: argparse.Namespace, report: Any, late: float, ages: Sequence[float]) -> None:
     """Prints how a run ended."""
     print(f"the arm holds: {report.fault.text}")
-    print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
+    print("limits reached: " + (", ".join(f"{name} {n} times" for name, n in report.limited.items()) or "never"))
     print("timing: " + json.dumps(report.timing.summary()))
     if report.timing.missed:
         print("missed: " + ", ".join(f"cycle {cycle} by {1e3 * over:.1f} ms" for cycle, over in report.timing.missed))
-    print(f"delay: the joints went where they were told {1e3 * late:.0f} ms later")
+    print(f"delay: the joints followed their targets {1e3 * late:.0f} ms later")
     if len(ages):
         print(f"pictures: {summary(ages)}")
     if args.log:

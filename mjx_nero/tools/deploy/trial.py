@@ -1,4 +1,4 @@
-"""Episodes of an exported lift over an emulated arm, in a time of their own: how many succeed, and logs of its drives."""
+"""Plays an exported lift policy on an emulated arm in simulated time: measures its success rate, and logs the drives."""
 
 import pathlib
 from typing import Any
@@ -22,7 +22,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools.identification.arm import metadata_of, play
 
-_NEAR = 0.02  # of the goal: success [m]
+_NEAR = 0.02  # distance to the goal that counts as success [m]
 
 
 def lifts(
@@ -34,16 +34,16 @@ def lifts(
     delay: float | None = None,
     seed: int = 0,
 ) -> tuple[float, list[Fault]]:
-    """Plays a lift whose cube and goal are drawn as in training.
+    """Plays lifts whose cube and goal are drawn as in training.
 
     Args:
-        cfg: of the environment.
-        kind: of the arm: ``sim``, ``so101``, ``piper`` or ``nero``.
-        faults: of its drives.
-        delay: of targets, that the runtime is told of [s]; None: nothing.
+        cfg: the environment's config.
+        kind: arm: ``sim``, ``so101``, ``piper`` or ``nero``.
+        faults: faults of its drives.
+        delay: delay of targets that the runtime is told [s]; None: it is told nothing.
 
     Returns:
-        share of the episodes that end with the cube within 2 cm of the goal, and the faults that ended others.
+        share of episodes that end with the cube within 2 cm of the goal, and the faults that ended episodes.
     """
     brain, clock, rng = Brain(policy), timeless.Clock(), np.random.default_rng(seed)
     told, ended, good = brain.metadata, [], 0
@@ -72,7 +72,7 @@ def lifts(
 
 
 def recorded(path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, seconds: float) -> dict[str, int]:
-    """Writes the log of an emulated arm under identification's movement; returns how often each limit acted."""
+    """Logs an emulated arm during identification's movement; returns how often each limit was reached."""
     told, clock, swings = metadata_of(robot), timeless.Clock(), sweeps(robot, seconds)
     targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
     model: mujoco.MjModel = scene.build(robot, SceneCfg(objects={}), SimCfg(), visuals=False)

@@ -1,4 +1,4 @@
-"""Places of a policy's objects, and the scene of a simulated or emulated arm."""
+"""The sources of a policy's object positions and pictures, and the scene of a simulated or emulated arm."""
 
 import argparse
 import contextlib
@@ -18,7 +18,7 @@ class World:
 
     Attributes:
         robot, scene, sim: configs.
-        objects: where objects are at first, in the root frame [m].
+        objects: first positions of the objects, in the root frame [m].
     """
 
     robot: Any
@@ -29,14 +29,14 @@ class World:
 
 @contextlib.contextmanager
 def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Returns where objects are, and the driver's options."""
+    """Yields the source of object positions, and the driver's options."""
     from mjx_nero.deploy import places
 
     simulated = args.arm == "sim" or args.emulate
     constant, told = args.object is not None and _is_point(args.object), None
     if args.object is None and not simulated:
         source: Any = places.Known()
-    elif simulated and (args.object is None or constant):  # the simulated object starts there, and is seen
+    elif simulated and (args.object is None or constant):  # the simulated object starts there and is tracked
         source = places.FromSocket("udp", "127.0.0.1", 0)
         told = source.port
     else:
@@ -52,17 +52,17 @@ def places_and_options(args: argparse.Namespace, metadata: dict[str, Any]) -> It
 
 @contextlib.contextmanager
 def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any) -> Iterator[Any]:
-    """The source of the policy's pictures, see ``observe.Pictures``; a policy that does not look at any gets none.
+    """Yields the source of the policy's pictures, see ``observe.Pictures``; a policy without cameras gets none.
 
     Raises:
-        UserError: nothing gives them, or no policy wants them.
+        UserError: the policy has cameras and nothing provides their pictures, or cameras are given and it has none.
     """
     from mjx_nero.deploy.observe import no_pictures
 
     told = metadata.get("cameras") or {}
     if not told:
         if args.cameras:
-            raise UserError(f"--cameras is for policies that look at pictures: {args.policy} does not")
+            raise UserError(f"--cameras is for policies with cameras, and {args.policy} has none: leave it out")
         yield no_pictures
         return
     if args.cameras:
@@ -77,7 +77,7 @@ def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any)
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=True)
         source = Eyes(model, told, metadata["joints"]["names"], metadata["base"]["position"], places)
     else:
-        raise UserError(f"the policy looks at pictures of {' and '.join(told)}: say with --cameras which cameras these are")
+        raise UserError(f"the policy needs pictures of {' and '.join(told)}: name these cameras in a file with --cameras")
     with contextlib.closing(source):
         yield source
 

@@ -1,4 +1,4 @@
-"""The commands ``record`` and ``identify`` (docs/guides/identification.md): ``mjx_nero.identify`` at a command line."""
+"""The commands ``record`` and ``identify``, for ``mjx_nero.identify`` (docs/guides/identification.md)."""
 
 from mjx_nero.tools.identification.command import identify_main, record_main
 

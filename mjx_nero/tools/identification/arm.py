@@ -1,4 +1,4 @@
-"""``record`` on an arm: identification's movement through the safety layer, and its log."""
+"""``record`` on an arm: sends identification's movement through the safety layer, and logs it."""
 
 import argparse
 import contextlib
@@ -23,12 +23,13 @@ from mjx_nero.tools.deploy.world import World
 
 
 def metadata_of(robot: RobotCfg) -> dict[str, Any]:
-    """Describes a robot as an exported policy would."""
+    """Describes a robot as the metadata of an exported policy does."""
     return {**description.robot(robot), "robot": robot.name, "control_dt": 1 / RATE, "command": {}, "objects": {}}
 
 
 def play(arm: Guarded, targets: np.ndarray, clock: Clock, stop: Stop) -> tuple[Fault | None, dict[str, int]]:
-    """Sends targets at ``RATE`` [m, n]; why it stopped short, and how often each limit acted."""
+    """Sends targets [steps, joints] at ``RATE``; returns why it stopped early (None: it did not), and how often each limit
+    was reached."""
     begun, limited = clock.now(), dict[str, int]()
     for k, target in enumerate(targets):
         clock.sleep_until(begun + k / RATE)
@@ -46,7 +47,11 @@ def play(arm: Guarded, targets: np.ndarray, clock: Clock, stop: Stop) -> tuple[F
 
 
 def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
-    """Moves an arm, goes home first, and writes what it was told and did; returns whether it ended in a fault."""
+    """Moves an arm home, then through identification's movement, and logs targets and readings.
+
+    Returns:
+        whether it ended in a fault.
+    """
     metadata, clock = metadata_of(robot), WallClock()
     arms.known(args.arm, metadata)
     swings = sweeps(robot, args.seconds, args.amplitude)
@@ -65,8 +70,8 @@ def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
         remote.start(anywhere=True)
         fault = go_home(remote, limits, clock, stop)
         if not fault:
-            print(f"the arm is where the movement begins: it takes {args.seconds:g} s")
+            print(f"the arm is at the start of the movement, which takes {args.seconds:g} s")
             fault, limited = play(remote, targets, clock, stop)
-            print("limits acted: " + (", ".join(f"{name} {n} times" for name, n in limited.items()) or "never"))
+            print("limits reached: " + (", ".join(f"{name} {n} times" for name, n in limited.items()) or "never"))
     print(f"the arm holds: {fault.text if fault else 'the movement is over'}")
     return fault is not None and fault.kind != "stop"

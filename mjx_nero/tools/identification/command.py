@@ -25,15 +25,18 @@ def record_main(argv: Sequence[str]) -> None:
     """The command line of ``record``."""
     parser = cli.Parser(
         "record",
-        "Moves an arm by sine sweeps within its limits, and writes what its drives were told and did. Without --arm "
-        "the arm is simulated, at once; with it, the movement goes through the safety layer of deploy, in real time.",
+        "Moves an arm by sine sweeps within its limits, and logs the targets and readings of its drives. Without --arm the "
+        "arm is simulated, faster than real time; with it, the movement goes through deploy's safety layer, in real time.",
     )
     _add_robot(parser)
     parser.add_argument("--arm", choices=drivers.KINDS, help="real, emulated or simulated arm (default: none)")
     arms.add_arm(parser)
     arms.add_limits(parser)
     parser.add_argument(
-        "--out", type=cli.path(".csv"), required=True, help="the log: a table with commas (docs/guides/identification.md)"
+        "--out",
+        type=cli.path(".csv"),
+        required=True,
+        help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
     about = config.describe(RecordCfg())
     for field in dataclasses.fields(RecordCfg):
@@ -58,8 +61,8 @@ def _record_arm(parser: cli.Parser, args: argparse.Namespace) -> None:
     """Records an arm.
 
     Raises:
-        UserError: it cannot be had.
-        SystemExit: it holds because something failed.
+        UserError: the arm cannot be reached.
+        SystemExit: the arm holds because something failed.
     """
     arms.check(parser, args)
     try:
@@ -77,10 +80,14 @@ def _record_arm(parser: cli.Parser, args: argparse.Namespace) -> None:
 def identify_main(argv: Sequence[str]) -> None:
     """The command line of ``identify``."""
     parser = cli.Parser("identify", "Fits gains, armature, friction, delay and encoder offsets of an arm's drives to a log.")
-    parser.add_argument("log", type=cli.path(), metavar="LOG", help="a table with commas (docs/guides/identification.md)")
+    parser.add_argument(
+        "log", type=cli.path(), metavar="LOG", help="log to read: a comma-separated table (docs/guides/identification.md)"
+    )
     _add_robot(parser)
-    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML for make(identified=...) and --env.identified")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of the remaining error")
+    parser.add_argument(
+        "--out", type=cli.path(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
+    )
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
     args, _ = parser.parse(argv)
     for path in filter(None, (args.out, args.plot)):
         files.check_writable(path)

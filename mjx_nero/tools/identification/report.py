@@ -16,12 +16,12 @@ from mjx_nero.runs.console import Table
 _HEAD = """\
 # Drives of {robot}, identified from {log}: values with 95% intervals. For make(identified=FILE) and --env.identified FILE.
 # stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], armature [kg m2 or kg], friction [N m or N], delay [s];
-# offset [rad or m]: what the encoder reads beside the joint's position, to be subtracted on the real arm.
+# offset [rad or m]: encoder reading minus joint position, to be subtracted on the real arm.
 """
 
 
 def table(joints: Sequence[str], fit: Fit, nominal: Drives) -> Table:
-    """A line a joint."""
+    """Makes the table of identified drives, one row per joint."""
     unit = "error held out [mrad, mm]"
     view = Table(
         "identified, with 95% intervals (the model's own)", ("joint", *POSITIVE, "offset [mrad, mm]", unit, "the model's own")
@@ -56,7 +56,7 @@ def save(path: pathlib.Path, robot: str, log: str, joints: Sequence[str], fit: F
 
 
 def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> None:
-    """A panel a joint: the differences to the readings over time, of the identified arm and of the model's own."""
+    """Plots simulated minus measured positions over time, one panel per joint, for the identified and the model's drives."""
     from matplotlib.figure import Figure
 
     columns = min(3, len(joints))

@@ -1,4 +1,4 @@
-"""Prints and draws a robot or an environment: python -m mjx_nero inspect nero --move --render nero.png"""
+"""Tables and pictures of a robot or an environment: python -m mjx_nero inspect nero --move --render nero.png"""
 
 from mjx_nero.sim.contacts import constraint_rows, contact_pairs
 from mjx_nero.tools.inspection.report import find, inspect, inspect_robot, picture

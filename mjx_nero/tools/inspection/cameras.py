@@ -1,4 +1,4 @@
-"""Shows the pictures of an environment's cameras, and how much of its objects they see: a sheet of pictures, and a table."""
+"""Shows what an environment's cameras see, as a sheet of pictures, and how much of the objects they see, as a table."""
 
 import dataclasses
 from typing import Any
@@ -13,9 +13,9 @@ from mjx_nero.runs import console
 from mjx_nero.sim.cameras import places
 
 WORLDS = 32
-_STEPS, _EVERY = 40, 40  # control steps with random actions; between two pictures
+_STEPS, _EVERY = 40, 40  # control steps with random actions; steps between two pictures
 _COLUMNS = 8
-_EDGE = 128  # of a picture on the sheet, about [pixels]
+_EDGE = 128  # approximate size of a picture on the sheet [pixels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Seen:
 
     Attributes:
         pictures: ``types.Picture`` by camera, [states, ...], in numpy.
-        shares: (camera, object) -> in what share of the states any of it is seen, and how many pixels of it, in the mean.
+        shares: (camera, object) -> share of states in which the object is visible, and its mean number of pixels.
     """
 
     pictures: dict[str, Any]
@@ -32,14 +32,14 @@ class Seen:
 
 
 def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
-    """Draws states of random episodes through the task's cameras; without any, through those that suit its robot.
+    """Draws states of random episodes through the task's cameras, or through default cameras for its robot if it has none.
 
     Raises:
-        UserError: the robot does not say where it works, or this machine cannot draw.
+        UserError: the robot does not declare a workspace, or this machine cannot draw.
     """
     found = cfg.scene.cameras or places.find(cfg.robot)
     found = {name: dataclasses.replace(c, kinds=tuple({*c.kinds, "rgb", "segmentation"})) for name, c in found.items()}
-    # Neither observations nor lenses look at pictures here, so that steps draw none.
+    # Without observations or lenses that use pictures, steps draw none.
     told = {name: group for name, group in cfg.observations.items() if not group.apart}
     sensors = {name: term for name, term in cfg.sensors.items() if not isinstance(term.made, Lens)}
     seen = dataclasses.replace(cfg.scene, cameras=found)
@@ -65,7 +65,7 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
 
 
 def sheet(seen: Seen) -> np.ndarray:
-    """Puts all colour pictures into one, uint8 [height, width, 3], camera after camera."""
+    """Puts all colour pictures on one sheet, uint8 [height, width, 3], camera by camera."""
     rows = []
     for picture in seen.pictures.values():
         times = max(1, _EDGE // max(picture.rgb.shape[1:3]))

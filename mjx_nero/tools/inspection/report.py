@@ -1,4 +1,4 @@
-"""A robot in its scene, or an environment: as values and as a picture."""
+"""Describes a robot in its scene, or an environment, as values and as a picture."""
 
 import dataclasses
 import pathlib
@@ -25,13 +25,13 @@ from mjx_nero.types import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint; gains, effort, speed and home are None where no drive turns it.
+    """A joint; gains, effort, speed and home are None if it has no drive.
 
     Attributes:
         kind: ``hinge``, ``slide``, ...
         range: limits [rad or m]; None: unlimited.
         follows: the joint that it is coupled to, or empty.
-        group: ``arm``, ``gripper``, those of another robot, or empty.
+        group: ``arm``, ``gripper``, a group of another robot, or empty.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Actuator:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """An environment's part of the report; texts for people."""
+    """An environment's part of the report, as text."""
 
     env: str
     preset: str
@@ -79,15 +79,15 @@ class Report:
     """A robot in its scene.
 
     Attributes:
-        open, close: targets of the gripper's joints, in their order [rad or m].
-        gaps: between the pads, open and closed [m]; None: unknown, or no gripper.
-        regions: ``workspace``, ``pick`` and ``hold`` of ``RobotCfg``, those that it has: ranges of x, y and z [m].
+        open, close: targets of the gripper's joints, in order [rad or m].
+        gaps: distance between the pads, open and closed [m]; None: unknown, or no gripper.
+        regions: ``workspace``, ``pick`` and ``hold`` of ``RobotCfg``, if it has them: ranges of x, y and z [m].
         sites: name -> position at home, world frame [m].
-        masses: body -> [kg], the robot's alone.
-        pairs: geoms that can meet.
-        rows: constraint rows of one environment at worst, by kind.
-        contacts_per_env, constraints_per_env: what MJX-Warp's buffers hold.
-        task: of an environment.
+        masses: body -> mass [kg], of the robot only.
+        pairs: geoms that can touch.
+        rows: maximum number of constraint rows of one environment, by kind.
+        contacts_per_env, constraints_per_env: capacity of MJX-Warp's buffers.
+        task: the environment's part; None for a robot.
     """
 
     robot: str
@@ -108,19 +108,19 @@ class Report:
 
     @property
     def contacts(self) -> int:
-        """Candidate contacts of one environment at worst."""
+        """Maximum number of candidate contacts of one environment."""
         return sum(pair.contacts for pair in self.pairs)
 
 
 def find(name: str, preset: str | None = None, robot: str | None = None) -> tuple[RobotCfg, EnvCfg | None]:
-    """A robot, and the environment if ``name`` is one.
+    """Returns a robot, and the environment if ``name`` is one.
 
     Args:
-        name: of a robot or an environment, or the folder of an imported robot.
+        name: robot, environment, or folder of an imported robot.
         preset, robot: of an environment.
 
     Raises:
-        UserError: no such thing, or a robot with a preset or another robot.
+        UserError: the name is unknown, or names a robot and a preset or another robot is given.
     """
     if name in registry.list_envs():
         cfg = registry.env_cfg(name, preset or registry.list_presets(name)[0], robot)
@@ -130,12 +130,12 @@ def find(name: str, preset: str | None = None, robot: str | None = None) -> tupl
         hint = config.hint(name, known)
         raise UserError(f"no robot or environment {name!r}{hint}: choose one of {', '.join(known)}, or the folder of a robot")
     if preset or robot:
-        raise UserError(f"{name} is a robot: --preset and --robot go with an environment")
+        raise UserError(f"{name} is a robot: leave out --preset and --robot, which are for environments")
     return registry.robot(name), None
 
 
 def inspect(name: str, preset: str | None = None, robot: str | None = None) -> Report:
-    """Everything about a robot at a table with a cube, or about an environment; see ``find``."""
+    """Reports everything about a robot at a table with a cube, or about an environment; see ``find``."""
     arm, cfg = find(name, preset, robot)
     sim = cfg.sim if cfg else sized(arm, SceneCfg(), SimCfg()) if arm.folder else SimCfg()
     report = inspect_robot(arm, cfg.scene if cfg else SceneCfg(), sim)
@@ -143,7 +143,7 @@ def inspect(name: str, preset: str | None = None, robot: str | None = None) -> R
 
 
 def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
-    """A robot in a scene, perhaps with others."""
+    """Reports a robot in a scene, which may have other robots."""
     model, robots = scene.build(robot, where, sim, visuals=False), team.of(robot, where.robots)
     data, gripper = mujoco.MjData(model), robot.gripper
     for joint, position in zip(team.joints(robots), team.home(robots), strict=True):
@@ -173,7 +173,7 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
 
 
 def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height: int = 720) -> np.ndarray:
-    """Picture of the robot at home, in its environment if there is one; uint8 [height, width, 3].
+    """Draws the robot at home, in its environment if one is given; uint8 [height, width, 3].
 
     Raises:
         UserError: the machine cannot draw offscreen.
@@ -226,13 +226,13 @@ def _bounds(pair) -> Range:
 
 
 def _extent(robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around the robot at home, world frame [m]."""
+    """Returns two corners of a box around the robot at home, world frame [m]."""
     model, data = scene.at_home(robot)
-    reach = np.minimum(model.geom_rbound, 0.1)[:, None]  # bounding spheres of long shapes would say too much
+    reach = np.minimum(model.geom_rbound, 0.1)[:, None]  # bounding spheres of long shapes are too large
     points = data.geom_xpos if model.ngeom else data.xpos
     reach = reach if model.ngeom else 0.05
     away = np.linalg.norm(points - data.xpos[1], axis=1)
-    near = away <= max(3 * np.median(away), 1.0)  # makers' meshes have stray parts, metres off
+    near = away <= max(3 * np.median(away), 1.0)  # some makers' meshes have stray parts metres away
     points, reach = points[near], np.broadcast_to(reach, (len(points), 1))[near]
     return (points - reach).min(axis=0), (points + reach).max(axis=0)
 
@@ -268,7 +268,7 @@ def _object(item: ObjectCfg) -> str:
 
 
 def _summary(term: Term) -> str:
-    """The first sentence about a term, as it goes on behind a colon."""
+    """Returns the first sentence of a term's docstring, with a small first letter, to follow a colon."""
     text = docs.summary(term.func).partition(". ")[0].replace("``", "")
     return text[:1].lower() + text[1:]
 

@@ -9,7 +9,7 @@ from mjx_nero.tools.motion import Move
 
 
 def tables(report: Report) -> list[Table]:
-    """The report for people."""
+    """Makes the tables of a report."""
     joints = _table(f"joints of {report.robot}", "joint", "range", "home", "stiffness", "damping", "effort", "speed", "")
     for j in report.joints:
         gains = (j.home, j.stiffness, j.damping, j.effort, j.speed)
@@ -50,23 +50,23 @@ def tables(report: Report) -> list[Table]:
 
 
 def move_table(moved: Sequence[Move]) -> Table:
-    """A line a movement."""
+    """Makes the table of movements, one row each."""
     title = "movements at the drives' speed limits, without contacts"
     view = _table(title, "joint", "from", "to", "error", "time [s]", "fastest", "saturated [%]")
     for m in moved:
-        there = "not there" if m.time is None else f"{m.time:.2f}"
+        there = "not reached" if m.time is None else f"{m.time:.2f}"
         ends, error = (_fixed(m.start, 3), _fixed(m.target, 3)), _fixed(abs(m.end - m.target), 4)
         view.add(m.joint, *ends, error, there, f"{m.fastest:.2f}", f"{100 * m.saturation:.0f}")
-    view.caption = "there: within 1% of the joint's range; rad, rad/s; slides: m, m/s"
+    view.caption = "time: until within 1% of the joint's range of the target; rad, rad/s; slides: m, m/s"
     return view
 
 
 def _contact_tables(report: Report) -> list[Table]:
-    pairs = _table("geoms that can meet", "geom", "geom", "shapes", "contacts", "condim", "rows")
+    pairs = _table("geoms that can touch", "geom", "geom", "shapes", "contacts", "condim", "rows")
     for p in report.pairs:
         pairs.add(p.first, p.second, p.shapes, str(p.contacts), str(p.condim), str(p.rows))
-    budget = _table("one environment at worst", "", "needed", "buffer (MJX-Warp)")
-    shared = f"{report.contacts_per_env} on average: environments share it"
+    budget = _table("maximum of one environment", "", "needed", "buffer (MJX-Warp)")
+    shared = f"{report.contacts_per_env} on average, shared by all environments"
     budget.add("contacts", str(report.contacts), shared)
     budget.add("constraint rows", str(sum(report.rows.values())), str(report.constraints_per_env))
     for name, rows in report.rows.items():
@@ -96,7 +96,7 @@ def _task_tables(task: Task) -> list[Table]:
 
 
 def _table(title: str, *columns: str, caption: str = "") -> Table:
-    """Names to the left, all else to the right."""
+    """Makes a table with names aligned left and everything else aligned right."""
     return Table(title, columns, left=("joint", "geom", "shapes"), caption=caption)
 
 

@@ -1,4 +1,4 @@
-"""A thing of a mesh: its parts, mass and rests as values, tables and a picture."""
+"""Describes a mesh object, with its parts, mass and resting poses, as values, tables and a picture."""
 
 import dataclasses
 
@@ -16,15 +16,15 @@ _COLOURS = ((0.86, 0.37, 0.34), (0.36, 0.6, 0.85), (0.45, 0.7, 0.42), (0.93, 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Thing:
-    """The thing that a file holds.
+    """A mesh object.
 
     Attributes:
-        edges: of the box around it, along the file's axes [m].
-        corners: of each convex part.
-        volume, mass, inertia: [m3], [kg], and the principal moments about its centre of mass [kg m2].
-        center: the centre of mass in the file's frame [m].
-        rests: orientation (wxyz), height of the centre [m], and how often a throw ends so.
-        triangles: as drawn.
+        edges: edge lengths of its bounding box, along the file's axes [m].
+        corners: number of corners of each convex part.
+        volume, mass, inertia: [m3], [kg], and the principal moments about the center of mass [kg m2].
+        center: center of mass in the file's frame [m].
+        rests: orientation (wxyz) and height of the center [m] of each resting pose, and the share of throws that end in it.
+        triangles: number of triangles drawn.
         texture: width and height [pixels]; (0, 0): none.
     """
 
@@ -46,7 +46,7 @@ def of(file: str, scale: float = 1.0) -> Thing:
     """Reads a file.
 
     Raises:
-        UserError: it cannot be used as an object; the message says why.
+        UserError: the file cannot be used as an object; the message says why.
     """
     item = ObjectCfg(shape="mesh", file=file, scale=scale)
     (solid,), (mass,) = item.solids, item.masses
@@ -67,14 +67,14 @@ def of(file: str, scale: float = 1.0) -> Thing:
 
 
 def tables(thing: Thing) -> list[console.Table]:
-    """The thing for people."""
+    """Makes the tables of an object."""
     view = console.Table(thing.file, ("", ""), left=("",))
     view.add("size", " x ".join(f"{1e3 * edge:.1f}" for edge in thing.edges) + " mm")
     view.add("convex parts", f"{len(thing.corners)}, of up to {max(thing.corners)} corners")
     view.add("volume", f"{1e6 * thing.volume:.1f} cm³")
     view.add("mass", f"{thing.mass:.4g} kg, at {thing.mass / thing.volume:.0f} kg/m³")
     view.add("principal moments", " ".join(f"{moment:.3g}" for moment in thing.inertia) + " kg m²")
-    view.add("centre of mass", " ".join(f"{1e3 * x:.1f}" for x in thing.center) + " mm in the file")
+    view.add("center of mass", " ".join(f"{1e3 * x:.1f}" for x in thing.center) + " mm in the file")
     view.add(
         "drawn",
         f"{thing.triangles:,} triangles, "
@@ -82,7 +82,7 @@ def tables(thing: Thing) -> list[console.Table]:
     )
     view.caption = thing.note
     lies = console.Table(
-        "how it rests on a table", ("rest", "share", "height of its centre", "up in its own axes"), left=("rest",)
+        "resting poses on a table", ("pose", "share", "height of the center", "up in its own axes"), left=("pose",)
     )
     for i, (quat, height, share) in enumerate(thing.rests):
         lies.add(str(i + 1), f"{share:.0%}", f"{1e3 * height:.1f} mm", " ".join(f"{x:.2f}" for x in rests.up(np.array(quat))))
@@ -90,7 +90,7 @@ def tables(thing: Thing) -> list[console.Table]:
 
 
 def picture(thing: Thing, width: int = 1280, height: int = 480) -> np.ndarray:
-    """Draws it as it rests, and behind that its convex parts in colours; uint8 [height, width, 3].
+    """Draws an object in its resting poses, and behind them its convex parts in colours; uint8 [height, width, 3].
 
     Raises:
         UserError: this machine cannot draw.

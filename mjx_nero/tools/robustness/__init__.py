@@ -1,4 +1,4 @@
-"""Success of a policy in worlds that differ from its training: ``python -m mjx_nero robustness``."""
+"""Measures a policy's success in worlds that differ from its training: ``python -m mjx_nero robustness``."""
 
 from mjx_nero.tools.robustness.command import main
 

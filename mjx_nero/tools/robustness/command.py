@@ -17,28 +17,32 @@ from mjx_nero.tools import cli
 from mjx_nero.tools.robustness import sweeps
 
 STEP = "physics step [factor]"
-_LARGEST = 1 << 20  # [bytes] of figures
+_LARGEST = 1 << 20  # maximum size of a results file [bytes]
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
-        "robustness", "Plays a policy over the range of each parameter of the world, one at a time and all at once."
+        "robustness", "Measures a policy's success over the range of each world parameter, one at a time and all at once."
     )
     parser.add_environment()
-    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled one)")
+    parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled policy)")
     parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting (default: %(default)s)")
     parser.add_seed(90210)
     parser.add_impl()
-    parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only parameters with this text; repeatable")
-    parser.add_argument("--json", type=cli.path(".json"), help="write the figures as JSON")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write the curves")
-    parser.add_argument("--beside", type=cli.path(".json"), help="figures of another policy (--json), to plot beside")
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="TEXT", help="only parameters whose names contain this text; repeatable"
+    )
+    parser.add_argument("--json", type=cli.path(".json"), help="write the results as JSON")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="plot the curves to this file")
+    parser.add_argument(
+        "--beside", type=cli.path(".json"), help="with --plot: results of another policy (from --json) to plot as well"
+    )
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     for path in filter(None, (args.json, args.plot)):
         files.check_writable(path)
     if args.beside and not args.plot:
-        raise UserError("--beside is for the picture: pass --plot, too")
+        raise UserError("--beside adds curves to the plot: pass --plot, too")
     other = read(args.beside) if args.beside else None
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     names = [name for name in (*sweeps.sweeps(cfg), STEP) if not args.only or any(text in name for text in args.only)]
@@ -59,7 +63,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def measure(args: Any, cfg: Any, names: Sequence[str]) -> dict[str, Any]:
-    """Success over the parameters ``names``: plain JSON."""
+    """Measures success over the parameters ``names``; returns plain JSON."""
     from mjx_nero.tools.robustness.measure import Bench
 
     def bench_of(cfg: Any) -> Bench:
@@ -96,7 +100,7 @@ def _progress(name: str, curve: Sequence[dict[str, Any]]) -> None:
 
 
 def table(result: dict[str, Any]) -> console.Table:
-    """A line a setting."""
+    """Makes a table with one row per setting."""
     title = f"{result['env']} · {result['backend']} · {result['episodes']} episodes a setting"
     view = console.Table(title, ("parameter", "value", "success", "95% interval"))
     for name, curve in result["curves"].items():
@@ -107,10 +111,10 @@ def table(result: dict[str, Any]) -> console.Table:
 
 
 def read(path: pathlib.Path) -> dict[str, Any]:
-    """Figures that ``--json`` wrote; a stranger may have made them.
+    """Reads results written by ``--json``. The file is not trusted.
 
     Raises:
-        UserError: it holds none, or cannot be read.
+        UserError: it holds no results, or cannot be read.
     """
     found = files.read_json(path, _LARGEST)
     try:
@@ -125,7 +129,7 @@ def read(path: pathlib.Path) -> dict[str, Any]:
             },
         }
     except (ValueError, TypeError, KeyError, AttributeError):
-        raise UserError(f"{path} holds no figures of robustness: make them by --json") from None
+        raise UserError(f"{path} holds no results of robustness: give a file written with --json") from None
 
 
 def _interval(point: Any) -> tuple[float, float]:
@@ -134,7 +138,7 @@ def _interval(point: Any) -> tuple[float, float]:
 
 
 def save_plot(path: pathlib.Path, results: Sequence[dict[str, Any]]) -> None:
-    """A panel a parameter of the first result: success with its intervals, and that of the others."""
+    """Plots success with its intervals, one panel per parameter of the first result, for all results."""
     from matplotlib.figure import Figure
 
     first, *_ = results

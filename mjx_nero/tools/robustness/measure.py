@@ -1,4 +1,4 @@
-"""Success over a parameter: one compiled program plays every setting, each with the same starts."""
+"""Measures success over a parameter. One compiled program plays every setting with the same start states."""
 
 import dataclasses
 import pathlib
@@ -25,26 +25,26 @@ from mjx_nero.types import LOOK
 
 
 class Bench:
-    """An environment whose drawn fields, delay and offset are given at the start of each episode.
+    """An environment whose randomized fields, delay and offset are set at the start of each episode.
 
     Args:
-        cfg: the task that the policy was trained on, of that preset.
+        cfg: the task that the policy was trained on, with that preset.
         path: the policy; None: the bundled one.
-        episodes: of a setting.
+        episodes: number of episodes per setting.
     """
 
     def __init__(self, env_name: str, preset: str, cfg: EnvCfg, path: pathlib.Path | None, episodes: int, impl: str, seed: int):
         self._played: list[tuple[Point, dict[str, Any]]] = []
         self._episodes, self._seed, self._sees = episodes, seed, bool(cfg.scene.cameras)
-        self._told = [] if self._sees else list(cfg.scene.objects)  # objects of which somebody says where they are
+        self._told = [] if self._sees else list(cfg.scene.objects)  # objects whose positions are told, not seen
         cfg = seen.prepared(cfg) if self._sees else cfg
-        own = {name: term for name, term in cfg.actions.items() if name != "delay"}  # the task's own delay gives way
+        own = {name: term for name, term in cfg.actions.items() if name != "delay"}  # ours replaces the task's own delay
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
         told = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._told}
         wanted = varied(cfg).randomization
         cfg = dataclasses.replace(cfg.uncorrupted(), actions={**late, **own}, sensors={**cfg.sensors, **told})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
-        # All fields that some setting draws, so that one program plays them all.
+        # All fields that any setting changes, so that one program plays every setting.
         names = Randomization(self.env.physics_model, wanted).names
         self._nominal = {name: jnp.asarray(getattr(self.env.physics_model, name), jnp.float32) for name in names}
         self.env.physics = make_physics(self.env.physics_model, cfg.sim, self.env.impl, names)
@@ -52,7 +52,7 @@ class Bench:
         self._run = rollout.runner(self.env, lambda params, obs, key: trained.act(obs), episodes, start=self._start)
 
     def success(self, point: Point) -> dict[str, Any]:
-        """Plays a setting once: the rate with Wilson's 95% interval."""
+        """Plays a setting, unless it was played before; returns the success rate with Wilson's 95% interval."""
         if known := next((found for played, found in self._played if played == point), None):
             return known
         summary = self._run(self._given(point), self._seed).summary()
@@ -60,7 +60,7 @@ class Bench:
         return self._played[-1][1]
 
     def _given(self, point: Point) -> dict[str, Any]:
-        """Fields, delay and offset of each episode."""
+        """Draws fields, delay and offset of each episode."""
         n, keys = self._episodes, jax.random.split(jax.random.PRNGKey(self._seed), 3)
         fields = {name: jnp.broadcast_to(value, (n, *value.shape)) for name, value in self._nominal.items()}
         if point.terms:
@@ -78,7 +78,7 @@ class Bench:
         return given
 
     def _start(self, given: Mapping[str, Any], state: State) -> State:
-        """The states at the start, with what is given; objects of another size on the table."""
+        """Returns the start states with the given values. Objects of another size still rest on the table."""
         sim, carry, fields = state.pipeline_state, state.info["carry"], given["fields"]
         memory, qpos = dict(carry.memory), sim.qpos
         memory["actions.delay"] = memory["actions.delay"].replace(lag=given["lag"])
@@ -95,7 +95,7 @@ class Bench:
         return self._looking(given, state) if self._sees else state
 
     def _looking(self, given: Mapping[str, Any], state: State) -> State:
-        """The states with the look and the pictures' delay that are given, in the first pictures, too."""
+        """Returns the states with the given look and picture delay, which already hold in the first pictures."""
         carry = state.info["carry"]
         memory = {**carry.memory, LOOK: given["look"]}
         state = state.replace(info={**state.info, "carry": carry.replace(memory=memory)})

@@ -1,4 +1,4 @@
-"""Sweeps of what a policy sees: one property of the picture at a time, and all of the preset's look at once."""
+"""Sweeps of the look of the world: one property at a time, and the preset's whole look at once."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from mjx_nero.tasks import seeing
 LATE = "pictures late [control steps]"
 LATEST = 5  # control steps
 ALL = "whole look [width]"
-_AS_THEY_ARE = ("x", "y", "z")  # parameters that are places
+_AS_THEY_ARE = ("x", "y", "z")  # parameters that are positions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Look:
     """The look of the world.
 
     Attributes:
-        terms: of the look.
+        terms: terms of the look.
         late: delay of all pictures [control steps].
     """
 
@@ -30,14 +30,14 @@ class Look:
 
 
 def lenses(cfg: EnvCfg) -> dict[str, Term]:
-    """Returns the task's lenses by name. Each only delays, by an amount that is given at the start."""
+    """Returns lenses for the task's cameras, by name. Each only delays its pictures, by an amount set at the start."""
     plain = {name: term.made.camera for name, term in cfg.sensors.items() if isinstance(term.made, Lens)}
     cameras = plain or {f"lens_{camera}": camera for camera in cfg.scene.cameras}
     return {name: Term(images.Lens, params={"camera": camera, "delay": (0, LATEST)}) for name, camera in cameras.items()}
 
 
 def prepared(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with one look for all episodes, and with everything that sweeps can show."""
+    """Returns the task with one look for all episodes, and with everything that the sweeps change."""
     whole = seeing.randomized(cfg)
     scene = dataclasses.replace(whole.scene, patterns=seeing.PATTERNS)
     sensors = {name: term for name, term in cfg.sensors.items() if not isinstance(term.made, Lens)}
@@ -45,7 +45,7 @@ def prepared(cfg: EnvCfg) -> EnvCfg:
 
 
 def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Look]]]:
-    """Parameter -> (value, look) of a task with cameras; empty for one without."""
+    """Returns (value, look) by parameter for a task with cameras; empty for one without."""
     if not cfg.scene.cameras:
         return {}
     look, objects = seeing.randomized(cfg).look, tuple(cfg.scene.objects)
@@ -92,7 +92,7 @@ def _with(term: Term, params: Mapping[str, Any]) -> Term:
 
 
 def _wide(term: Term, width: float) -> Term:
-    """A term with its ranges ``width`` times as wide about what the model has; no share grows beyond 1."""
+    """Returns a term with its ranges ``width`` times as wide about the model's values; no share exceeds 1."""
     return _with(term, {name: _range(name, value, width) for name, value in term.params.items()})
 
 

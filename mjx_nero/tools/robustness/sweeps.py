@@ -1,4 +1,4 @@
-"""The sweeps: one parameter at a time, and all at once as the preset ``sim2real`` draws them."""
+"""The sweeps: one parameter at a time, and all at once as in the preset ``sim2real``."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ class Point:
     """One setting of the world.
 
     Attributes:
-        terms: of randomization, with ranges of no width; or, of all at once, with the preset's.
-        delay: of the actions [control steps], the least and the most.
-        offset: of where objects are seen, along each axis at most [m].
-        look: what the world looks like, in a task with cameras.
+        terms: randomization terms, with ranges of zero width, or scaled ranges of the preset for all at once.
+        delay: minimum and maximum delay of the actions [control steps].
+        offset: maximum error of observed object positions along each axis [m].
+        look: look of the world, for a task with cameras.
     """
 
     terms: Mapping[str, Term] = dataclasses.field(default_factory=dict)
@@ -29,7 +29,7 @@ class Point:
     look: seen.Look = seen.Look()
 
 
-# Parameter -> (term of the preset, its parameter, values). The object is the first of the scene.
+# Parameter -> (the preset's term, its parameter, values). {object} is the scene's first object.
 _FIELDS = {
     "object mass [factor]": ("{object}_mass", "scale", (0.5, 1.0, 2.0, 4.0, 8.0)),
     "object size [factor]": ("{object}_size", "scale", (0.8, 0.9, 1.0, 1.15, 1.3)),
@@ -48,12 +48,12 @@ LONGEST = max(_DELAYS)
 
 
 def varied(cfg: EnvCfg) -> EnvCfg:
-    """The task with all that the preset ``sim2real`` varies."""
+    """Returns the task with everything that the preset ``sim2real`` randomizes."""
     return sim2real.randomized(cfg)
 
 
 def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Point]]]:
-    """Parameter -> (value, setting), of those that a task has; and all at once, over widths of the preset's ranges."""
+    """Returns (value, setting) by parameter, for the parameters that a task has, and for all at once over the ranges' width."""
     terms, things = varied(cfg).randomization, list(cfg.scene.objects)
     out: dict[str, list[tuple[float, Point]]] = {}
     for name, (term, parameter, values) in _FIELDS.items():
@@ -61,14 +61,14 @@ def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Point]]]:
             out[name] = [(v, Point({term: _only(terms[term], {parameter: (v, v)})})) for v in values]
     out |= {name: [(value, Point(look=look)) for value, look in points] for name, points in seen.sweeps(cfg).items()}
     out["action delay [control steps]"] = [(steps, Point(delay=(steps, steps))) for steps in _DELAYS]
-    if things and not cfg.scene.cameras:  # who sees is not told
+    if things and not cfg.scene.cameras:  # a task with cameras is not told positions
         out["objects seen off by [m]"] = [(offset, Point(offset=offset)) for offset in _OFFSETS]
     out[ALL] = [(width, _wide(terms, width)) for width in (0.0, 0.5, 1.0, 1.5)]
     return out
 
 
 def _only(term: Term, params: dict[str, Any]) -> Term:
-    """A term that draws these parameters and leaves the others as they are."""
+    """Returns a term that draws these parameters and leaves the others unchanged."""
     neutral = {name: _narrow(name, value, 0.0) for name, value in term.params.items()}
     if "spin" in neutral:  # of contacts, absolute
         neutral |= {"slide": neutral["slide"], "spin": None, "roll": None}
@@ -76,7 +76,7 @@ def _only(term: Term, params: dict[str, Any]) -> Term:
 
 
 def _wide(terms: Mapping[str, Term], width: float) -> Point:
-    """All of the preset's ranges, ``width`` times as wide about what the model has."""
+    """Returns all of the preset's ranges, ``width`` times as wide about the model's values."""
     narrowed = {
         name: dataclasses.replace(term, params={key: _narrow(key, value, width) for key, value in term.params.items()})
         for name, term in terms.items()
@@ -87,7 +87,7 @@ def _wide(terms: Mapping[str, Term], width: float) -> Point:
 
 
 def _narrow(name: str, value: Any, width: float) -> Any:
-    """A parameter's range about 1 (about 0, where it begins there)."""
+    """Scales a parameter's range about 1, or about 0 if it begins there."""
     if name in ("spin", "roll") or not isinstance(value, tuple | float) or isinstance(value, tuple) and isinstance(value[0], str):
         return value
     if isinstance(value, float):

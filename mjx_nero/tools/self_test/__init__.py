@@ -1,4 +1,4 @@
-"""The self-test that ends an import: seconds of physics that show whether the robot does what its files claim."""
+"""The self-test at the end of an import: a few seconds of simulation that show whether the robot does what its files claim."""
 
 from mjx_nero.tools.self_test.checks import TRIES as TRIES
 from mjx_nero.tools.self_test.checks import run as run

@@ -1,4 +1,4 @@
-"""The checks: the gripper's ends, the home pose, and what the script makes of the cube."""
+"""The checks: the gripper's limits, the home pose, and tries of a script that picks and places a cube."""
 
 import time
 from collections.abc import Sequence
@@ -29,16 +29,16 @@ from mjx_nero.tools.self_test.result import Result
 from mjx_nero.types import View
 
 TRIES = 8
-MOST_JOINTS = 16  # of an arm, whose inverse kinematics compiles within seconds
-DEEP = 0.005  # [m] shapes that lie no deeper within one another may do so because they are wider than the links
-FULL = 0.5  # share of a movement with all effort, from which on that is why it ends early
-SLOW = 0.5  # [s] a drive that lags so far behind its target does not get there in time
-AWAY = 0.01  # [m] a hand that is further from where it ought to be at a phase's end has not got there, a cube has been pushed
-EMPTY = 0.02  # of the fingers' way: nearer to closed there is nothing between them
+MOST_JOINTS = 16  # maximum joints of an arm, so that its inverse kinematics compiles within seconds
+DEEP = 0.005  # [m] overlap that is ignored, because shapes may be wider than their links
+FULL = 0.5  # share of a movement at the effort limit from which on that limit is why it ends early
+SLOW = 0.5  # [s] a drive that lags more than this does not arrive in time
+AWAY = 0.01  # [m] a hand farther from its place at the end of a phase has not arrived; a cube that moved more was pushed
+EMPTY = 0.02  # share of the fingers' travel: fingers closer to closed hold nothing
 REACHED = 0.01  # [m]
-SETTLED, LONGEST = 3.0, 30.0  # [s] after the set-point has arrived, and of a try at most
-ANY_TURN, FREE = 4.0, 0.005  # [rad, m/rad] tolerance and weight of the hand's turn, where the position counts
-# What is seen of tries that fail in a phase of the script, and what to look at then.
+SETTLED, LONGEST = 3.0, 30.0  # [s] waiting time after the set-point has arrived; maximum time of a try
+ANY_TURN, FREE = 4.0, 0.005  # [rad, m/rad] tolerance and weight of the hand's orientation, if only its position matters
+# What was observed in tries that fail in a phase of the script, and what to look at then.
 PUSHED = "the hand pushes the cube away before it closes: look at ee, down and opening"
 SEEN = {
     "above pick": "the hand stays {away:.0f} mm from its place over the cube: look at pick and home",
@@ -51,7 +51,7 @@ SEEN = {
 
 
 def run(robot: RobotCfg, tries: int = TRIES) -> Result:
-    """Tests a robot for some seconds, in MuJoCo's C library. JAX computes on the CPU, for which programs compile sooner."""
+    """Tests a robot for some seconds, in MuJoCo's C library. JAX uses the CPU, for which it compiles faster."""
     begun = time.monotonic()
     with jax.default_device(jax.devices("cpu")[0]):
         tried = _tried(robot, tries)
@@ -65,7 +65,7 @@ def run(robot: RobotCfg, tries: int = TRIES) -> Result:
 
 
 def _gripper(robot: RobotCfg) -> str:
-    """Finds where the gripper stops before one of its ends."""
+    """Says where the gripper stops before one of its limits, and why; empty if it does not."""
     lags = dict(zip(robot.gripper.joints, robot.gripper.lead, strict=True))
     sim = SimCfg().finer(robot.max_step)
     bounds.check(sim)
@@ -74,7 +74,7 @@ def _gripper(robot: RobotCfg) -> str:
             continue
         why = "look at the range, the speed and the gains of its joint"
         if move.saturation > FULL:
-            why = "its drive pushes with all its effort: look at that, and at the joint's damping and friction"
+            why = "its drive is at its effort limit: look at that limit, and at the joint's damping and friction"
         elif lags[move.joint] > SLOW:
             why = f"its drive lags by {lags[move.joint]:.2g} s, damping over stiffness: look at tune-gains"
         return f"the gripper stops at {move.end:.3g} of {move.target:.3g} (joint {move.joint!r}): {why}"
@@ -82,7 +82,7 @@ def _gripper(robot: RobotCfg) -> str:
 
 
 def _home(robot: RobotCfg) -> str:
-    """Finds what touches in the home pose."""
+    """Says which parts touch in the home pose; empty if none do."""
     model = scene.build(robot, SceneCfg(objects={}), SimCfg(), visuals=False)
     data = mujoco.MjData(model)
     for joint, position in zip(robot.joints, robot.home, strict=True):
@@ -97,7 +97,7 @@ def _home(robot: RobotCfg) -> str:
 
 
 def _tried(robot: RobotCfg, tries: int) -> dict[str, Any]:
-    """Selects the part of a result that is about the tries."""
+    """Runs the tries; returns their fields of a result."""
     none = {"script": "", "tries": 0, "good": 0, "placed": 0, "failures": {}}
     if len(robot.arm.joints) > MOST_JOINTS:
         return {**none, "reason": f"no try: an arm of more than {MOST_JOINTS} joints"}
@@ -114,7 +114,7 @@ def _tried(robot: RobotCfg, tries: int) -> dict[str, Any]:
 
 
 class _Goer:
-    """Goes straight to where inverse kinematics puts the goal, whichever way the hand is turned, at the drives' speed limits."""
+    """Moves straight to the inverse kinematics solution of the goal, with any orientation, at the drives' speed limits."""
 
     def __init__(self, robot: RobotCfg, dt: float):
         self._n, self._step = len(robot.arm.joints), np.array(robot.arm.speed, np.float32) * dt
@@ -123,12 +123,12 @@ class _Goer:
         self.seconds = min(SETTLED + float(np.max((high - low) / robot.arm.speed)), LONGEST)
 
     def init(self, view: View) -> tuple[Array, Array]:
-        """The set-point, and where it has to go [rad or m]."""
+        """Returns the set-point and its goal [rad or m]."""
         q = view.joint_pos[: self._n]
         return q, self._ik.solve(view.goal_pos_w, view.goal_quat_w, q, jax.random.PRNGKey(0)).q
 
     def step(self, memory: tuple[Array, Array], view: View) -> tuple[tuple[Array, Array], Array]:
-        """Targets of the arm's drives; the gripper's stay."""
+        """Moves the targets of the arm's drives; the gripper's stay."""
         q, goal = memory
         q = rate_limit(goal, q, step=jnp.asarray(self._step))
         return (q, goal), jnp.concatenate([q, view.ctrl[self._n :]])
@@ -139,10 +139,10 @@ class _Goer:
 
 
 def _reaches(cfg: EnvCfg, tries: int, reason: str) -> dict[str, Any]:
-    """Tries of an arm that does not grasp: to points of its workspace."""
+    """Tries to reach points of the workspace, for an arm that cannot grasp."""
     robot, dt = cfg.robot, cfg.sim.dt * cfg.sim.decimation
     box = robot.workspace or robot.pick
-    assert box is not None  # follow_target asks for it
+    assert box is not None  # follow_target requires it
     goals, goer = _drawn(box, tries), _Goer(robot, dt)
 
     def watch(memory: Any, view: View) -> dict[str, Array]:
@@ -151,12 +151,12 @@ def _reaches(cfg: EnvCfg, tries: int, reason: str) -> dict[str, Any]:
     away = play(cfg, goer, round(goer.seconds / dt), {}, goals, watch)["away"][-1]
     good = int((away < REACHED).sum())
     if good < tries and not reason:
-        reason = f"it stays up to {1e3 * np.nanmax(away):.0f} mm from the others: look at workspace and at the gains"
+        reason = f"it stops up to {1e3 * np.nanmax(away):.0f} mm from the others: look at workspace and at the gains"
     return {"script": "reach", "tries": tries, "good": good, "placed": 0, "failures": {}, "reason": reason}
 
 
 def _grasps(cfg: EnvCfg, tries: int) -> dict[str, Any]:
-    """Tries of a hand: the cube from where the task puts it to where it belongs."""
+    """Tries to pick up the cube where the task puts it and to place it at the goal."""
     dt, lies, goal = cfg.sim.dt * cfg.sim.decimation, cfg.events["reset_object_position"].params, cfg.command.params
     places, goals = _drawn([lies[k] for k in "xy"], tries), _drawn([goal[k] for k in "xyz"], tries, seed=1)
     script = control.make("pick_place", cfg.robot, dt, cfg.controllers["pick_place"])
@@ -187,18 +187,18 @@ def _grasps(cfg: EnvCfg, tries: int) -> dict[str, Any]:
 
 
 def _drawn(box: Sequence[Range], tries: int, seed: int = 0) -> np.ndarray:
-    """Random points [tries, len(box)] of a box, always the same."""
+    """Draws random points [tries, len(box)] in a box, always the same ones."""
     low, high = np.array(box).T
     return low + (high - low) * np.random.default_rng(seed).random((tries, len(box)))
 
 
 def _failure(seen: dict[str, np.ndarray], ends: np.ndarray, grasped: bool) -> tuple[str, str]:
-    """Describes in which phase a try failed, and what was seen.
+    """Returns the phase in which a try failed, and what was observed.
 
     Args:
         seen: what was watched, [steps, ...].
-        ends: the last step of each phase.
-        grasped: whether the cube has been held at all.
+        ends: last step of each phase.
+        grasped: whether the cube was held at any time.
     """
     away, cube = seen["away"], seen["cube"]
     if grasped:

@@ -1,4 +1,4 @@
-"""A controller's tries in MuJoCo's C library, without the rest of an environment, whose compilation would take longer."""
+"""Plays a controller in MuJoCo's C library, without the rest of an environment, which takes longer to compile."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -28,16 +28,16 @@ def play(
     goals: Float[np.ndarray, "n 3"],
     watch: Watch,
 ) -> dict[str, np.ndarray]:
-    """Tries side by side, from home on.
+    """Plays several tries side by side, starting from home.
 
     Args:
-        steps: control steps.
-        places: object -> where it lies on the table, in the world [m].
-        goals: in the robot's frame, where they stay [m].
+        steps: number of control steps.
+        places: object -> its positions on the table, in the world [m].
+        goals: fixed goals in the robot's frame [m].
         watch: (controller's memory, view) -> what to keep of each control step.
 
     Returns:
-        What was watched, [steps, n, ...]. A try that became non-finite has NaN, False or 0 from there on.
+        what was watched, [steps, n, ...]. A try that became non-finite has NaN, False or 0 from then on.
     """
     model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False)
     command, parts = dataclasses.replace(cfg.command, motion=None), scene.parts(cfg.scene, model)
@@ -73,7 +73,7 @@ def play(
 
 
 def _start(model: mujoco.MjModel, cfg: EnvCfg, places: Mapping[str, Float[np.ndarray, "2"]]) -> mujoco.MjData:
-    """The robot at home, its linkages closed, and the objects in their places."""
+    """Returns the robot at home with its linkages closed, and the objects in their places."""
     data = mujoco.MjData(model)
     for joint, position in zip(cfg.robot.joints, cfg.robot.home, strict=True):
         data.joint(joint).qpos = position
@@ -85,7 +85,7 @@ def _start(model: mujoco.MjModel, cfg: EnvCfg, places: Mapping[str, Float[np.nda
 
 
 def _sim(data: list[mujoco.MjData]) -> Sim:
-    """The state of all tries; of one that MuJoCo had to reset it is NaN."""
+    """Returns the states of all tries, NaN for a try that MuJoCo had to reset."""
     lost = np.array([any(w.number for w in one.warning) for one in data])
     qpos, qvel, ctrl = (jnp.asarray([getattr(one, name) for one in data], jnp.float32) for name in ("qpos", "qvel", "ctrl"))
     qpos = jnp.where(lost[:, None], jnp.nan, qpos)

@@ -6,17 +6,17 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """The measurements of a self-test in physics.
+    """The results of a self-test in simulation.
 
     Attributes:
-        gripper: whether it opens and closes to the ends that it claims: empty, or where it stops and why.
-        home: what touches there: empty, or the pairs.
-        script: what the tries are of: ``pick_place``, ``reach`` (without a gripper that can grasp), or empty.
-        tries: how many; of these ``good`` grasped the cube, or got there, and ``placed`` put it where it belongs.
-        failures: phase of the script -> tries that failed there.
-        reason: why there were no tries, or what was seen where most of them failed and what to look at.
-        has_gripper: whether there is one to test.
-        seconds: that the test took.
+        gripper: where the gripper stops before its declared limits, and why; empty if it reaches them.
+        home: what touches in the home pose; empty if nothing does.
+        script: what was tried: ``pick_place``, ``reach`` (without a gripper that can grasp), or empty.
+        tries: number of tries, of which ``good`` grasped the cube or reached the goal, and ``placed`` put the cube at the goal.
+        failures: phase of the script -> number of tries that failed in it.
+        reason: why there were no tries; or what was observed in the phase where most tries failed, and what to look at.
+        has_gripper: whether the robot has a gripper.
+        seconds: time that the test took.
     """
 
     gripper: str

@@ -1,7 +1,7 @@
-"""Gains for a robot's drives from its own model: python -m mjx_nero tune-gains --robot nero --out gains.yaml --plot gains.png
+"""Proposes gains for a robot's drives: python -m mjx_nero tune-gains --robot nero --out gains.yaml --plot gains.png
 
-In MuJoCo's C library, without contacts and without a limit on the targets' speed: the drives themselves are seen. ``proposal``
-says how gains are chosen, from the ``load`` that each drive has to move; ``response`` shows what they do with it.
+The simulation uses MuJoCo's C library, without contacts and without a limit on the targets' speed, so that it shows the drives
+alone. ``proposal`` chooses gains for the ``load`` that each drive has to move; ``response`` measures step responses.
 """
 
 from mjx_nero.identify.load import Load, loads

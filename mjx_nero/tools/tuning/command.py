@@ -16,23 +16,26 @@ from mjx_nero.tools.tuning.report import save_gains, save_plot, table
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = cli.Parser(
-        "tune-gains", "Proposes stiffness and damping for a robot's drives, and shows the step responses before and after."
+        "tune-gains", "Proposes stiffness and damping for a robot's drives, and shows step responses before and after."
     )
     parser.add_load()
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
-    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="YAML of the gains, for import-urdf --gains")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="picture of the step responses")
+    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="write the gains as YAML, for import-urdf --gains")
+    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write a picture of the step responses")
     parser.add_argument(
         "--step",
         type=cli.positive_float,
         default=0.1,
-        help="step of the target [rad or m], within the drives' effort and a tenth of a joint's range (default: %(default)s)",
+        help="step of the target that the drives must follow within their effort [rad or m]; at most a tenth of a joint's range "
+        "(default: %(default)s)",
     )
     parser.add_argument(
-        "--frequency", type=cli.positive_float, help="bound of the natural frequency [Hz] (default: one radian per control step)"
+        "--frequency", type=cli.positive_float, help="maximum natural frequency [Hz] (default: one radian per control step)"
     )
     parser.add_argument("--dt", type=cli.positive_float, default=SimCfg.dt, help="physics step [s] (default: %(default)s)")
-    parser.add_argument("--gravity-compensation", action=argparse.BooleanOptionalAction, help="override the robot's own setting")
+    parser.add_argument(
+        "--gravity-compensation", action=argparse.BooleanOptionalAction, help="override the robot's gravity compensation"
+    )
     args, _ = parser.parse(argv)
     for path in filter(None, (args.out, args.plot)):
         files.check_writable(path)

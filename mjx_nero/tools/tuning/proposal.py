@@ -1,20 +1,21 @@
-"""Gains for all drives of a robot.
+"""Proposes gains for all drives of a robot.
 
-How the gains are chosen, for each drive:
+The gains of each drive are chosen as follows:
 
-- Inertia: the diagonal of the joint-space inertia matrix (armature included) over random poses within the joint limits. That is
-  what a joint turns while the drives of the others hold theirs. The inverse of the inverse's diagonal, what it turns while the
-  others swing freely, is smaller, so damping for the former never turns out too little. Of the poses the 95th percentile counts.
-- Stiffness: the largest that both allow. A step of the target by ``step`` asks for less than the effort that the largest gravity
-  load leaves, and the natural frequency stays below one radian a control step: a faster drive would follow every stair of targets
-  that change only so often. (A drive at its limit does not damp, and a light joint then jumps within one physics step.)
-- Damping: a damping ratio of 0.8 (1.5% overshoot) at that inertia, so critical at 64% of it and more than critical below: no
-  pose overshoots by much, and the light ones are not slowed for the sake of the heaviest. On top comes stiffness x step;
-  ``sim.gains`` says why.
+- Inertia: the diagonal of the joint-space inertia matrix (armature included) over random poses within the joint limits, at the
+  95th percentile of the poses. A joint moves this inertia while the other drives hold their joints. While the others swing
+  freely, it moves less (the inverse of the inverse's diagonal), so damping for the former is always enough.
+- Stiffness: the largest value that two limits allow. A target step of ``step`` needs less than the effort that the largest
+  gravity load leaves. The natural frequency stays below one radian per control step, because a faster drive would follow every
+  stair of targets that change once per control step. (A drive at its effort limit does not damp, and a light joint then jumps
+  within one physics step.)
+- Damping: a damping ratio of 0.8 (1.5% overshoot) at that inertia, which is critical at 64% of it and overcritical below. No
+  pose overshoots much, and light poses are not slowed for the heaviest one. Stiffness x physics step is added; see
+  ``sim.gains``.
 
-At home and in random poses no joint of the package's own arms then overshoots by 2%, nor meets its effort limit.
+With these gains no joint of the package's own arms overshoots by 2% or reaches its effort limit, at home and in random poses.
 
-A gripper's stiffness also sets how hard it grips at a given target: look at that before taking its gains over.
+A gripper's stiffness also sets how hard it grips at a given target: check that before you use its gains.
 """
 
 import dataclasses
@@ -30,17 +31,17 @@ from mjx_nero.sim.gains import critical_damping
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SimCfg
 
-_RATIO = 0.8  # damping ratio at the heaviest pose that counts
-_RESERVE = 0.99  # of the effort, for the step: the limit itself is never met
+_RATIO = 0.8  # damping ratio in the 95th percentile pose
+_RESERVE = 0.99  # share of the spare effort that a step may use, so that the limit is never reached
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """Gains and responses before and after; tuples run along the robot's joints.
+    """Gains and step responses before and after; tuples have one entry per joint of the robot.
 
     Attributes:
-        robot, tuned: the robot with its gains, and with the proposed ones.
-        loads: what the drives have to move.
+        robot, tuned: the robot with its own gains, and with the proposed ones.
+        loads: loads that the drives have to move.
         before, after: step responses at home.
     """
 
@@ -55,8 +56,8 @@ def tune(robot: RobotCfg, step: float = 0.1, frequency: float | None = None, sim
     """Proposes gains for all drives of a robot, and measures its step responses with both.
 
     Args:
-        step: of the target, that the drives answer within their effort [rad or m]; at most a tenth of a joint's range.
-        frequency: bound of the natural frequency [Hz]; None: one radian a control step.
+        step: step of the target that the drives follow within their effort [rad or m]; at most a tenth of a joint's range.
+        frequency: maximum natural frequency [Hz]; None: one radian per control step.
         sim: physics and control step.
 
     Raises:
@@ -88,11 +89,11 @@ def tune(robot: RobotCfg, step: float = 0.1, frequency: float | None = None, sim
 
 
 def propose(load: Load, step: float, frequency: float, dt: float) -> tuple[float, float]:
-    """(stiffness [N m/rad or N/m], damping [N m s/rad or N s/m]); the module says why.
+    """Returns (stiffness [N m/rad or N/m], damping [N m s/rad or N s/m]); the module's docstring says how they are chosen.
 
     Args:
-        step: of the target, that the drive answers within its effort [rad or m].
-        frequency: bound of the natural frequency [Hz].
+        step: step of the target that the drive follows within its effort [rad or m].
+        frequency: maximum natural frequency [Hz].
         dt: physics step [s].
 
     Raises:
@@ -101,7 +102,7 @@ def propose(load: Load, step: float, frequency: float, dt: float) -> tuple[float
     spare = load.effort - load.gravity
     if spare <= 0:
         raise UserError(
-            f"{load.joint}: gravity asks up to {load.gravity:.3g} of a drive limited to {load.effort:.3g}: "
+            f"{load.joint}: gravity needs up to {load.gravity:.3g} from a drive limited to {load.effort:.3g}: "
             "raise its effort, or let the robot compensate gravity"
         )
     critical = _RATIO**2 * load.heavy  # the inertia that is damped critically
@@ -110,7 +111,7 @@ def propose(load: Load, step: float, frequency: float, dt: float) -> tuple[float
 
 
 def gains(robot: RobotCfg) -> dict[str, dict[str, float]]:
-    """Joint -> stiffness, damping, effort and speed, to three significant digits: what ``import-urdf --gains`` takes."""
+    """Returns stiffness, damping, effort and speed by joint, to three significant digits, for ``import-urdf --gains``."""
     out = {}
     for drive in (robot.arm, robot.gripper):
         for i, joint in enumerate(drive.joints):

@@ -1,4 +1,4 @@
-"""Gains and step responses, before and after: tables, a picture, a file."""
+"""Reports gains and step responses before and after: tables, a picture, a file."""
 
 import math
 import pathlib
@@ -12,7 +12,7 @@ from mjx_nero.tools.tuning.proposal import Tuning, gains
 
 
 def table(tuning: Tuning) -> tuple[Table, Table]:
-    """The gains, and the step responses; before -> after."""
+    """Makes tables of the gains and of the step responses, before -> after."""
     columns = ("joint", "inertia [kg m2, kg]", "gravity", "effort", "stiffness", "damping", "sag [mrad, mm]")
     chosen = Table(f"gains of {tuning.robot.name}", columns)
     columns = ("joint", "step [mrad, mm]", "rise [s]", "overshoot [%]", "settled [s]", "error", "saturated [%]")
@@ -48,7 +48,7 @@ def _change(before: float, after: float, form: str) -> str:
 
 
 def plot(tuning: Tuning, figure) -> None:
-    """One panel a joint on a matplotlib figure: the way, as a share of the step, before and after."""
+    """Plots the joint positions as a share of the step, before and after, in one panel per joint of a matplotlib figure."""
     n = len(tuning.before)
     columns = min(4, n)
     panels = figure.subplots(math.ceil(n / columns), columns, squeeze=False, sharey=True).ravel()

@@ -1,1 +1,1 @@
-"""The command ``view``: environments in a browser, moving and to be moved."""
+"""The command ``view``: shows environments in a browser and lets the user take part."""

@@ -1,4 +1,4 @@
-"""Agents of a viewed environment: policies, controllers, and the user's own hand on the joints."""
+"""Agents of a viewed environment: policies, controllers, and the user."""
 
 import pathlib
 from collections.abc import Callable, Mapping
@@ -20,14 +20,14 @@ Make = Callable[[], rollout.Agent]
 
 
 def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], preset: str = "default") -> dict[str, Make]:
-    """Lists all agents, each with a function that makes it: policies from files, the bundled one, controllers and sliders."""
+    """Lists all agents by name, each with a function that makes it: policies, controllers, sliders, the user's hand."""
     found: dict[str, Make] = {}
     shipped = bundled.shipped(env_name, preset)
     for path in [*policies, *([shipped] if shipped.is_file() else [])]:
         name = f"policy {path.stem}" if path == shipped else f"policy {path}"
         found[name] = lambda path=path: of_policy(policy.load_for(env, env_name, path))  # type: ignore[misc]
     able: dict[str, Mapping[str, Any]] = dict(env.cfg.controllers)
-    if not able and env.cfg.scene.goal == "frame":  # a pose is commanded, which is all that a follower asks for
+    if not able and env.cfg.scene.goal == "frame":  # a commanded pose is all that a follower needs
         able["ik"] = {}
         if (env.cfg.robot.xml.parent / "rmpflow").is_dir():
             able["rmpflow"] = {}
@@ -43,17 +43,17 @@ def known(env: ManipulationEnv, env_name: str, policies: list[pathlib.Path], pre
 
 
 def of_policy(trained: policy.Policy) -> rollout.Agent:
-    """Deterministic."""
+    """Makes a deterministic agent of a policy."""
     return rollout.policy_agent(lambda params, obs, key: trained.act(obs))
 
 
 def of_controller(env: ManipulationEnv, controller: control.Controller) -> rollout.Agent:
-    """Lets a controller act in any environment, through the action that gives its drive targets."""
+    """Makes an agent of a controller in any environment, by inverting its drive targets into actions."""
     return rollout.through_actions(env, rollout.controller_agent(env, controller))
 
 
 def of_targets(env: ManipulationEnv) -> rollout.Agent:
-    """Takes the drives' position targets [joints] as its parameters."""
+    """Makes an agent whose parameters are the drives' position targets [joints]."""
 
     def act(targets, memory, state, key):
         wanted = jnp.broadcast_to(targets, (state.done.shape[0], *targets.shape))
@@ -63,7 +63,7 @@ def of_targets(env: ManipulationEnv) -> rollout.Agent:
 
 
 def _joint_pos(env: ManipulationEnv, state: State) -> jax.Array:
-    """Joint positions of each environment [n, joints]."""
+    """Returns the joint positions of each environment [n, joints]."""
     return jax.vmap(lambda each: env.view(each).joint_pos)(state)
 
 
@@ -72,7 +72,7 @@ def _always(draw: Callable) -> rollout.Agent:
 
 
 def newest(run: pathlib.Path) -> pathlib.Path | None:
-    """The last policy or checkpoint that a training has written into its folder."""
+    """Returns the newest policy or checkpoint in a run's folder; None if there is none."""
     last = files.inside(run, POLICY)
     found = [*([last] if last.is_file() else []), *saved(run)]
     return max(found, key=lambda path: (path.stat().st_mtime, path.name), default=None)

@@ -1,4 +1,4 @@
-"""The door before a page's server: who comes in has the token of the printed address, and comes from that address."""
+"""A proxy that guards a page's server: it lets in only requests with the printed token, from the printed address."""
 
 import asyncio
 import contextlib
@@ -18,10 +18,10 @@ from mjx_nero.types import UserError
 if TYPE_CHECKING:
     from mjx_nero.tools.view import inner
 
-PATIENCE_S = 10.0  # for a request's head
-GUESTS = 64  # at a time who still stand before the door, and as many behind it
-PORTS = 100  # that are tried
-RATE = 1 << 18  # bytes a second that a page may send
+PATIENCE_S = 10.0  # time limit for a request's head
+GUESTS = 64  # maximum number of connections that wait for admission, and of admitted ones
+PORTS = 100  # number of ports to try
+RATE = 1 << 18  # bytes per second that a page may send
 _LOCAL = ("localhost", "127.0.0.1", "[::1]")
 _ANSWER = (
     "HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {length}\r\nX-Frame-Options: DENY\r\n"
@@ -31,12 +31,12 @@ _STRANGER = "Open the address that the program printed, with its token.\n"
 
 
 def open_page(host: str, port: int) -> "tuple[inner.Inner, Door]":
-    """Opens a page's server and the door before it (see ``Door``).
+    """Opens a page's server and its ``Door``.
 
     Raises:
-        UserError: the address cannot be listened at, or viser cannot be served so.
+        UserError: the program cannot listen on the address, or this version of viser cannot be served.
     """
-    from mjx_nero.tools.view import inner  # which needs viser
+    from mjx_nero.tools.view import inner  # needs viser
 
     page = inner.Inner()
     try:
@@ -47,29 +47,29 @@ def open_page(host: str, port: int) -> "tuple[inner.Inner, Door]":
 
 
 class Door:
-    """Listens at ``host:port`` and lets through, to a server on this machine, requests with the token: it comes with the address
-    once, a cookie keeps it.
+    """Listens on ``host:port`` and passes requests with the token to a server on this machine. The first request has the token
+    in its address; after that a cookie holds it.
 
-    Browsers say which address they mean (Host) and which page asks (Origin). Both have to be this one's, so that neither another
-    page that the user has open comes in, nor one whose name is made to lead here (DNS rebinding). What comes in is not encrypted:
-    use it in a network that you trust, or a tunnel.
+    Browsers name the address that they request (Host) and the page that makes the request (Origin). Both must be this page's.
+    This keeps out other pages that the user has open, and pages whose name resolves to this machine (DNS rebinding). Traffic is
+    not encrypted: use it in a network that you trust, or through a tunnel.
 
     Args:
-        host: to listen at. With one of the whole network, addresses and this machine's name are its own as well.
-        port: the first free one from here on; 0: any.
+        host: address to listen on. If it is not local, IP addresses and this machine's name are accepted as well.
+        port: first port to try; 0: any free port.
         behind: Unix socket of the server.
 
     Attributes:
-        url: to open, with the token.
+        url: address to open, with the token.
 
     Raises:
-        UserError: the address cannot be listened at.
+        UserError: the program cannot listen on the address.
     """
 
     def __init__(self, host: str, port: int, behind: pathlib.Path):
         self.token, self._behind = secrets.token_urlsafe(16), behind
         self._waiting: dict[asyncio.StreamWriter, None] = {}
-        self._open: set[asyncio.Task | None] = set()  # the loop alone would forget who waits for the server behind
+        self._open: set[asyncio.Task | None] = set()  # the event loop itself keeps only weak references
         self._inside = 0
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(lambda _, context: LOG.warning("the door: %s", context["message"]))
@@ -77,12 +77,12 @@ class Door:
             self._server = self._loop.run_until_complete(self._listen(host, port))
         except OSError as error:
             self._loop.close()
-            raise UserError(f"cannot listen at {host}:{port}: {error.strerror or error}; pass another --host or --port") from None
+            raise UserError(f"cannot listen on {host}:{port}: {error.strerror or error}; pass another --host or --port") from None
         self.port = self._server.sockets[0].getsockname()[1]
-        self._cookie = f"mjx_nero_view_{self.port}"  # cookies do not tell ports apart
+        self._cookie = f"mjx_nero_view_{self.port}"  # cookies are shared by all ports
         self._everywhere = not _is_local(host)
         name = socket.gethostname() if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
-        # The name localhost may lead to another address of this machine, where another user listens.
+        # The name localhost may resolve to another address of this machine, where another user listens.
         self.url = f"http://{'127.0.0.1' if name == 'localhost' else name}:{self.port}/?token={self.token}"
         self._names = {name.lower(), *_LOCAL, *([socket.gethostname().lower()] if self._everywhere else [])}
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -126,17 +126,17 @@ class Door:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._waiting[writer] = None
-        if len(self._waiting) > GUESTS:  # whoever says nothing for long goes first
+        if len(self._waiting) > GUESTS:  # drop the connection that has waited longest
             longest = next(iter(self._waiting))
             del self._waiting[longest]
             longest.transport.abort()
         try:
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
             asked = request.parse(head)
-        except TimeoutError:  # browsers connect ahead: an answer before the request would become the page
+        except TimeoutError:  # browsers connect in advance and would show an answer before the request as the page
             return
         except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
-            await _answer(reader, writer, "400 Bad Request", "This is no request for a page.\n")
+            await _answer(reader, writer, "400 Bad Request", "This is not a request for a page.\n")
             return
         if not self._is_mine(asked):
             await _answer(reader, writer, "403 Forbidden", _STRANGER)
@@ -145,12 +145,12 @@ class Door:
         elif set(asked.query) == {"token"} and self._knows(asked.query["token"]):
             cookie = f"Set-Cookie: {self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/\r\n"
             await _answer(reader, writer, "303 See Other", "", f"Location: /\r\n{cookie}")
-        else:  # also with other queries: by some of them viser's page would talk to a server of somebody else's
+        else:  # also other queries: some make viser's page talk to another server
             await _answer(reader, writer, "403 Forbidden", _STRANGER)
 
     def _is_mine(self, asked: request.Request) -> bool:
-        """True if a request means this address, and comes from it."""
-        known = asked.host in self._names or (self._everywhere and _is_address(asked.host))  # no name leads to an address
+        """Returns whether a request is for this address and comes from it."""
+        known = asked.host in self._names or (self._everywhere and _is_address(asked.host))  # an IP address cannot be rebound
         return known and asked.own_origin
 
     def _knows(self, given: str) -> bool:
@@ -166,7 +166,7 @@ class Door:
             inner, outer = await asyncio.open_unix_connection(self._behind)
             outer.write(asked.head())
             ways = [asyncio.create_task(_pump(inner, writer))]
-            if asked.upgrades:  # else there is no more to say
+            if asked.upgrades:  # otherwise the client sends nothing more
                 ways.append(asyncio.create_task(_pump(reader, outer, RATE)))
             try:
                 await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
@@ -180,7 +180,7 @@ class Door:
 
 
 async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: str, text: str, more: str = "") -> None:
-    """Answers, and reads on for a moment: what lies unread would throw the answer away."""
+    """Answers, and reads on for a moment, because closing with unread data would discard the answer."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(1.0):
             writer.write(_ANSWER.format(status=status, length=len(text), more=more, text=text).encode())

@@ -1,4 +1,5 @@
-"""A gamepad in the browser that steers the hand: a script in the page reports its state, which becomes motion here."""
+"""Steers the hand by a gamepad in the browser: a script in the page reports the gamepad's state, and this module moves the
+hand."""
 
 import functools
 import gzip
@@ -12,15 +13,16 @@ from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.log import LOG
 from mjx_nero.tools.view.orders import Orders
 
-PATH = "/gamepad"  # of its websocket
-RATE = 20  # messages a second
-SPEED, TURN = 0.15, 60.0  # [m/s], [degrees/s] of a stick that is pushed all the way
-REST = 0.15  # share of a stick's way in which it counts as let go
-# Buttons of the standard layout (W3C, Gamepad, "Remapping"): the four on the right from the lowest on, and the middle left one.
+PATH = "/gamepad"  # path of its websocket
+RATE = 20  # messages per second
+SPEED, TURN = 0.15, 60.0  # [m/s], [degrees/s] at full deflection of a stick
+REST = 0.15  # dead zone, as a share of a stick's range
+# Buttons of the standard layout (W3C, Gamepad, "Remapping"): the right cluster's bottom, right, left and top, and the left one of
+# the center cluster.
 GRIP, BACK, RECORD, SAVE, DISCARD = 0, 1, 2, 3, 8
-HELP = "gamepad: left stick moves the hand, right stick lifts and turns it, A grips, B gives back, X records, Y saves"
+HELP = "gamepad: left stick moves the hand, right stick lifts and turns it, A grips, B hands back control, X records, Y saves"
 
-# The browser tells a page of a gamepad once a button of it is pressed, and only the page that has the focus.
+# A browser reports a gamepad only after one of its buttons was pressed, and only to the page that has the focus.
 _SCRIPT = f"""<script>(() => {{
   let socket = null;
   setInterval(() => {{
@@ -36,7 +38,7 @@ _Axis = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 
 
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
-    """The state of a gamepad: sticks to the right and down, the left one first, and which buttons are pressed."""
+    """The state of a gamepad: right and down of the left stick, then of the right one, and whether each button is pressed."""
 
     axes: tuple[_Axis, _Axis, _Axis, _Axis]
     buttons: Annotated[list[bool], msgspec.Meta(max_length=32)]
@@ -49,8 +51,8 @@ class Gamepad:
     """Steers a hand by the gamepads that pages report.
 
     Args:
-        orders: where it is done.
-        buttons: number of a button -> what a press of it does.
+        orders: thread that carries out the movements.
+        buttons: number of a button -> action of pressing it.
     """
 
     def __init__(self, hand: Hand, orders: Orders, buttons: Mapping[int, Callable[[], None]]):
@@ -58,7 +60,7 @@ class Gamepad:
         self._held: set[int] = set()
 
     def hear(self, raw: bytes) -> None:
-        """Takes a page's message; ignores everything else."""
+        """Handles a page's message; ignores anything that is not a gamepad's state."""
         try:
             said = _DECODER.decode(raw)
         except (msgspec.MsgspecError, RecursionError) as error:
@@ -78,7 +80,7 @@ class Gamepad:
 
 @functools.lru_cache(maxsize=4)
 def with_script(page: bytes) -> bytes:
-    """viser's page with the script in it, packed as it came."""
+    """Adds the script to viser's page, which stays compressed if it was."""
     packed = page[:2] == b"\x1f\x8b"
     text = gzip.decompress(page) if packed else page
     text = text.replace(b"</head>", _SCRIPT.encode() + b"</head>", 1)

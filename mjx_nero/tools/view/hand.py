@@ -1,4 +1,4 @@
-"""A hand on the arm: the user drags or steers the hand, and the session records demonstrations."""
+"""Lets the user drag or steer the robot's hand, and records demonstrations."""
 
 import pathlib
 import threading
@@ -24,16 +24,17 @@ from mjx_nero.tools.view import tape
 from mjx_nero.tools.view.session import Frame, Session
 
 NAME = "your hand"
-STEP = 0.01  # [m] of a key
-TURN = 10.0  # [degrees] of a key
-# Of an arm with few joints the place of the hand counts, and its turn as far as it can.
+STEP = 0.01  # movement per key press [m]
+TURN = 10.0  # rotation per key press [degrees]
+# On an arm with few joints the hand's position has priority over its orientation.
 _IK = IkCfg(orientation_weight=0.03, restarts=0)
 
 
 def agent(env: ManipulationEnv) -> rollout.Agent:
-    """Moves the hand to its parameters: ``pos`` [m], ``quat`` (wxyz), and ``open``, from 0 to 1, at the drives' speed.
+    """Makes an agent that moves the hand to its parameters at the drives' speed: ``pos`` [m], ``quat`` (wxyz), and ``open``,
+    from 0 to 1.
 
-    Of several robots, the first moves and the others stay.
+    If there are several robots, only the first moves.
     """
     robot, ik = env.cfg.robot, InverseKinematics(env.cfg.robot, cfg=_IK)
     n, own, step = len(robot.arm.joints), len(robot.joints), np.array(robot.arm.speed + robot.gripper.speed, np.float32) * env.dt
@@ -45,7 +46,7 @@ def agent(env: ManipulationEnv) -> rollout.Agent:
         moved = rate_limit(jnp.concatenate([arm, fingers]), point[:own], step=jnp.asarray(step))
         return jnp.concatenate([moved, point[own:]])
 
-    def act(asked, points, state, key):  # of their own, as targets may lead joints by much
+    def act(asked, points, state, key):  # its own set-points, because drive targets may be far ahead of the joints
         points = jax.vmap(one, (None, 0))(asked, points)
         return points, points
 
@@ -53,10 +54,10 @@ def agent(env: ManipulationEnv) -> rollout.Agent:
 
 
 class Hand:
-    """The pose that the user wants the hand of a session's robots to have.
+    """The pose to which the user steers the hand of a session's robots.
 
     Args:
-        take_over: called when the user steers; True: somebody else acted till now.
+        take_over: called when the user steers; returns True if another agent acted until then.
     """
 
     def __init__(self, session: Session, take_over: Callable[[], bool]):
@@ -68,13 +69,13 @@ class Hand:
         self.here()
 
     def here(self) -> None:
-        """Makes the present pose the wanted one."""
+        """Makes the current pose the wanted one."""
         pos, quat = self._pose(jnp.asarray(self._session.frame.qpos[0], jnp.float32))
         with self._lock:
             self.pos, self.quat = np.array(pos, float), np.array(quat, float)
 
     def begin(self) -> dict[str, jax.Array]:
-        """Parameters of the agent as it begins: the hand stays where it is, unless the user began by steering it."""
+        """Returns the agent's first parameters: the hand stays where it is, unless steering made the agent begin."""
         if not self._steered:
             self.here()
         self._steered = False
@@ -114,7 +115,7 @@ class Hand:
 
     def _steer(self, change: Callable[[], None]) -> None:
         begins = self._take_over()
-        if begins:  # whoever acts now is given parameters when it begins
+        if begins:  # the new agent takes its parameters when it begins
             self.here()
             self._steered = True
         with self._lock:
@@ -124,11 +125,11 @@ class Hand:
 
 
 class Recording:
-    """Keeps what the first environment of a session does, and writes it as an episode of a data set.
+    """Records the first environment of a session, and writes it as an episode of a data set.
 
     Args:
         out: folder of the data set.
-        env_name, preset, fields: what the session plays.
+        env_name, preset, fields: environment of the session.
     """
 
     def __init__(
@@ -164,10 +165,10 @@ class Recording:
         session.recorders.append(self)
 
     def __call__(self, record: Record) -> None:
-        """Takes a step; the end of the task's episode ends the recording, too."""
+        """Records a step. The end of the task's episode also ends the recording."""
         with self._lock:
             if self.on:
-                before = self._session.frame.qpos[0].astype(np.float32)  # the frame is still that before the step
+                before = self._session.frame.qpos[0].astype(np.float32)  # the frame is still the one before the step
                 one = jax.tree.map(lambda x: np.array(x[0]), record)
                 self._steps.append((before, one))
                 self.on = not one.done
@@ -176,12 +177,12 @@ class Recording:
         return len(self._steps)
 
     def tape(self) -> Iterator[Frame]:
-        """Frames of what was recorded."""
+        """Returns the recorded frames."""
         goals = [np.concatenate([one.scenery.goal_pos_w, one.scenery.goal_quat_w]) for _, one in self._steps]
         return tape.frames(self._session.frame, [qpos.astype(float) for qpos, _ in self._steps], np.array(goals))
 
     def begin(self) -> None:
-        """Starts to record."""
+        """Starts recording."""
         with self._lock:
             self._steps, self.on = [], True
 
@@ -191,7 +192,7 @@ class Recording:
             self._steps, self.on = [], False
 
     def save(self) -> str:
-        """Adds the recording to the data set as a success, as the user says, and prints a line.
+        """Adds the recording to the data set as a success, which the user confirms by saving; returns a line to show.
 
         Raises:
             UserError: nothing was recorded, or it cannot be written.
@@ -208,7 +209,7 @@ class Recording:
         return f"{steps} steps saved; {self._out} has {count} episodes"
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        """Features of the steps, as those of ``demonstrations.Player``."""
+        """Returns the features of the steps, as ``demonstrations.Player`` does."""
         env = self._session.env
         before = np.stack([qpos for qpos, _ in self._steps])
         record: Any = jax.tree.map(lambda *x: np.stack(x), *(one for _, one in self._steps))

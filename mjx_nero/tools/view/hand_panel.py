@@ -1,4 +1,4 @@
-"""Buttons, sliders and keys of the hand, beside the picture."""
+"""Buttons, sliders and keys for the hand, beside the picture."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from mjx_nero.tools.view.hand import NAME, STEP, TURN, Hand, Recording
 from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.panel import Panel
 
-KEYS = (  # key, what it does, how far it shifts the hand
+KEYS = (  # key, its label, by how much it shifts the hand [m]
     ("arrowup", "hand away (x)", (STEP, 0.0, 0.0)),
     ("arrowdown", "hand back (x)", (-STEP, 0.0, 0.0)),
     ("arrowleft", "hand left (y)", (0.0, STEP, 0.0)),
@@ -19,9 +19,9 @@ KEYS = (  # key, what it does, how far it shifts the hand
     ("pagedown", "hand down", (0.0, 0.0, -STEP)),
 )
 
-WHEN = ("when I say", "while I steer")  # the second one: what mends a policy's errors, and nothing that it did itself
+WHEN = ("when I say", "while I steer")  # the second records only the user's corrections, and nothing that the policy does
 
-OWN = (NAME, leader_arm.NAME)  # agents that are the user's own
+OWN = (NAME, leader_arm.NAME)  # agents that the user steers
 
 
 class HandPanel:
@@ -29,8 +29,8 @@ class HandPanel:
 
     Args:
         server: a ``viser.ViserServer``.
-        panel: knows who acts.
-        recording: None: nothing is recorded.
+        panel: its dropdown says which agent acts.
+        recording: recorder of demonstrations; None: there is none.
         leader: lets a leader arm take over; None: there is none.
     """
 
@@ -55,7 +55,7 @@ class HandPanel:
             if leader:
                 self._button("Follow the leader arm (L)", leader)
                 self._key("follow the leader arm", "L", leader)
-            if recording is not None:  # one without steps counts as false
+            if recording is not None:  # a recording without steps counts as false
                 self._when = gui.add_dropdown("Record", WHEN, initial_value=WHEN[0])
                 for label, key, work in self._recorder(recording):
                     self._button(f"{label} ({key})", work)
@@ -80,7 +80,7 @@ class HandPanel:
         )
 
     def take_over(self, name: str = NAME) -> bool:
-        """Lets the hand, or another of the user's agents, act. True if another agent acted until now."""
+        """Lets the hand or another of the user's agents act; returns True if a different agent acted until now."""
         if self._panel.agent.value == name:
             return False
         if self._panel.agent.value not in OWN:
@@ -91,7 +91,7 @@ class HandPanel:
         return True
 
     def give_back(self) -> None:
-        """Lets the agent that acted before act again, for example after the user has corrected a policy."""
+        """Lets the previous agent act again, for example after the user has corrected a policy."""
         if self._panel.agent.value in OWN and self._before not in OWN:
             self._panel.agent.value = self._before
             if self._of_corrections:
@@ -99,7 +99,7 @@ class HandPanel:
 
     @property
     def _of_corrections(self) -> Recording | None:
-        """The recorder, if it records only the user's corrections."""
+        """Returns the recorder if it records only the user's corrections."""
         return self._recording if self._recording is not None and self._when.value == WHEN[1] else None
 
     def _grip(self) -> None:

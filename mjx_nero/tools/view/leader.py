@@ -1,7 +1,7 @@
-"""A leader arm steers the robot: LeRobot's SO-101 leader, which a person moves by hand.
+"""Steers the robot by a leader arm: LeRobot's SO-101 leader, which a person moves by hand.
 
-An SO-ARM does with its joints what the leader does with its own. Another robot's hand goes the way that the leader's hand goes,
-from where both are when it takes over, and its gripper opens as far.
+An SO-ARM copies the leader's joints. On other robots the hand copies the movement of the leader's hand, starting from where both
+are when the leader takes over, and the gripper copies the leader's opening.
 """
 
 import functools
@@ -34,7 +34,7 @@ from mjx_nero.tools.view.session import Session
 
 NAME = "leader arm"
 HZ = 50.0
-PATIENCE_S = 0.5  # without an answer; then the robot stays where it is
+PATIENCE_S = 0.5  # time without an answer after which the robot stays where it is
 _MODEL = "so_arm101"
 
 
@@ -47,15 +47,15 @@ class Readable(Protocol):
 
 
 def at(port: str, calibration: pathlib.Path | None) -> Readable:
-    """The leader at a serial port.
+    """Connects to the leader at a serial port.
 
     Raises:
-        UserError: there is no calibration file, or nothing answers as it says.
+        UserError: no calibration file is given, a package is missing, or no arm that matches the calibration answers.
     """
     from mjx_nero.deploy.drivers import so_leader
 
     if calibration is None:
-        raise UserError("--leader needs --calibration: LeRobot's file of the leader, as lerobot-calibrate writes it")
+        raise UserError("--leader needs --calibration: the leader's file written by lerobot-calibrate")
     try:
         import serial  # noqa: F401
     except ModuleNotFoundError:
@@ -66,12 +66,12 @@ def at(port: str, calibration: pathlib.Path | None) -> Readable:
 
 
 def same_joints(env: ManipulationEnv) -> bool:
-    """True if the robot has the leader's joints."""
+    """Returns whether the robot has the leader's joints."""
     return env.cfg.robot.name in LEROBOT
 
 
 def agent(env: ManipulationEnv) -> rollout.Agent:
-    """Takes the joints to its parameters [joints], at the drives' speed."""
+    """Makes an agent that moves the joints to its parameters [joints], at the drives' speed."""
     robot = env.cfg.robot
     step = jnp.array(robot.arm.speed + robot.gripper.speed, jnp.float32) * env.dt
 
@@ -83,14 +83,14 @@ def agent(env: ManipulationEnv) -> rollout.Agent:
 
 
 class Leader:
-    """Reads an arm in a thread, and hands on where it is.
+    """Reads an arm in a thread, and passes on its joint positions.
 
     Args:
-        arm: connected.
-        follow: called with the positions of its joints [rad].
+        arm: a connected arm.
+        follow: called with the joint positions [rad].
 
     Attributes:
-        position: of its joints, as last read [rad].
+        position: joint positions as last read [rad].
     """
 
     def __init__(self, arm: Readable, follow: Callable[[np.ndarray], None]):
@@ -100,7 +100,7 @@ class Leader:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread and closes the port; the arm stays limp."""
+        """Ends the thread and closes the port. The arm's torque stays off."""
         self._ended.set()
         self._thread.join(timeout=2)
         self._arm.close()
@@ -113,11 +113,11 @@ class Leader:
                 self._follow(self.position)
             except ArmError as error:
                 if time.monotonic() - heard > PATIENCE_S:
-                    LOG.warning("the leader arm is silent, and the robot stays where it is: %s", error)
+                    LOG.warning("the leader arm does not answer, so the robot stays where it is: %s", error)
 
 
 class Way:
-    """The way of a leader's hand, which the hand of another robot goes, too."""
+    """Copies the movement of a leader's hand to the hand of another robot."""
 
     def __init__(self, hand: Hand):
         robot = registry.robot(_MODEL)
@@ -127,15 +127,15 @@ class Way:
         self._from: tuple | None = None
 
     def begin(self) -> None:
-        """Starts from where both hands are at the next step."""
+        """Starts from the poses of both hands at the next step."""
         self._hand.here()
         self._from = None
 
     def step(self, joints: np.ndarray) -> None:
-        """Takes the robot's hand along.
+        """Moves the robot's hand as the leader's hand moved.
 
         Args:
-            joints: of the leader [rad].
+            joints: joint positions of the leader [rad].
         """
         pos, quat = self._poses(jnp.asarray(joints, jnp.float32))
         if self._from is None:
@@ -152,10 +152,10 @@ class Way:
 def attached(
     arm: Readable, session: Session, panel: Panel, hand: Hand, take_over: Callable[[str], bool]
 ) -> tuple[Leader, Callable[[], object]]:
-    """Returns the arm as it is read, and what lets it take over.
+    """Starts reading the arm; returns its reader, and a function that lets it take over.
 
     Args:
-        take_over: lets an agent of the user's act, by its name.
+        take_over: lets one of the user's agents act, by name.
     """
     if same_joints(session.env):
 

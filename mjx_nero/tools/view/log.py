@@ -1,21 +1,21 @@
-"""The one voice of the view's servers: a line now and then, whatever comes in."""
+"""The log of the view's servers, limited in rate whatever clients send."""
 
 import logging
 import time
 
-EVERY_S = 10.0  # a line at most
+EVERY_S = 10.0  # minimum time between two lines
 _LONGEST = 160  # characters
 
 
 class _Rarely(logging.Filter):
-    """Lets one line through at a time, in plain letters (what strangers send may be in it) and without its traceback."""
+    """Lets one line through per ``EVERY_S``, escaped (it may quote untrusted requests) and without its traceback."""
 
     def __init__(self) -> None:
         super().__init__()
         self._next, self._kept = 0.0, 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        if record.getMessage() == "opening handshake failed":  # websockets says so of each page that is closed while it loads
+        if record.getMessage() == "opening handshake failed":  # websockets logs this for each page that is closed while it loads
             return False
         if time.monotonic() < self._next:
             self._kept += 1

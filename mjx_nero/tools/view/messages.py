@@ -1,12 +1,12 @@
-"""Messages that a page may send to its server: four kinds, with bounds, about existing controls and things."""
+"""The messages that a page may send to its server: four kinds, with bounds, about existing controls and objects."""
 
 from typing import Annotated, Literal
 
 import msgspec
 import viser
 
-LONGEST = 4096  # bytes of a message; the page's own have some 500
-SLACK = 1e-6  # of a slider's range: the browser counts in steps
+LONGEST = 4096  # maximum bytes of a message; the page's own have about 500
+SLACK = 1e-6  # tolerance as a share of a slider's range: the browser rounds to steps
 
 _Word = Annotated[str, msgspec.Meta(max_length=256)]
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # neither infinite nor NaN
@@ -21,7 +21,7 @@ class _Said(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=Tr
 
 
 class ViewerCameraMessage(_Said):
-    """The place and direction of the page's camera."""
+    """The pose of the page's camera."""
 
     wxyz: tuple[_Number, _Number, _Number, _Number]
     position: _Vector
@@ -35,7 +35,7 @@ class ViewerCameraMessage(_Said):
 
 
 class _Update(msgspec.Struct, forbid_unknown_fields=True):
-    """A control's new value. viser would set any other attribute of its handle, too."""
+    """A control's new value. viser itself would set any attribute of the control's handle."""
 
     value: bool | int | float | _Word
 
@@ -48,7 +48,7 @@ class GuiUpdateMessage(_Said):
 
 
 class SceneNodeDragMessage(_Said):
-    """A thing is dragged."""
+    """An object is dragged."""
 
     phase: Literal["start", "update", "end"]
     name: _Word
@@ -72,21 +72,21 @@ _DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | Scen
 
 
 def checked(raw: bytes, server: viser.ViserServer) -> bytes:
-    """The message written anew, so that viser reads what was checked and nothing else.
+    """Checks a message and encodes it again, so that viser reads only what was checked.
 
     Raises:
-        ValueError: it is none of a page's, or what it names or chooses is not there.
+        ValueError: it is not a message of a page, or it names something that does not exist.
     """
     try:
         said = _DECODER.decode(raw)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(str(error)) from None
     if isinstance(said, GuiUpdateMessage) and not _is_choice(server, said.uuid, said.updates.value):
-        raise ValueError("no choice of a control")
+        raise ValueError("not a value of an existing control")
     if isinstance(said, SceneNodeDragMessage) and not _is_there(server, said.name, said.instance_index):
-        raise ValueError("nothing that can be dragged")
+        raise ValueError("not an object that can be dragged")
     if isinstance(said, CommandTriggerMessage) and said.uuid not in server.gui._command_handle_from_uuid:
-        raise ValueError("no command")
+        raise ValueError("not an existing command")
     return msgspec.msgpack.encode(said)
 
 

@@ -1,4 +1,4 @@
-"""The view that the command ``view`` opens: the session, its page and the door before it."""
+"""Opens the view of the command ``view``: the session, its page and the door that guards it."""
 
 import functools
 import pathlib
@@ -24,14 +24,14 @@ from mjx_nero.types import UserError
 if TYPE_CHECKING:
     from mjx_nero.tools.view import leader as leaders
 
-WATCH_S = 2.0  # how often a followed run is looked at
+WATCH_S = 2.0  # time between two looks at a followed run
 
 
 def serve(**kwargs: Any) -> None:
     """Serves the page until Ctrl-C.
 
     Args:
-        kwargs: of ``open_view``.
+        kwargs: arguments of ``open_view``.
     """
     need("viser", "view")
     cli.setup_jax()
@@ -47,17 +47,17 @@ class View:
     """A page that is being served.
 
     Attributes:
-        url: to open, with its token.
-        server: viser's.
-        session: what it shows.
+        url: address to open, with its token.
+        server: viser's server.
+        session: the session that it shows.
         panel: its controls.
-        hands: those of the user's hand.
+        hands: controls of the user's hand.
     """
 
     def __init__(self, page, door, orders, session, panel, hands, run: pathlib.Path | None, env_name: str):
         self._page, self._door, self._orders = page, door, orders
         self.session, self.panel, self.hands = session, panel, hands
-        self.leader: leaders.Leader | None = None  # that is read
+        self.leader: leaders.Leader | None = None  # a leader arm that is being read
         self.url, self.server = door.url, page.server
         self._run, self._env_name = run, env_name
         self._seen: pathlib.Path | None = None
@@ -65,19 +65,19 @@ class View:
         self._thread: threading.Thread | None = None
 
     def start(self, shown) -> None:
-        """Lets the session run."""
+        """Starts the session."""
         self._thread = threading.Thread(target=self.session.run, args=(shown,), daemon=True)
         self._thread.start()
 
     def wait(self) -> None:
-        """Waits until the simulation fails, and follows the run meanwhile."""
+        """Waits until the view is closed, and follows the run meanwhile; raises the error of a simulation that fails."""
         while self.session.failure is None and not self._ended.wait(WATCH_S):
             self.follow()
         if self.session.failure is not None:
             raise self.session.failure
 
     def follow(self) -> None:
-        """Plays the newest checkpoint of the run, if there is one that did not play yet."""
+        """Plays the newest checkpoint of the run, if it is new."""
         newest = agents.newest(self._run) if self._run else None
         if newest is None or newest == self._seen:
             return
@@ -87,7 +87,7 @@ class View:
         self.session.reset()
 
     def close(self) -> None:
-        """Ends simulation and servers."""
+        """Ends the simulation and the servers."""
         self._ended.set()
         if self.leader:
             self.leader.close()
@@ -115,19 +115,20 @@ def open_view(
     episode: int | None = None,
     leader: "leaders.Readable | None" = None,
 ) -> View:
-    """Serves the page, and lets the environments run.
+    """Serves the page and runs the environments.
 
     Args:
-        agent: a name of ``agents.known``; None: a policy, a controller, or if there is none the joint sliders.
-        run: folder of a training to follow.
-        host: address to listen at.
-        port: the first free one from here on.
-        demos: data set to record to, of the first environment.
-        episode: of that data set, to replay at first.
-        leader: an arm that the user moves by hand, connected.
+        agent: agent that acts first, by its name in ``agents.known``; None: a policy, or else a controller, or else the joint
+            sliders.
+        run: run folder to follow.
+        host: address to listen on.
+        port: first port to try.
+        demos: data set into which the first environment can be recorded.
+        episode: episode of that data set to replay first.
+        leader: a connected arm that the user moves by hand.
 
     Raises:
-        UserError: as the command.
+        UserError: see ``command.main``.
     """
     need("viser", "view")
     from mjx_nero.tools.view import hand, session, tape
@@ -151,10 +152,10 @@ def open_view(
 
 
 def _served(sim, makers, chosen: str, recording, leader, where: tuple[str, int], run: pathlib.Path | None, env_name: str) -> View:
-    """Puts a session's page together and starts both.
+    """Builds a session's page and starts both.
 
     Raises:
-        UserError: as ``open_view``.
+        UserError: see ``open_view``.
     """
     from mjx_nero.tools.view import door, hand, hand_panel, orders, panel, scene
     from mjx_nero.tools.view import leader as leaders
@@ -181,15 +182,15 @@ def _served(sim, makers, chosen: str, recording, leader, where: tuple[str, int],
 
 
 def _chosen(agent: str | None, names: Sequence[str], env_name: str) -> str:
-    """Returns the first agent; a policy may be named without that word."""
+    """Returns the name of the agent that acts first; the word "policy" may be left out."""
     found = next((name for name in (agent or names[0], f"policy {agent}") if name in names), None)
     if found is None:
-        raise UserError(f"nobody called {agent!r} can act in {env_name}: choose one of {', '.join(names)}")
+        raise UserError(f"no agent {agent!r} can act in {env_name}: choose one of {', '.join(names)}")
     return found
 
 
 def _played(demos: pathlib.Path) -> dict[str, Any]:
-    """The environment and the preset of a data set."""
+    """Returns the environment and the preset of a data set."""
     about = open_dataset(demos).schema.about
     return {"env_name": about["env"], "preset": about["preset"]}
 
@@ -197,7 +198,7 @@ def _played(demos: pathlib.Path) -> dict[str, Any]:
 def _described(run: pathlib.Path) -> dict[str, Any]:
     path = files.inside(run, CONFIG)
     if not path.exists():
-        raise UserError(f"{run} is not the folder of a training: give what train.py wrote to (--out)")
+        raise UserError(f"{run} is not a run folder: give the folder that train.py wrote (--out)")
     found = files.read_json(path)
     names = {key: found[key] for key in ("env_name", "preset") if key in found} if isinstance(found, dict) else None
     return values.read(Mapping[str, str], names, f"{path}:")

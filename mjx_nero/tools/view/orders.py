@@ -1,4 +1,4 @@
-"""Orders of pages, carried out one after the other."""
+"""Orders of pages, carried out one after another."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -7,8 +7,8 @@ from mjx_nero.tools.view.log import LOG
 
 
 class Orders:
-    """A thread that does what pages ask for. Of the orders that wait under one name only the last is done, so that no page can
-    pile up work; one that fails is a line in the terminal and nothing more."""
+    """A thread that carries out the orders of pages. Only the last of the waiting orders with one name is done, so that no page
+    can pile up work. An order that fails only logs a line."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, Callable[[], object]] = {}
@@ -17,13 +17,13 @@ class Orders:
         self._thread.start()
 
     def give(self, name: Hashable, work: Callable[[], object]) -> None:
-        """Asks for ``work``, in place of what still waits under ``name``."""
+        """Queues ``work``, and replaces a waiting order with the same name."""
         with self._changed:
             self._waiting[name] = work
             self._changed.notify()
 
     def close(self) -> None:
-        """Ends the thread; what waits is not done any more."""
+        """Ends the thread; waiting orders are dropped."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -39,4 +39,4 @@ class Orders:
             try:
                 work()
             except Exception:
-                LOG.warning("what a page asked for failed", exc_info=True)
+                LOG.warning("an order of a page failed", exc_info=True)

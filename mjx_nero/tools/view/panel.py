@@ -1,4 +1,4 @@
-"""The controls beside the picture: run and step, who acts, joints, curves."""
+"""The controls beside the picture: run and step, agent, joints, curves."""
 
 import contextlib
 import threading
@@ -25,15 +25,17 @@ class Panel:
 
     Args:
         server: a ``viser.ViserServer``.
-        makers: agents to choose from, as ``agents.known``.
-        chosen: the one that plays.
-        orders: where what takes time is done.
+        makers: agents to choose from, see ``agents.known``.
+        chosen: the agent that acts first.
+        orders: thread for everything that takes time.
     """
 
     def __init__(self, server, session: Session, makers: Mapping[str, Make], chosen: str, orders: Orders):
         self._session, self._makers, self._gui = session, dict(makers), server.gui
         self._orders, self._drawn, self._drawing = orders, 0.0, threading.Lock()
-        self.parameters: dict[str, Callable[[], Any]] = {SLIDERS: self._slid_to}  # of agents that the user steers
+        self.parameters: dict[str, Callable[[], Any]] = {
+            SLIDERS: self._slid_to
+        }  # first parameters of agents that the user steers
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._status = server.gui.add_markdown("")
@@ -59,20 +61,20 @@ class Panel:
         self._tell(session.frame)
 
     def show(self, frame: Frame) -> None:
-        """Text and curves, a few times a second."""
+        """Updates text and curves, a few times per second."""
         if time.perf_counter() - self._drawn >= 1 / CURVES_HZ:
             self._drawn = time.perf_counter()
             self._tell(frame)
             self._draw_curves()
 
     def add(self, name: str, make: Make) -> None:
-        """Another agent to choose, and plays it."""
+        """Adds an agent and lets it act."""
         self._makers[name] = make
         self.agent.options = tuple(self._makers)
         self.agent.value = name
 
     def play(self, name: str) -> None:
-        """Lets an agent act, or says why it cannot."""
+        """Lets an agent act, or shows why it cannot."""
         try:
             made = self._makers[name]()
             self._session.play(made, self.parameters[name]() if name in self.parameters else None)
@@ -81,7 +83,7 @@ class Panel:
             self._message.content = f"**{error}**"
 
     def replay(self, tape: Iterator[Frame]) -> None:
-        """Shows a tape, from a pause, too."""
+        """Shows a tape, even if the session is paused."""
         self._session.replay(tape)
         if not self._session.running:
             self._pause()
@@ -117,7 +119,7 @@ class Panel:
         )
 
     def _draw_curves(self) -> None:
-        with self._drawing:  # a page's choice and the session's steps come from two threads
+        with self._drawing:  # pages and the session call from different threads
             self._draw(self._what.value)
 
     def _draw(self, what: str) -> None:

@@ -1,11 +1,11 @@
-"""The head of an HTTP request, read strictly: whatever is odd about it is refused."""
+"""Parses the head of an HTTP request strictly: anything unusual is refused."""
 
 import dataclasses
 import re
 import urllib.parse
 
-LONGEST = 16384  # bytes of a head
-_MOST = 100  # lines of a head
+LONGEST = 16384  # maximum bytes of a head
+_MOST = 100  # maximum lines of a head
 _FIRST = re.compile(r"GET (/[A-Za-z0-9._/-]*)(?:\?([!-~]*))? HTTP/1\.1")
 _HEADER = re.compile(r"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\t -~\x80-\xff]*)")
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::[0-9]{1,5})?")
@@ -17,9 +17,9 @@ class Request:
 
     Attributes:
         path: without the query.
-        query: name -> value, each once.
-        headers: name in small letters -> value.
-        host: name or address that the client believes to talk to, without the port.
+        query: name -> value; no name appears twice.
+        headers: name in lower case -> value.
+        host: name or address that the client requested, without the port.
     """
 
     path: str
@@ -29,31 +29,31 @@ class Request:
 
     @property
     def upgrades(self) -> bool:
-        """True if it asks for a websocket."""
+        """Whether it asks for a websocket."""
         return "upgrade" in self.headers
 
     @property
     def own_origin(self) -> bool:
-        """True if it comes from a page of this address."""
+        """Whether it comes from a page of this address."""
         origin = self.headers.get("origin")
         return not self.upgrades if origin is None else origin.lower() == f"http://{self.headers['host'].lower()}"
 
     def cookie(self, name: str) -> str:
-        """Value of a cookie, or nothing."""
+        """Returns the value of a cookie; empty if there is none."""
         pairs = (each.strip().partition("=") for each in self.headers.get("cookie", "").split(";"))
         return next((value for key, _, value in pairs if key == name), "")
 
     def head(self) -> bytes:
-        """The request for whom it is handed to, without its query."""
+        """Returns the bytes of the request to pass on, without its query."""
         lines = [f"GET {self.path} HTTP/1.1", *(f"{name}: {value}" for name, value in self.headers.items())]
         return "\r\n".join([*lines, "", ""]).encode("latin-1")
 
 
 def parse(head: bytes) -> Request:
-    """A request of the bytes up to its empty line.
+    """Parses a request from its bytes, up to and including the empty line.
 
     Raises:
-        ValueError: it is no plain GET with one host, or it is not well formed.
+        ValueError: it is not a plain GET with one host, or it is malformed.
     """
     first, *lines = head.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
     start, found = _FIRST.fullmatch(first), [_HEADER.fullmatch(line) for line in lines]

@@ -1,4 +1,4 @@
-"""The picture: each body of the model as a mesh in the browser, one instance an environment."""
+"""The picture: each body of the model as a mesh in the browser, with one instance per environment."""
 
 from collections.abc import Callable, Iterator
 from typing import cast
@@ -14,19 +14,19 @@ from mjx_nero.tools.view.hand import Hand
 from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import Frame, Session, free_joints
 
-HIDDEN = 3  # geom groups from here on: what collides
-SHAPE = "/drawn/"  # in the names of geoms that draw one shape of an object that may have several (``sim.objects.body``)
-APART = 1.5  # between environments, at least [m]
+HIDDEN = 3  # first of the hidden geom groups, which are collision shapes
+SHAPE = "/drawn/"  # part of the name of a geom that draws one of an object's possible shapes (``sim.objects.body``)
+APART = 1.5  # minimum distance between environments [m]
 
 
 class Scene:
-    """Shows frames, and turns drags of goals and things into orders to the session.
+    """Shows frames, and turns drags of goals and objects into orders to the session.
 
     Args:
         server: a ``viser.ViserServer``.
-        model: with visual shapes (``ManipulationEnv.mj_model``).
-        orders: where drags are done.
-        hand: what a drag of the robot's hand moves.
+        model: model with visual shapes (``ManipulationEnv.mj_model``).
+        orders: thread that carries out drags.
+        hand: moved when the user drags the robot's hand; None: it cannot be dragged.
     """
 
     def __init__(self, server, session: Session, model: mujoco.MjModel, orders: Orders, hand: Hand | None = None):
@@ -37,12 +37,12 @@ class Scene:
         across, apart = int(np.ceil(np.sqrt(session.size))), max(APART, *session.env.cfg.scene.table_size)
         self._corners = np.array([(i // across * apart, i % across * apart, 0.0) for i in range(session.size)])
         server.scene.set_up_direction("+z")
-        server.scene.configure_environment_map(hdri=None)  # the maps there are come from the internet
-        server.scene.configure_default_lights(cast_shadow=False)  # shadows are dear for a browser that draws in software
+        server.scene.configure_environment_map(hdri=None)  # viser's maps are loaded from the internet
+        server.scene.configure_default_lights(cast_shadow=False)  # shadows are slow in a browser that draws in software
         server.scene.add_light_hemisphere("/light", sky_color=(255, 255, 255), ground_color=(170, 160, 150), intensity=1.5)
         middle = self._corners.mean(0)
         camera = model.camera("front")
-        # One environment as in the package's pictures, several from farther off.
+        # One environment is shown as in the package's pictures, several from farther away.
         server.initial_camera.look_at = tuple(middle + model.stat.center)
         server.initial_camera.position = tuple(middle + model.stat.center + (camera.pos - model.stat.center) * across)
         server.initial_camera.fov = float(np.radians(camera.fovy[0]))
@@ -69,20 +69,20 @@ class Scene:
         positions, quats = self._poses(frame)
         with self._server.atomic():
             for body, handle, geom in self._bodies:
-                if body:  # the world stands
+                if body:  # the world does not move
                     handle.batched_positions, handle.batched_wxyzs = self._shown(positions[body], geom, frame), quats[body]
             self._place(frame)
 
     @staticmethod
     def _shown(positions: np.ndarray, geom: int, frame: Frame) -> np.ndarray:
-        """Places of a body's mesh [n, 3]: far below if an environment has another shape of the object."""
+        """Returns the positions of a body's mesh [n, 3]: far below where an environment has another shape of the object."""
         if geom < 0 or "geom_rgba" not in frame.scenery.look:
             return positions
         there = np.asarray(frame.scenery.look["geom_rgba"])[:, geom, 3] > 0
         return np.where(there[:, None], positions, positions - [0.0, 0.0, 100.0]).astype(np.float32)
 
     def _place(self, frame: Frame) -> None:
-        """Draws obstacles anew where an episode has others (see ``ManipulationEnv.scenery``)."""
+        """Draws the obstacles again if an episode has different ones (see ``ManipulationEnv.scenery``)."""
         boxes = frame.scenery.obstacles
         drawn = jax.tree.leaves(boxes)
         if len(drawn) == len(self._stand) and all(map(np.array_equal, drawn, self._stand)):
@@ -95,7 +95,7 @@ class Scene:
                 self._server.scene.add_box(f"/obstacles/{i}/{name}", color, dimensions=box.size[i], **pose)
 
     def _poses(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [bodies, n, 3] and orientations [bodies, n, 4] of all bodies."""
+        """Returns positions [bodies, n, 3] and orientations [bodies, n, 4] of all bodies."""
         model, data, n = self._model, self._data, len(frame.qpos)
         positions, quats = np.empty((model.nbody, n, 3), np.float32), np.empty((model.nbody, n, 4), np.float32)
         moved = {field: values for field, values in frame.scenery.look.items() if field.startswith("body_")}
@@ -114,12 +114,12 @@ class Scene:
         if body not in things and body != "goal" and not hand:
             return
 
-        grabbed: dict[int, np.ndarray] = {}  # by browser, from where the mouse took hold to the middle
+        grabbed: dict[int, np.ndarray] = {}  # by browser: vector from the grabbed point to the object's center
 
         @handle.on_drag
-        async def _(event) -> None:  # a coroutine, for these alone come in order
+        async def _(event) -> None:  # a coroutine: viser calls only coroutines in order
             i = event.instance_index or 0
-            if event.phase == "start":  # later on the browser's picture is behind what it has been told
+            if event.phase == "start":  # later the browser's picture lags behind
                 middle = hand.pos + self._corners[i] if hand else np.asarray(handle.batched_positions[i])
                 grabbed[event.client_id] = middle - event.start_position
             if event.client_id not in grabbed:
@@ -136,16 +136,16 @@ class Scene:
 
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and those that carry it."""
+    """Returns a body and its ancestors."""
     return [body, *(_above(model, int(model.body_parentid[body])) if body else [])]
 
 
 def meshes(model: mujoco.MjModel) -> Iterator[tuple[int, str, trimesh.Trimesh, tuple[float, ...]]]:
-    """(body, name, mesh in the body's frame, colour): the visible geoms of a body, those of one colour in one mesh."""
+    """Yields (body, name, mesh in the body's frame, colour), with all visible geoms of a body and colour in one mesh."""
     for body in range(model.nbody):
         found: dict[tuple[str, tuple[float, ...]], list[trimesh.Trimesh]] = {}
         for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < HIDDEN)):
-            if model.geom_contype[geom] & OBSTACLE:  # differ from one environment to the other
+            if model.geom_contype[geom] & OBSTACLE:  # obstacles differ between environments
                 continue
             material = model.geom_matid[geom]
             rgba = tuple(float(x) for x in (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]))

@@ -1,4 +1,4 @@
-"""The simulation behind a view: environments that run in real time, in a thread, and take orders while they do."""
+"""The simulation behind a view: environments that run in real time, in a thread, and take orders meanwhile."""
 
 import collections
 import dataclasses
@@ -21,17 +21,19 @@ from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Scenery
 
 CURVE = 400  # control steps that the curves show
-EPISODES = 100  # the last ones, of which the success rate is told
+EPISODES = 100  # number of last episodes in the success rate
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One picture's data after a control step: arrays on the host, one row per environment.
+    """The data of a picture after a control step: arrays on the host, one row per environment.
 
     Attributes:
         qpos: [n, nq].
-        scenery: [n, ...], what else there is to see (``ManipulationEnv.scenery``).
-        curves: name -> [size] of the first environment: rewards by term, actions, observations by term.
+        scenery: everything else that is visible (``ManipulationEnv.scenery``), [n, ...].
+        step: control step in the first environment's episode.
+        distance: distance to the goal in the first environment [m].
+        curves: group -> name -> [size], of the first environment: rewards by term, actions, observations by term.
     """
 
     qpos: np.ndarray
@@ -42,12 +44,12 @@ class Frame:
 
 
 class Session:
-    """Environments, who acts in them, and the orders of the user. All methods may be called from any thread.
+    """Environments, the agent that acts in them, and the user's orders. All methods may be called from any thread.
 
     Args:
-        env: with native physics.
-        size: environments side by side.
-        seed: of their episodes.
+        env: an environment with native physics.
+        size: number of environments.
+        seed: seed of their episodes.
     """
 
     def __init__(self, env: ManipulationEnv, size: int, agent: rollout.Agent, params: Any = None, seed: int = 0):
@@ -55,7 +57,7 @@ class Session:
         self.running, self.speed = True, 1.0
         self.failure: BaseException | None = None
         self.successes: collections.deque[bool] = collections.deque(maxlen=EPISODES)
-        self.recorders: list[Callable[[Record], None]] = []  # each gets the record of every step, of all environments
+        self.recorders: list[Callable[[Record], None]] = []  # called with the record of every step of all environments
         self.history: collections.deque[Frame] = collections.deque(maxlen=CURVE)
         self._batch = Batch(env, size)
         self._key = jax.random.PRNGKey(seed)
@@ -65,19 +67,19 @@ class Session:
         self._changed = False
         self._tape: Iterator[Frame] = iter(())
         self._dragged = np.zeros(size, bool)
-        self._command = np.zeros((size, 3), np.float32)  # of the goals that the user has dragged
+        self._command = np.zeros((size, 3), np.float32)  # commands of the goals that the user has dragged
         self._state = self._reset(self._split())
         self.play(agent, params)
         self.frame = self._look(jnp.zeros((size, env.action_size)))
 
     def play(self, agent: rollout.Agent, params: Any = None) -> None:
-        """Lets another agent act from now on."""
+        """Lets an agent act from now on."""
         with self._lock:
             self._act, self._init, self.params = jax.jit(agent.act), jax.jit(agent.init), params
             self._memory = self._init(self._state)
 
     def reset(self) -> None:
-        """Fresh episodes; goals are where the task draws them."""
+        """Starts new episodes, with goals drawn by the task."""
         with self._lock:
             self._tape, self._dragged[:] = iter(()), False
             self.history.clear()
@@ -88,26 +90,26 @@ class Session:
             self._changed = True
 
     def replay(self, tape: Iterator[Frame]) -> None:
-        """Shows the frames of a tape, one a step; the physics stands still until it ends, or until ``reset``."""
+        """Shows the frames of a tape, one per step. The physics stands still until the tape ends, or until ``reset``."""
         with self._lock:
             self._tape = itertools.chain(tape, [self.frame])
 
     def single_step(self) -> None:
-        """One control step, also while paused."""
+        """Requests one control step, which is done even while paused."""
         self._single = True
 
     def move_goal(self, index: int, to: np.ndarray) -> None:
-        """Puts the goal of an environment at a point of the world [m]; it stays there until ``reset``, also in new episodes."""
+        """Moves the goal of an environment to a point in the world [m]. It stays there until ``reset``, also in new episodes."""
         with self._lock:
             command = self._state.info["carry"].command
-            # A moving goal keeps to its path about the command, so the command goes as far as the goal does.
+            # A moving goal follows a path about the command, so the command moves by the same vector as the goal.
             self._command[index] = np.asarray(command[index]) + to - self.frame.scenery.goal_pos_w[index]
             self._dragged[index] = True
             self._replace_goals()
             self._changed = True
 
     def move_object(self, index: int, joint: str, to: np.ndarray) -> None:
-        """Puts an object, by the name of its free joint, at a point of the world [m], at rest."""
+        """Moves an object, named by its free joint, to a point in the world [m], at rest."""
         with self._lock:
             at, model, sim = self.env.physics_model.joint(joint), self.env.physics_model, self._state.pipeline_state
             dof = int(model.jnt_dofadr[at.id])
@@ -117,7 +119,7 @@ class Session:
             self.frame, self._changed = dataclasses.replace(self.frame, qpos=np.array(qpos, np.float64)), True
 
     def run(self, shown: Callable[[Frame], None]) -> None:
-        """Steps in real time times ``speed`` until ``stop``, and shows each step. A failure ends it and is kept."""
+        """Steps at ``speed`` times real time until ``stop``, and shows each step. An error ends it and is kept in ``failure``."""
         due = time.perf_counter()
         try:
             while not self._stop.is_set():
@@ -127,8 +129,8 @@ class Session:
                     shown(self.frame)
                 elif self._changed:
                     self._changed = False
-                    shown(self.frame)  # what the user moves does so while all else stands still
-                due = max(due + self.env.dt / self.speed, time.perf_counter() - 0.1)  # after a stall it does not race
+                    shown(self.frame)  # what the user drags moves while everything else stands still
+                due = max(due + self.env.dt / self.speed, time.perf_counter() - 0.1)  # does not catch up after a stall
                 self._stop.wait(max(0.001, due - time.perf_counter()))
         except Exception as error:
             self.failure = error
@@ -139,7 +141,7 @@ class Session:
         self._stop.set()
 
     def step(self) -> None:
-        """One control step of all environments, or one frame of a tape."""
+        """Makes one control step in all environments, or shows one frame of a tape."""
         with self._lock:
             if (frame := next(self._tape, None)) is not None:
                 self.frame = frame
@@ -195,6 +197,6 @@ class Session:
 
 
 def free_joints(model: mujoco.MjModel) -> dict[str, str]:
-    """Body -> free joint: the things that lie about."""
+    """Returns the free joints of a model, by the name of their body."""
     free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
     return {model.body(model.jnt_bodyid[j]).name: model.joint(j).name for j in free}

@@ -1,4 +1,4 @@
-"""Tapes: what was recorded, as frames that a session shows instead of its physics."""
+"""Tapes: recorded frames that a session shows instead of its physics."""
 
 import dataclasses
 import pathlib
@@ -16,11 +16,11 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def frames(frame: Frame, qpos: Sequence[np.ndarray], goals: np.ndarray) -> Iterator[Frame]:
-    """A frame a step, of the first environment; everything else stays as in ``frame``.
+    """Yields one frame per step, with the first environment as recorded; everything else stays as in ``frame``.
 
     Args:
-        qpos: positions of the physics [steps, nq].
-        goals: pose of the goal [steps, 7], wxyz.
+        qpos: recorded positions [steps, nq].
+        goals: recorded goal poses [steps, 7], wxyz.
     """
     for i, (at, goal) in enumerate(zip(qpos, goals, strict=True)):
         both, pos, quat = (np.array(x) for x in (frame.qpos, frame.scenery.goal_pos_w, frame.scenery.goal_quat_w))
@@ -30,24 +30,24 @@ def frames(frame: Frame, qpos: Sequence[np.ndarray], goals: np.ndarray) -> Itera
 
 
 def of_dataset(path: pathlib.Path, index: int, frame: Frame) -> Iterator[Frame]:
-    """An episode of a data set.
+    """Yields the frames of an episode of a data set.
 
     Raises:
-        UserError: there is no such episode, or the data set is of another scene.
+        UserError: there is no such episode, or the data set is from another scene.
     """
     found = open_dataset(path)
     if not 0 <= index < len(found):
         raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
     if missing := {names.QPOS, names.ENVIRONMENT} - set(found.schema.features):
-        raise UserError(f"{path} has no {' and no '.join(sorted(missing))}: it is not of an environment here")
+        raise UserError(f"{path} has no {' and no '.join(sorted(missing))}: give a data set written by demos with --holds all")
     size = found.schema.features[names.QPOS].size
     if size != frame.qpos.shape[1]:
-        raise UserError(f"{path} has scenes of {size} positions, and this environment {frame.qpos.shape[1]}: pass its --env")
+        raise UserError(f"{path} has {size} positions, but this environment has {frame.qpos.shape[1]}: pass the data set's --env")
     episode = found.episodes((names.QPOS, names.ENVIRONMENT))[index]
     return frames(frame, list(episode.arrays[names.QPOS].astype(float)), episode.arrays[names.ENVIRONMENT][:, goal(found.schema)])
 
 
 def goal(schema: Schema) -> list[int]:
-    """Numbers of the goal's pose in ``episode.ENVIRONMENT``."""
+    """Returns the indices of the goal's pose in ``episode.ENVIRONMENT``."""
     known = schema.features[names.ENVIRONMENT].names
     return [known.index(f"goal.{axis}") for axis in _POSE]

@@ -15,19 +15,19 @@ GYM_ID = "lerobot_env_mjx_nero/mjx_nero-v0"
 @EnvConfig.register_subclass("mjx_nero")
 @dataclass
 class MjxNeroEnv(EnvConfig):
-    """What ``lerobot-train`` and ``lerobot-eval`` take as ``--env.*``.
+    """The ``--env.*`` options of ``lerobot-train`` and ``lerobot-eval``.
 
     Attributes:
-        task: an environment of mjx_nero.
-        preset: of the environment's presets.
-        robot: another than the environment's own, by name or folder.
-        units: of joints, as in the data set: auto, si or lerobot.
-        through: who made the data set acted through: task (a policy) or drives (an expert), as ``demos --inspect`` says.
-        velocities: the state has the joints' velocities, too, as ``demos --velocities``.
-        cameras: whose pictures the policy sees, with commas between them, as ``demos --cameras``.
-        renderer: of the pictures, as ``demos --renderer``.
-        width, height: of a picture [pixels].
-        fps: filled in, as are the features: control steps a second.
+        task: name of an environment of mjx_nero.
+        preset: name of one of its presets.
+        robot: name of another robot, or folder of an imported one; None: the environment's own.
+        units: units of joints, as in the data set: auto, si or lerobot.
+        through: what the data set's actions went through, as in ``demos --inspect``: task (a policy's) or drives (an expert's).
+        velocities: include the joints' velocities in the state, as ``demos --velocities`` does.
+        cameras: comma-separated names of the cameras whose pictures the policy sees, as in ``demos --cameras``.
+        renderer: renderer of the pictures, as in ``demos --renderer``.
+        width, height: size of a picture [pixels].
+        fps: control steps per second; filled in, like the features.
     """
 
     task: str | None = "nero_lift"
@@ -48,7 +48,10 @@ class MjxNeroEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         cfg = registry.env_cfg(self.task, self.preset, self.robot)
-        joints, poses = len(cfg.robot.joints), 1 if self.cameras else 2 + len(cfg.scene.objects)  # who sees is told the goal
+        joints, poses = (
+            len(cfg.robot.joints),
+            1 if self.cameras else 2 + len(cfg.scene.objects),
+        )  # with cameras, only the goal's pose
         self.fps = round(1 / (cfg.sim.dt * cfg.sim.decimation))
         self.features = {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(joints,)),
@@ -62,17 +65,17 @@ class MjxNeroEnv(EnvConfig):
 
     @property
     def package_name(self) -> str:
-        """What LeRobot imports if it does not know the environment yet."""
+        """The package that LeRobot imports if it does not know the environment yet."""
         return __name__
 
     @property
     def gym_id(self) -> str:
-        """What LeRobot hands to ``gymnasium.make``."""
+        """The id that LeRobot passes to ``gymnasium.make``."""
         return GYM_ID
 
     @property
     def gym_kwargs(self) -> dict:
-        """Arguments of ``env.Env``."""
+        """The arguments of ``env.Env``."""
         size = (self.width, self.height)
         return {
             "task": self.task,

@@ -1,4 +1,4 @@
-"""One environment as LeRobot's commands take it: joints' targets in, states out, in the units of a data set of ``demos``."""
+"""One environment for LeRobot's commands. It takes joint targets and returns states, in the units of a ``demos`` data set."""
 
 import dataclasses
 import functools
@@ -19,15 +19,15 @@ from mjx_nero.tools.demos import making
 
 
 class Programs:
-    """What environments of the same arguments share: the environment and its compiled functions.
+    """The environment and its compiled functions, which ``Env``s with the same arguments share.
 
     Args:
-        task, preset, robot: of ``registry.env_cfg``.
-        units: of ``making.units_of``.
-        velocities: the state has the joints', too.
-        through: of the data set, as ``demos --inspect`` says it: task (a policy's) or drives (an expert's).
-        cameras: names with commas between them.
-        renderer: of ``demos --renderer``.
+        task, preset, robot: as in ``registry.env_cfg``.
+        units: as in ``making.units_of``.
+        velocities: include the joints' velocities in the state.
+        through: what the data set's actions went through, as in ``demos --inspect``: task (a policy's) or drives (an expert's).
+        cameras: comma-separated names.
+        renderer: as in ``demos --renderer``.
         size: width and height of a picture [pixels].
     """
 
@@ -43,9 +43,9 @@ class Programs:
         size: tuple[int, int],
         velocities: bool,
     ):
-        cli.setup_jax()  # compiled once for all processes that LeRobot starts
+        cli.setup_jax()  # its cache lets the processes that LeRobot starts compile only once
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
-        cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are drawn here
+        cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are rendered here
         self.env = env = ManipulationEnv(making.by_drives(cfg, through), impl="native")
         names = [name for name in cameras.split(",") if name]
         self.cameras = Cameras(env, names, size, renderer) if names else None
@@ -66,7 +66,7 @@ class Programs:
         self.reset, self.step, self.scenery = map(_on_cpu, (reset, step, env.scenery))
 
     def named(self, state: Any, seen: Any) -> dict[str, Any]:
-        """An observation as LeRobot has it; ``pixels``: by camera, uint8 [height, width, 3]."""
+        """Returns an observation in LeRobot's form; ``pixels`` has uint8 [height, width, 3] by camera."""
         out: dict[str, Any] = dict(zip(("agent_pos", "environment_state"), map(np.asarray, seen), strict=True))
         if self.cameras:
             shown = (
@@ -78,7 +78,7 @@ class Programs:
 
 
 def _on_cpu(function: Callable) -> Callable:
-    """The compiled function, on the processor: one environment is slower on a GPU, which has the policy."""
+    """Compiles a function for the CPU: a single environment is slower on a GPU, which runs the policy."""
     compiled = jax.jit(function)
 
     def call(*args: Any) -> Any:
@@ -92,7 +92,7 @@ made = functools.lru_cache(Programs)
 
 
 class Env(gymnasium.Env):
-    """See above. The arguments are those of ``Programs``."""
+    """A Gymnasium environment for LeRobot. Its arguments are those of ``Programs``."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
@@ -127,13 +127,13 @@ class Env(gymnasium.Env):
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict]:
-        """A fresh episode; a seed draws all of it."""
+        """Starts an episode; a seed determines all of it."""
         super().reset(seed=seed)
         self._state, seen = self._programs.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
         return self._programs.named(self._state, seen), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict]:
-        """One control step. The info has ``is_success``, which an episode can only have at its end."""
+        """Runs one control step. The info has ``is_success``, which can only be true at the end of an episode."""
         self._state, seen, out = self._programs.step(self._state, np.asarray(action, np.float32))
         reward, done, truncated, success = (float(x) for x in out)
         ended = done > 0
@@ -146,7 +146,7 @@ class Env(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray:
-        """A frame, uint8 [height, width, 3]."""
+        """Renders a frame, uint8 [height, width, 3]."""
         self._renderer = self._renderer or Renderer(self._programs.env.mj_model)
         scenery = jax.device_get(self._programs.scenery(self._state))
         return self._renderer.render(np.asarray(self._state.pipeline_state.qpos), scenery)
