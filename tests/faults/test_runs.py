@@ -207,7 +207,7 @@ def test_damaged_checkpoints_are_passed_over(train, undisturbed, tmp_path):
     (newest.parent / f".{newest.stem}.part.safetensors").write_text("half of one")
     code, _, err = train("--restore", "run", "--num-timesteps", STEPS, steps=0)
     assert code == 0 and f"warning: run/checkpoints/{newest.name} is damaged: using" in err
-    assert "run resumes with num_timesteps 640 in place of 384" in err
+    assert "run resumes with num_timesteps 640 instead of 384" in err
     assert last(tmp_path / "run") == undisturbed
     assert not list((tmp_path / "run").rglob("*.part*"))
 
@@ -232,7 +232,7 @@ def test_another_run_is_refused_by_the_name_of_the_flag(call, train, tmp_path):
         assert code == 2 and message in err, err
     assert (tmp_path / "run" / "config.json").read_bytes() == before
     code, _, err = call("train", "--restore", "run", "--seed", 0, "--no-video", "--num-timesteps", 256, "--max-minutes", 5)
-    assert code == 0 and "run resumes with num_timesteps 256 in place of 128, max_minutes 5.0 in place of 0.0" in err
+    assert code == 0 and "run resumes with num_timesteps 256 instead of 128, max_minutes 5.0 instead of 0.0" in err
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["hyperparameters"]["num_timesteps"] == 256 and config["hyperparameters"]["network"]["actor"] == [8]
 
