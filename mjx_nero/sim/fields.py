@@ -25,13 +25,13 @@ class Draws:
     """Draws fields of a model by terms, one after another.
 
     Args:
-        kind: what the terms are, for messages.
+        kind: name of the terms' group in messages.
         terms: by name, each ``(key, model) -> {field: (rows, values)}``.
-        nominal: the fields that may differ, as the model has them.
+        nominal: the fields that may differ, with the model's values.
         index: rows by name, see ``mdp.randomization.Model``.
 
     Attributes:
-        rows: field -> all rows that the terms draw. A field of which the model has nothing is left out.
+        rows: field -> all rows that the terms draw. Fields that are empty in the model are left out.
 
     Raises:
         UserError: a term names something that the model lacks, or draws a field that cannot differ.

@@ -165,7 +165,7 @@ def closing_time(robot: RobotCfg, gap: float) -> float:
 
 
 def closing(robot: RobotCfg, gap: float, least: float = CLOSING) -> float:
-    """Time that a script gives the fingers to close to ``gap`` [m]: what they take, ``least`` at least [s]."""
+    """Time that a script gives the fingers to close to ``gap`` [m]: as long as they take, but at least ``least`` [s]."""
     return round(max(least, closing_time(robot, gap)), 3)
 
 

@@ -214,7 +214,7 @@ def robot_model(robot: RobotCfg, whole: bool = False) -> mujoco.MjModel:
 
 
 def at_home(robot: RobotCfg, whole: bool = False) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot alone, as ``robot_model`` compiles it, and all its poses at home."""
+    """The model of the robot alone (``robot_model``), and its data with the poses of all bodies at home."""
     model = robot_model(robot, whole)
     data = mujoco.MjData(model)
     data.qpos[[model.joint(name).qposadr[0] for name in robot.joints]] = robot.home

@@ -23,7 +23,7 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 
 OPEN = 0.06  # [m] greatest opening of the hand: handles are less than 2 cm wide
 NEAR = 0.04  # [m] distance from the grasp point within which the handle counts as in the hand
-TILT = math.radians(15)  # of the hand from level, fingertips down
+TILT = math.radians(15)  # [rad] tilt of the hand from level, fingertips down
 SPEED = 0.02  # [m/s] speed above which the handle counts as moved
 OFF: Mapping[str, Range] = {"x": (-0.03, 0.03), "y": (-0.03, 0.03), "yaw": (-0.15, 0.15)}  # [m, rad] offsets of the fixture
 HALF: PositiveRange = (0.5, 2.0)  # factors of damping and dry friction
@@ -39,7 +39,7 @@ class Task:
         handle: what to take hold of, without ``grip``, which ``held`` adds.
         middle: offset of the handle along y from ``place`` at the start, so that its path lies in front of the robot [m].
         follow, beyond: see ``FollowJointCfg``.
-        level: the hand stays level, in place of tilted by ``TILT``.
+        level: the hand stays level. Otherwise it is tilted by ``TILT``.
     """
 
     robot: RobotCfg

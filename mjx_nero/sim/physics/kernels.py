@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 # Warp's current device belongs to the process, not to a thread. Hold this lock while changing it, so that no other thread
-# makes anything meanwhile: kernels with arrays on another device than their own end the process.
+# makes anything meanwhile: a kernel whose arrays are on another device crashes the process.
 WARP = threading.Lock()
 
 
@@ -41,7 +41,7 @@ def make(
 
 
 def packed(name: str, values: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Whole numbers and arrays as one argument of kernels: its type, called ``name``, and itself."""
+    """Packs integers and arrays into one kernel argument. Returns its type, called ``name``, and its value."""
     import warp as wp
 
     types: dict[str, Any] = {
@@ -75,7 +75,7 @@ def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
 
 
 def batched(function: Callable[..., tuple], outputs: int) -> Callable[..., tuple]:
-    """A function of batches that ``jax.vmap`` calls once, with one more leading axis on all that it is given."""
+    """Wraps a function of batches: ``jax.vmap`` calls it once, with one more leading axis on all arguments."""
     whole = jax.custom_batching.custom_vmap(function)
 
     @whole.def_vmap
@@ -94,7 +94,7 @@ class Programs:
         self._made: dict[tuple[str, int], Any] = {}  # by device and number of worlds
 
     def __call__(self, n: int) -> Any:
-        """Returns what ``n`` worlds need on Warp's current device."""
+        """Returns the program for ``n`` worlds on Warp's current device."""
         import warp as wp
 
         key = (str(wp.get_device()), n)
@@ -103,7 +103,7 @@ class Programs:
         return self._made[key]
 
     def prepare(self, n: int, num_devices: int) -> None:
-        """Makes it on each of the first devices. A thread may call this."""
+        """Makes the program on each of the first devices. A thread may call this."""
         import warp as wp
 
         for device in wp.get_cuda_devices()[:num_devices] or [wp.get_device("cpu")]:
@@ -113,7 +113,7 @@ class Programs:
 
 
 def captured(run: Callable[[], None]) -> Callable[[], None]:
-    """Runs a function's launches as one CUDA graph. The function was called before: loading kernels cannot be captured."""
+    """Captures a function's launches in one CUDA graph. Call the function once before: loading kernels cannot be captured."""
     import warp as wp
 
     with wp.ScopedCapture() as capture:

@@ -45,7 +45,7 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> tuple[Any, list[Work], lis
 
 
 def _contacts(model: Any, data: Any) -> tuple[Any, Any, Any]:
-    """The contacts as one argument of a kernel: its type, itself, and the function of one contact's force [N]."""
+    """Packs the contacts into one kernel argument. Returns its type, its value, and the function of one contact's force [N]."""
     import warp as wp
     from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
 
