@@ -179,7 +179,7 @@ def test_our_own_have_what_their_comments_say():
             "a joint of body 'a' has no name: give it one",
         ),
         ("<mujoco><worldbody><body><joint name='a' type='ball'/></body></worldbody></mujoco>", "choose from hinge, slide"),
-        ("<mujoco><include file='/etc/passwd'/></mujoco>", "<include> has no place"),
+        ("<mujoco><include file='/etc/passwd'/></mujoco>", "<include> is not allowed"),
         ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "is not a valid model: .*mass"),
     ],
 )
