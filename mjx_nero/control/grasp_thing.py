@@ -140,9 +140,7 @@ class GraspThing(PickUp):
 
     def _over(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""], gap: Float[Array, ""]) -> Float[Array, "3"]:
         """Computes the place of the grasp point for this middle of the pads, which is kept off the table."""
-        height = jnp.maximum(middle[2], view.root_pos_w[2] + self.cfg.lowest) + self.cfg.beyond
-        aside = jnp.interp(gap, self._opened, self._aside)
-        return middle.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
+        return self.around(view, middle, yaw, jnp.interp(gap, self._opened, self._aside))
 
     def _local(self, view: View, place: Float[Array, "3"]) -> Float[Array, "3"]:
         seen = view.objects[self.cfg.object]

@@ -24,8 +24,13 @@ UNREACHABLE = 100.0  # cost of a pose out of reach, in radians of joint motion
 _ROOM_COUNTS = 60.0  # [rad/m] joint motion that a metre of room for the fingers is worth
 _LOST = 0.05  # [m] distance from its place in a good grasp beyond which the object has been lost
 _SLOW = 0.2  # [rad/s]
-# [m/rad] weight of the hand's orientation at the goal. Where the hand has to lean, 0.03 leaves it centimetres beside the goal.
+_THERE = 0.02  # [rad] tolerance within which an arm has arrived where it was sent, even if that is beside a place out of reach
+_STILL = 0.05  # [1/s] share of their way: fingers that close more slowly have met something
+# [m/rad] weight of the hand's orientation at the goal. Where the hand has to lean, more leaves it centimetres beside the goal.
 _HELD = 0.003
+# [rad] On its way down the hand waits while a joint lags by more. Only then do all joints lag alike (``setpoint.follow``);
+# otherwise the hand leaves its line and lands on the object.
+_BEHIND = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +48,7 @@ class PickUpCfg:
         above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away.
         speed: speed of the grasp point [m/s].
         closing: time that the fingers take to close [s], besides the lag of their drives.
-        ik: settings of the arm's motion. At the goal, orientation has little weight: a hand that cannot point down leans.
+        ik: settings of the arm's motion. Orientation has little weight, least at the goal: a hand that cannot point down leans.
     """
 
     object: str = "cube"
@@ -55,7 +60,7 @@ class PickUpCfg:
     above: Positive = 0.08
     speed: Positive = 0.3
     closing: Positive = 0.3
-    ik: IkCfg = IkCfg(orientation_weight=0.03, restarts=3)
+    ik: IkCfg = IkCfg(orientation_weight=0.01, restarts=3)
 
 
 @struct.dataclass
@@ -89,7 +94,8 @@ class PickUp:
         gripper, ik: the hand's fingers, and the arm's kinematics.
         lead: how far the arm's targets lead its set-point, by joint [s].
         gentle: greatest acceleration of the arm with the object in its hand [rad/s2].
-        closed, finger_step: time after which the fingers have closed [s], and how far they move in a step.
+        closed, pressed, finger_step: time after which the fingers have closed [s], and after which they press if something has
+            stopped them; how far they move in a step.
         lost: distance of the object from its place in the hand beyond which it counts as lost [m].
 
     Raises:
@@ -102,13 +108,18 @@ class PickUp:
         if cfg.aside and len(cfg.aside) != len(cfg.turns):
             raise UserError(f"aside takes one value per object, got {cfg.aside} for {len(cfg.turns)}")
         self.dt, self.cfg = dt, cfg
-        self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik, point=robot.grip)
-        self._n = len(robot.arm.joints)
+        self._n, self._opening = len(robot.arm.joints), np.array(grasp.opening(robot), np.float32)
         self._down, self._grip = np.array(robot.down, np.float32), np.array(robot.grip, np.float32)
-        self._opening = np.array(grasp.opening(robot), np.float32)
+        same = cfg.aside[0] if len({*cfg.aside}) == 1 else 0.0
+        self._point = self._grip + same * self._opening  # point of the hand that has to be at the object
+        x, y, z = map(float, self._point)
+        self.gripper, self.ik = ParallelGripper(robot), InverseKinematics(robot, cfg=cfg.ik, point=(x, y, z))
         self.lead, self._speed = np.array(robot.arm.lead, np.float32), np.array(robot.arm.speed, np.float32)
         self.gentle = setpoint.gentle(robot.arm.lead)
         self.closed, self.finger_step = self.gripper.pace(cfg.closing, dt)
+        lag = float(np.max(robot.gripper.lead, initial=0.0))
+        self.pressed = self.closed - lag
+        self._closing = np.subtract(robot.gripper.close, robot.gripper.open).astype(np.float32)  # the fingers' way
         self.lost = float(np.linalg.norm(robot.grip)) + _LOST
         self._reach = robot.opening / 2  # distance of a finger from the grasp point
         # Relative to an object's heading; a round object has none.
@@ -144,6 +155,8 @@ class PickUp:
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
         upright = jnp.where(phase == CARRY, min(_HELD, self.cfg.ik.orientation_weight), self.cfg.ik.orientation_weight)
         found = self.ik.local(pos, self.hand(memory.yaw), memory.q, upright).q
+        waits = (phase == DOWN) & (jnp.max(jnp.abs(found - memory.q)) > _BEHIND)
+        pos = jnp.where(waits, memory.pos, pos)
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
         fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self.gentle)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
@@ -152,8 +165,11 @@ class PickUp:
 
         lost = (phase >= UP) & (self.off(memory, view) > self.lost)
         falls = (phase == ABOVE) & (memory.tries > 0)
-        held, meant = (math.rotate(quat, jnp.asarray(self._grip)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
-        ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), far < 1e-3)
+        held, meant = (math.rotate(quat, jnp.asarray(self._point)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
+        there = jnp.max(jnp.abs(view.joint_pos[: self._n] - memory.above)) < _THERE
+        arrived = jnp.where(phase == ABOVE, there, far < 1e-3)
+        gripped = jnp.all(view.joint_vel[self._n :] * self._closing <= _STILL * self._closing**2)
+        ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), arrived, gripped)
         memory = dataclasses.replace(
             self.again(memory, view, lost | falls),
             phase=jnp.where(lost, ABOVE, phase + ended),
@@ -170,21 +186,24 @@ class PickUp:
         """Distance of the grasp point from where the object is to be held [m]."""
         return jnp.linalg.norm(view.ee_pos_w - view.objects[self.cfg.object].pos_w)
 
-    def _ended(self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""]) -> Bool[Array, ""]:
+    def _ended(
+        self, memory: PickUpMemory, error: Float[Array, ""], arrived: Bool[Array, ""], gripped: Bool[Array, ""]
+    ) -> Bool[Array, ""]:
         """True if the phase is done, or its time is up.
 
         Args:
             error: position error of the grasp point [m].
-            arrived: the set-point has arrived.
+            arrived: the arm is as near to the place above the object as it comes; in later phases, the set-point has arrived.
+            gripped: the fingers close no further.
         """
         time = (memory.count + 1) * self.dt
         still = jnp.max(jnp.abs(memory.qd)) < 0.1
         return jnp.select(
             [memory.phase == ABOVE, memory.phase == DOWN, memory.phase == CLOSE, memory.phase == UP],
             [
-                still & (error < 0.01) | (time > 2.5),
-                arrived & still & (error < 0.004) | (time > 0.8),
-                time > self.closed,
+                (error < 0.01) | still & arrived | (time > 2.5),
+                arrived & still & (error < 0.004) | (time > 1.5),
+                (time > self.closed) | gripped & (time > self.pressed),
                 arrived | (time > 1.0),
             ],
             False,
@@ -213,11 +232,19 @@ class PickUp:
 
     def _pick(self, view: View, yaw: Float[Array, ""]) -> Float[Array, "3"]:
         """Computes where the grasp point must be."""
-        seen, table = view.objects[self.cfg.object].pos_w, view.root_pos_w[2]
-        low = jnp.maximum(0.0, grasp.CLEAR - (seen[2] - table) / 2)  # a low object must not be at the pads' lower edges
-        height = jnp.maximum(seen[2], table + self.cfg.lowest - low) + self.cfg.beyond
         aside = jnp.array(self.cfg.aside or (0.0,))[0 if view.target is None else view.target]
-        return seen.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
+        return self.around(view, view.objects[self.cfg.object].pos_w, yaw, aside)
+
+    def around(self, view: View, middle: Float[Array, "3"], yaw: Float[Array, ""], aside: Float[Array, ""]) -> Float[Array, "3"]:
+        """Computes where the grasp point must be so that the pads hold what is at ``middle``, without touching the table [m].
+
+        Args:
+            aside: offset of the pads' middle from its usual place along the opening [m].
+        """
+        table = view.root_pos_w[2]
+        low = jnp.maximum(0.0, grasp.CLEAR - (middle[2] - table) / 2)  # a low object must not be at the pads' lower edges
+        height = jnp.maximum(middle[2], table + self.cfg.lowest - low) + self.cfg.beyond
+        return middle.at[2].set(height) - math.rotate(self.hand(yaw), jnp.asarray(self._grip) + aside * self._opening)
 
     def _room(self, view: View, angles: Float[Array, " n"]) -> Float[Array, " n"]:
         """Distance from the open fingers to the nearest of the other objects' centres [m], at most half the hand's opening."""

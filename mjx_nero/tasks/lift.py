@@ -28,6 +28,9 @@ from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks import sim2real as sim2reals
 
+SPEED = 0.4  # [m/s] of the script's hand: 5 s are short for arms with slow joints
+OVER = 0.02  # [m] height over the cube from which the script's hand comes down
+
 
 @dataclasses.dataclass(frozen=True)
 class LiftSetup:
@@ -61,6 +64,9 @@ class LiftSetup:
             "lowest": grasp.lowest(robot.pad),
             "beyond": grasp.beyond(robot, edge),
             "closing": grasp.closing(robot, edge, grasp.QUICK),
+            "above": round(edge + OVER, 4),
+            "speed": SPEED,
+            "aside": (grasp.aside(robot, robot.opening),),  # amid the open fingers a cube that lies askew has most room
         }
         return {"pick_up": {**fields, **regions.ik(robot, "ik.")}}
 

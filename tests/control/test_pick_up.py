@@ -15,7 +15,7 @@ from mjx_nero.control.pick_up import PickUp, PickUpCfg
 from mjx_nero.sim import grasp
 from mjx_nero.tasks.arms.cobotta_pro_900 import COBOTTA_PRO_900
 from mjx_nero.tasks.arms.nero import NERO
-from mjx_nero.tasks.arms.so_arm100 import SO_ARM100
+from mjx_nero.tasks.arms.so_arm100 import LIFT, SO_ARM100
 from mjx_nero.types import ObjectView, View
 
 CFG = PickUpCfg(object="target", heading=(0, 2, 0), turns=(4, 2, 0), lowest=0.03)
@@ -93,6 +93,14 @@ def test_a_jaw_that_turns_goes_beside_a_small_object_as_it_goes_beside_the_cube(
         np.testing.assert_allclose(aside._pick(seen(index), jnp.array(math.pi / 2)), wanted, atol=1e-6)
 
 
+def test_the_hand_comes_down_with_the_cube_amid_its_open_fingers():
+    """The SO-ARM's fixed jaw would come down 4 mm beside a cube of 30 mm; amid the open jaws it is 5 mm further off."""
+    fields = LIFT.controllers(SO_ARM100)["pick_up"]
+    assert fields["aside"] == (pytest.approx(-0.005, abs=1e-3),) and fields["above"] == pytest.approx(0.03 + 0.02)
+    made = control.make("pick_up", SO_ARM100, 0.02, fields)
+    np.testing.assert_allclose(np.abs(made._point), np.abs(grasp.opening(SO_ARM100)) * 0.005, atol=1e-3)
+
+
 def test_fingers_whose_drives_lag_get_time_to_press():
     """A third of a second, the jaw's damping over its stiffness: its targets take as much longer, and the hand waits as long."""
     slow, quick = (PickUp(robot, 0.02, PickUpCfg(closing=0.4)) for robot in (SO_ARM100, NERO))
@@ -119,14 +127,16 @@ def test_a_hand_that_has_lost_an_object_follows_it_as_it_falls(controller):
 def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
     memory = fresh()
 
-    def ends(phase, count=0, error=0.0, arrived=True, qd=0.0) -> bool:
+    def ends(phase, count=0, error=0.0, arrived=True, qd=0.0, gripped=False) -> bool:
         now = dataclasses.replace(memory, phase=jnp.array(phase), count=jnp.array(count), qd=jnp.full(6, qd))
-        return bool(controller._ended(now, jnp.array(error), jnp.array(arrived)))
+        return bool(controller._ended(now, jnp.array(error), jnp.array(arrived), jnp.array(gripped)))
 
-    assert ends(pick_up.ABOVE, error=0.009) and not ends(pick_up.ABOVE, error=0.011) and not ends(pick_up.ABOVE, qd=0.2)
-    assert ends(pick_up.ABOVE, error=1.0, count=125)
+    assert ends(pick_up.ABOVE, error=0.009, arrived=False) and not ends(pick_up.ABOVE, error=0.011, arrived=False)
+    assert ends(pick_up.ABOVE, error=0.011) and not ends(pick_up.ABOVE, error=0.011, qd=0.2)  # it reaches no further
+    assert ends(pick_up.ABOVE, error=1.0, arrived=False, count=125)
     assert ends(pick_up.DOWN, error=0.003) and not ends(pick_up.DOWN, error=0.005) and not ends(pick_up.DOWN, arrived=False)
     assert not ends(pick_up.CLOSE, count=26) and ends(pick_up.CLOSE, count=27)  # 0.3 s of closing, 0.1 s of lag and 0.15 s
+    assert not ends(pick_up.CLOSE, count=24, gripped=True) and ends(pick_up.CLOSE, count=25, gripped=True)  # half of the lag
     assert ends(pick_up.UP) and not ends(pick_up.UP, arrived=False) and not ends(pick_up.CARRY, count=10_000)
 
 
