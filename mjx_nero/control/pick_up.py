@@ -202,7 +202,7 @@ class PickUp:
             [memory.phase == ABOVE, memory.phase == DOWN, memory.phase == CLOSE, memory.phase == UP],
             [
                 (error < 0.01) | still & arrived | (time > 2.5),
-                arrived & still & (error < 0.004) | (time > 1.5),
+                arrived & (still & (error < 0.004) | (time > 0.8)) | (time > 1.5),
                 (time > self.closed) | gripped & (time > self.pressed),
                 arrived | (time > 1.0),
             ],

@@ -135,6 +135,9 @@ def test_phases_end_when_their_work_is_done_or_their_time_is_over(controller):
     assert ends(pick_up.ABOVE, error=0.011) and not ends(pick_up.ABOVE, error=0.011, qd=0.2)  # it reaches no further
     assert ends(pick_up.ABOVE, error=1.0, arrived=False, count=125)
     assert ends(pick_up.DOWN, error=0.003) and not ends(pick_up.DOWN, error=0.005) and not ends(pick_up.DOWN, arrived=False)
+    # An arm that has arrived beside the object gets no nearer; one that is still on its way may.
+    assert ends(pick_up.DOWN, error=0.005, count=40) and not ends(pick_up.DOWN, error=0.005, arrived=False, count=40)
+    assert ends(pick_up.DOWN, arrived=False, count=75)
     assert not ends(pick_up.CLOSE, count=26) and ends(pick_up.CLOSE, count=27)  # 0.3 s of closing, 0.1 s of lag and 0.15 s
     assert not ends(pick_up.CLOSE, count=24, gripped=True) and ends(pick_up.CLOSE, count=25, gripped=True)  # half of the lag
     assert ends(pick_up.UP) and not ends(pick_up.UP, arrived=False) and not ends(pick_up.CARRY, count=10_000)
