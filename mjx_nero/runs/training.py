@@ -88,9 +88,9 @@ def _summary(folder: pathlib.Path) -> dict[str, Any]:
             values.read(kind, found[name], name)
         values.read(Share, found["evaluation"]["success_rate"], "evaluation.success_rate")
         values.read(Mapping[str, int], found["lost"], "lost")
-        best = found.get("best", found["evaluation"])  # runs of version 0.5 have none
-        values.read(Share, best["success_rate"], "best.success_rate")
-        values.read(int, best.get("env_steps", 0), "best.env_steps")
+        if "best" in found:  # runs of version 0.5 have none
+            values.read(Share, found["best"]["success_rate"], "best.success_rate")
+            values.read(int, found["best"]["env_steps"], "best.env_steps")
     except (UserError, KeyError, TypeError) as error:
         raise UserError(f"{path} is damaged ({error}): remove it") from None
     return found

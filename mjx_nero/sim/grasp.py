@@ -84,11 +84,14 @@ def _in_hand(robot: RobotCfg, way: tuple[float, float, float]) -> np.ndarray:
 def aside(robot: RobotCfg, gap: float) -> float:
     """Returns the offset of the pads' middle along the opening, from its place around the robot's cube [m].
 
-    It is 0 if both sides move alike. If one side stands still, its pad comes down as near to a small object as to the cube.
+    It is 0 if both sides move alike, and without a gripper or a known opening. If one side stands still, its pad comes down as
+    near to a small object as to the cube.
 
     Args:
         gap: distance between the pads [m].
     """
+    if not (robot.gripper.joints and robot.opening):
+        return 0.0
     hand, cube = _Hand(robot), cube_for(robot).size[0] + 2 * BESIDE
     return round(hand.middle(hand.share(gap)) - hand.middle(hand.share(cube)), 3) + 0.0
 

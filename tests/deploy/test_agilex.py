@@ -150,7 +150,7 @@ def test_a_silent_bus_is_refused(bench):
 
 @pytest.mark.parametrize("port", ["can0", "nonsense:can0", "slcan:/dev/nothing"])
 def test_wrong_ports_are_one_line(kind, told, port):
-    with pytest.raises(UserError, match="--port of a (Piper|Nero) is|cannot open"):
+    with pytest.raises(UserError, match="--port of a (Piper|Nero) takes|cannot open"):
         agilex.of(kind, told, arms.Clock(), port).connect()
 
 

@@ -22,7 +22,7 @@ def test_a_signal_is_told_once_it_came(name):
     with stop.operator() as asked:
         assert asked() is None
         os.kill(os.getpid(), number)
-        assert asked().kind == "stop" and asked().text == f"{name} came"
+        assert asked().kind == "stop" and asked().text == f"{name} arrived"
     assert signal.getsignal(number) is before
 
 
@@ -75,7 +75,7 @@ def test_a_signal_ends_a_run_in_hold(lift, tmp_path):
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=50)[0]
-    assert process.returncode == 0 and "the arm holds: SIGTERM came" in said
+    assert process.returncode == 0 and "the arm holds: SIGTERM arrived" in said
     with open(log) as file:
         rows = [row for row in csv.DictReader(line for line in file if line[0] != "#") if row["target.shoulder_pan"]]
     assert rows[-1]["held"] == "stop" and not rows[0]["held"]

@@ -78,7 +78,7 @@ def test_at_level_0_nothing_differs_and_at_1_all_does(env, reset):
 def test_a_level_takes_a_share_of_each_drawn_field(env, reset):
     half, full = (reset(KEYS, level).pipeline_state.fields for level in (0.5, 1.0))
     for name in ("body_mass", "geom_friction", "actuator_gainprm", "dof_frictionloss"):
-        nominal = np.asarray(env._randomization._nominal[name])
+        nominal = np.asarray(env._randomization._draws.nominal[name])
         np.testing.assert_allclose(np.asarray(half[name]), (nominal + np.asarray(full[name])) / 2, rtol=1e-5, atol=1e-7)
 
 

@@ -87,7 +87,7 @@ def test_encoders_of_ones_own(monkeypatch):
     encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
     _, (_, params) = made(dataclasses.replace(CFG, encoders=(("picture", "mean"),)))
     assert params.policy["params"]["MLP_0"]["hidden_0"]["kernel"].shape == (2 + 9, 16)
-    with pytest.raises(UserError, match="there already is an encoder 'mean': choose another name"):
+    with pytest.raises(UserError, match="there is already an encoder 'mean': choose another name"):
         encoders.ENCODERS.add("mean", lambda shape, cfg: Mean())
 
 

@@ -124,7 +124,7 @@ def test_another_learner_trains_is_resumed_played_and_measured(search, call, tmp
 
 
 def test_names_of_learners(search, call):
-    with pytest.raises(UserError, match="there already is a learner 'search': choose another name"):
+    with pytest.raises(UserError, match="there is already a learner 'search': choose another name"):
         learner.KINDS.add("search", learner.find("search"))
     with pytest.raises(
         UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, clone, distill, search"

@@ -41,7 +41,7 @@ def test_the_delay_explains_what_the_model_does_not(recorded, tmp_path):
 
 
 def test_another_robots_file_is_refused(recorded, tmp_path):
-    with pytest.raises(UserError, match="is of nero"):
+    with pytest.raises(UserError, match="is for nero"):
         replay.run_of(recorded[0], ROBOT, 0.005, drives(tmp_path / "d.yaml", 0.0, "nero"))
 
 

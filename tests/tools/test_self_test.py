@@ -76,7 +76,7 @@ def test_gripper_that_stops(robot):
     """A drive of 0.1 mN moves fingers of 50 g by millimetres."""
     weak = dataclasses.replace(robot.gripper, effort=(1e-4,))
     said = checks._gripper(dataclasses.replace(robot, gripper=weak))
-    assert said.startswith("the gripper stops at ") and " of 0.01 " in said and "all its effort" in said
+    assert said.startswith("the gripper stops at ") and " of 0.01 " in said and "at its effort limit" in said
     lazy = dataclasses.replace(robot.gripper, damping=(1e4,), effort=(1e4,))
     assert "its drive lags by" in checks._gripper(dataclasses.replace(robot, gripper=lazy))
     slow = dataclasses.replace(robot.gripper, speed=(1e-9,))
