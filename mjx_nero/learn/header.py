@@ -17,8 +17,20 @@ MAX_POLICY = 200_000_000  # bytes
 MAX_ARRAYS = 5_000
 MAX_LAYERS, MAX_WIDTH = 16, 8192  # of networks
 MAX_SIZE = 1_000_000  # numbers per observation group
-_SIZES = {"F": ("float", (64, 32, 16)), "I": ("int", (64, 32, 16, 8)), "U": ("uint", (64, 32, 16, 8))}
-DTYPES = {f"{short}{bits}": f"{name}{bits}" for short, (name, sizes) in _SIZES.items() for bits in sizes} | {"BOOL": "bool"}
+DTYPES = {  # a safetensors file's name of a type -> numpy's
+    "F64": "float64",
+    "F32": "float32",
+    "F16": "float16",
+    "I64": "int64",
+    "I32": "int32",
+    "I16": "int16",
+    "I8": "int8",
+    "U64": "uint64",
+    "U32": "uint32",
+    "U16": "uint16",
+    "U8": "uint8",
+    "BOOL": "bool",
+}
 Arrays = dict[str, tuple[str, tuple[int, ...]]]  # name -> (numpy's name of the type, shape)
 
 
