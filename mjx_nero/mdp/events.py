@@ -120,14 +120,6 @@ def joints_by_scale(key: Key, start: Start, *, low: float, high: float) -> Start
     return dataclasses.replace(start, joint_pos=joint_pos * jax.random.uniform(key, joint_pos.shape, minval=low, maxval=high))
 
 
-def joints_offset_uniform(key: Key, start: Start, *, offset: NonNegative) -> Start:
-    """Moves every joint by a uniform offset of at most ``offset`` [rad or m]. The caller clips to the joint ranges."""
-    joint_pos = start.joint_pos
-    return dataclasses.replace(
-        start, joint_pos=joint_pos + jax.random.uniform(key, joint_pos.shape, minval=-offset, maxval=offset)
-    )
-
-
 def joint_turned(key: Key, start: Start, *, joint: int, by: Range) -> Start:
     """Moves one joint, counted from 0, by a uniform offset [rad or m]. The caller clips to the joint ranges."""
     offset = jax.random.uniform(key, minval=by[0], maxval=by[1])

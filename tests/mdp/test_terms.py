@@ -566,15 +566,6 @@ def test_object_event_places_one_object(name):
     np.testing.assert_allclose(placed.max(0), [0.4, 0.2, 0.115], atol=0.001)
 
 
-def test_joint_event_adds_to_every_joint():
-    joints, start = jnp.array([1.0, 2.0]), jnp.array([0.2, 0.0, 0.015])
-    moved, cubes, _ = starts(events.joints_offset_uniform, joints, start, offset=0.1)
-    assert (cubes == start).all()
-    np.testing.assert_allclose(moved.min(0), [0.9, 1.9], atol=0.001)
-    np.testing.assert_allclose(moved.max(0), [1.1, 2.1], atol=0.001)
-    assert abs(np.corrcoef(moved.T)[0, 1]) < 0.1  # each joint by its own draw
-
-
 def test_one_joint_is_turned():
     joints, start = jnp.array([1.0, 2.0]), jnp.array([0.2, 0.0, 0.015])
     moved, cubes, _ = starts(events.joint_turned, joints, start, joint=1, by=(-0.3, 0.1))
