@@ -22,7 +22,7 @@ from PIL import Image
 
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import rollout
-from mjx_nero.runs import evaluation
+from mjx_nero.runs import evaluation, videos
 from mjx_nero.sim import objects, render
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, results
@@ -113,7 +113,7 @@ def film(path: pathlib.Path, played: evaluation.Played, which: np.ndarray) -> No
                 frame = Image.fromarray(renderer.render(shown.qpos[t, k], shown.scenery[t, k])).resize(
                     (320, 240), Image.Resampling.BOX
                 )
-                frames.append(Image.fromarray(render.inset(np.array(frame), [each[t, k] for each in shown.pictures])))
+                frames.append(Image.fromarray(videos.inset(np.array(frame), [each[t, k] for each in shown.pictures])))
     for quality in (35, 20, 10):
         write(path, frames, every * played.env.dt, quality)
         if path.stat().st_size < LARGEST:

@@ -17,14 +17,13 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, header, machines, policy
 from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
-from mjx_nero.runs import compiled, console, resume, signals, starts, track, trust
+from mjx_nero.runs import compiled, console, resume, signals, starts, track, trust, videos
 from mjx_nero.runs import folder as run_folder
 from mjx_nero.runs.cfg import RunCfg, fit_machine, learner_cfg, resolve
 from mjx_nero.runs.checkpoints import Checkpoints, NotWritten, saved
 from mjx_nero.runs.compiled import Compiled
 from mjx_nero.runs.logs import Logs
 from mjx_nero.runs.loop import Loop, Tally
-from mjx_nero.sim import render
 
 __all__ = ["RunCfg", "carry_out", "describe", "film", "fit_machine", "learner_cfg", "prepare", "resolve", "speaker", "train"]
 
@@ -147,7 +146,7 @@ def carry_out(
     return _finish(run, made.learner, tally, ended, folder, made.seconds)
 
 
-def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
+def film(run: RunCfg, folder: pathlib.Path, video: videos.VideoCfg) -> None:
     """Plays a run's policy in MuJoCo's C library and draws its episodes to ``video.mp4``. If it cannot, it says so.
 
     Args:
@@ -161,7 +160,7 @@ def film(run: RunCfg, folder: pathlib.Path, video: render.VideoCfg) -> None:
         with console.drawing(screen, "video.mp4") as update:
             played = act(None, run.seed)
             path, what = folder / "video.mp4", (played.qpos, played.scenery)
-            render.write_episodes(path, env.mj_model, *what, env.dt, video, update, played.pictures)
+            videos.write_episodes(path, env.mj_model, *what, env.dt, video, update, played.pictures)
     except UserError as error:
         console.line(screen, str(error))
 

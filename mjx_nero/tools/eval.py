@@ -11,9 +11,8 @@ import numpy as np
 
 from mjx_nero import control, files
 from mjx_nero.errors import UserError
-from mjx_nero.runs import console
+from mjx_nero.runs import console, videos
 from mjx_nero.runs.evaluation_cfg import EXPERT, EvalCfg
-from mjx_nero.sim import render
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
@@ -44,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
         raise UserError("--failures selects the episodes of a video: pass --video FILE.mp4, too")
     for path in filter(None, (args.video, args.json)):
         files.check_writable(path)
-    video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
+    video = videos.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
     from mjx_nero.runs import evaluation  # with Brax and MJX, which help does without
 
     cfg = EvalCfg(
@@ -96,13 +95,13 @@ def report(result: dict[str, Any]) -> None:
         print(f"warning: {result['warning']}", file=sys.stderr)
 
 
-def draw(played: "Played", path: pathlib.Path, cfg: render.VideoCfg) -> None:
+def draw(played: "Played", path: pathlib.Path, cfg: videos.VideoCfg) -> None:
     """Writes the video, or prints why it cannot."""
     screen, episodes = console.screen(), played.episodes
     try:
         with console.drawing(console.screen(stderr=True), path.name) as update:
             model, what = played.env.mj_model, (episodes.qpos, episodes.scenery)
-            render.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.pictures)
+            videos.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.pictures)
         console.wrote(screen, "video", path)
     except UserError as error:
         console.line(screen, str(error))

@@ -10,11 +10,10 @@ from typing import Any
 from mjx_nero.envs.env import MAX_SPEED
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
-from mjx_nero.runs import console, resume, track, training
+from mjx_nero.runs import console, resume, track, training, videos
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.checkpoints import saved
 from mjx_nero.runs.folder import CONFIG
-from mjx_nero.sim import render
 from mjx_nero.tools import cli, seeds
 
 
@@ -52,7 +51,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
     films = args.video and not summary["code"]
     report(summary, films)
     if films:
-        video = render.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
+        video = videos.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
         training.film(run, pathlib.Path(summary["folder"]), video)
     if summary["code"]:
         sys.exit(summary["code"])

@@ -13,7 +13,7 @@ import pytest
 
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.play import rollout
-from mjx_nero.runs import evaluation, logs, training
+from mjx_nero.runs import evaluation, logs, training, videos
 from mjx_nero.sim import render
 from mjx_nero.sim.physics import host
 from mjx_nero.sim.physics.native import NativePhysics
@@ -180,7 +180,7 @@ def test_video_has_real_frames(call, tmp_path):
 def test_a_video_of_failures_shows_them_alone(call, tmp_path, monkeypatch):
     """Of the episodes that play, the second and the fourth fail."""
     drawn = []
-    monkeypatch.setattr(render, "write_episodes", lambda path, model, qpos, scenery, *_: drawn.append((qpos, scenery.goal_pos_w)))
+    monkeypatch.setattr(videos, "write_episodes", lambda path, model, qpos, scenery, *_: drawn.append((qpos, scenery.goal_pos_w)))
     played = evaluation.play
     succeeds = np.array([True, False, True, False])
     monkeypatch.setattr(rollout.Episodes, "success", property(lambda self: succeeds))

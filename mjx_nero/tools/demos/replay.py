@@ -13,8 +13,7 @@ from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.recording.demonstrations import start
-from mjx_nero.runs import console
-from mjx_nero.sim import render
+from mjx_nero.runs import console, videos
 from mjx_nero.tools.demos import making
 from mjx_nero.types import Scenery
 
@@ -38,8 +37,8 @@ def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
     if video:
         with console.drawing(console.screen(stderr=True), video.name) as update:
             drawn = episode.arrays[names.QPOS].astype(np.float64)[:, None]
-            cfg = render.VideoCfg(in_turn=1)
-            render.write_episodes(video, env.mj_model, drawn, scenery[:, None], env.dt, cfg, update)
+            cfg = videos.VideoCfg(in_turn=1)
+            videos.write_episodes(video, env.mj_model, drawn, scenery[:, None], env.dt, cfg, update)
         console.wrote(screen, "video", video)
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy import ndimage
 
 import mjx_nero
-from mjx_nero.sim import render
+from mjx_nero.runs import videos
+from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
 SCENERY = Scenery(np.zeros((150, 3, 3)), np.zeros((150, 3, 4)))
@@ -19,8 +20,8 @@ def written(monkeypatch):
     """``written(seconds a megapixel, VideoCfg) -> (width, height, pictures, frames a second, progress)`` by our own clock."""
     clock = [0.0]
 
-    def write(seconds: float, cfg: render.VideoCfg):
-        class Renderer:
+    def write(seconds: float, cfg: videos.VideoCfg):
+        class Drawer:
             def __init__(self, model, width, height, **kwargs):
                 self.size = width, height
 
@@ -37,10 +38,10 @@ def written(monkeypatch):
             render_all = render
 
         found, progress = [], []
-        monkeypatch.setattr(render, "Renderer", Renderer)
-        monkeypatch.setattr(render.time, "perf_counter", lambda: clock[0])
-        monkeypatch.setattr(render, "write_video", lambda path, images, fps: found.extend([list(images), fps]))
-        render.write_episodes("x.mp4", None, QPOS, SCENERY, DT, cfg, lambda *done: progress.append(done))
+        monkeypatch.setattr(videos, "Renderer", Drawer)
+        monkeypatch.setattr(videos.time, "perf_counter", lambda: clock[0])
+        monkeypatch.setattr(videos, "write_video", lambda path, images, fps: found.extend([list(images), fps]))
+        videos.write_episodes("x.mp4", None, QPOS, SCENERY, DT, cfg, lambda *done: progress.append(done))
         images, fps = found
         return *images[0], len(images), fps, progress
 
@@ -48,27 +49,27 @@ def written(monkeypatch):
 
 
 def test_where_a_gpu_draws_videos_are_720p_at_25(written):
-    width, height, count, fps, progress = written(0.01, render.VideoCfg())
+    width, height, count, fps, progress = written(0.01, videos.VideoCfg())
     assert (width, height, count, fps) == (1280, 720, 225, pytest.approx(25))
     assert progress == [(i + 1, 225) for i in range(225)]
 
 
 def test_where_software_draws_size_and_then_rate_fit_half_a_minute(written):
-    assert written(0.2, render.VideoCfg())[:3] == (960, 540, 225)  # 225 of 0.10 s; 720p would take 41 s
-    assert written(0.5, render.VideoCfg())[:3] == (640, 360, 225)  # 225 of 0.12 s
-    width, height, count, fps, _ = written(2.0, render.VideoCfg())  # 0.46 s each: 65 of them, every seventh step
+    assert written(0.2, videos.VideoCfg())[:3] == (960, 540, 225)  # 225 of 0.10 s; 720p would take 41 s
+    assert written(0.5, videos.VideoCfg())[:3] == (640, 360, 225)  # 225 of 0.12 s
+    width, height, count, fps, _ = written(2.0, videos.VideoCfg())  # 0.46 s each: 65 of them, every seventh step
     assert (width, height, count, fps) == (640, 360, 3 * 22, pytest.approx(1 / 0.14))
 
 
 def test_flags_set_size_and_rate(written):
-    assert written(2.0, render.VideoCfg(size=(320, 240), fps=50))[:4] == (320, 240, 450, pytest.approx(50))
-    assert written(0.01, render.VideoCfg(envs=3))[2] == 75  # side by side: one picture of all
+    assert written(2.0, videos.VideoCfg(size=(320, 240), fps=50))[:4] == (320, 240, 450, pytest.approx(50))
+    assert written(0.01, videos.VideoCfg(envs=3))[2] == 75  # side by side: one picture of all
 
 
 def test_robots_side_by_side_in_one_picture():
     env = mjx_nero.make("nero_lift", impl="native")
     try:
-        renderer = render.Renderer(env.mj_model, 1280, 720, envs=4)
+        renderer = Renderer(env.mj_model, 1280, 720, envs=4)
     except mjx_nero.UserError:
         assert not os.environ.get("CI")
         pytest.skip("no offscreen OpenGL")
