@@ -12,12 +12,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
+from mjx_nero.control.follow_target import Motion, RmpCfg, mover
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.rmpflow import Target
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.types import UserError, View
+from mjx_nero.types import View
 
 Corners = Float[Array, "n 3"]
 
@@ -39,23 +39,23 @@ class DetourCfg:
     speed: float = 0.2
     ramp: float = 0.04
     lead: float = 0.08
-    motion: str = "rmpflow"
+    motion: Motion = "rmpflow"
     rmpflow: RmpCfg = RmpCfg()
     ik: IkCfg = IkCfg(orientation_weight=0.03)
 
 
 @struct.dataclass
 class Way:
-    """A path of straight legs, the target's distance along it [m], and the set-point of an arm that keeps one."""
+    """A path of straight legs, the target's distance along it [m], and the arm's set-point."""
 
     corners: Corners
     travelled: Float[Array, ""]
-    setpoint: Float[Array, " nj"] | None = None  # [rad]
+    setpoint: Float[Array, " nj"]  # [rad]
 
     @classmethod
-    def through(cls, *corners: Float[Array, "3"]) -> "Way":
+    def through(cls, setpoint: Float[Array, " nj"], *corners: Float[Array, "3"]) -> "Way":
         """Makes the path through these corners, with the target at its beginning."""
-        return cls(jnp.stack(corners), jnp.zeros(()))
+        return cls(jnp.stack(corners), jnp.zeros(()), setpoint)
 
     @property
     def ends(self) -> Float[Array, " n"]:
@@ -82,11 +82,11 @@ class Way:
         return dataclasses.replace(self, travelled=jnp.minimum(self.travelled + by, self.length))
 
 
-def over(start: Float[Array, "3"], goal: Float[Array, "3"], view: View, clearance: float) -> Way:
+def over(setpoint: Float[Array, " nj"], start: Float[Array, "3"], goal: Float[Array, "3"], view: View, clearance: float) -> Way:
     """Makes a path from start to goal, ``clearance`` above the highest obstacle in between. Obstacles stand upright."""
     tops = [jnp.where(box.pos_w[2] > 0, box.pos_w[2] + box.size[2] / 2, -jnp.inf) for box in view.obstacles.values()]
     height = jnp.maximum(jnp.max(jnp.stack(tops)) + clearance, jnp.maximum(start[2], goal[2]))
-    return Way.through(start, start.at[2].set(height), goal.at[2].set(height), goal)
+    return Way.through(setpoint, start, start.at[2].set(height), goal.at[2].set(height), goal)
 
 
 class Detour:
@@ -98,24 +98,17 @@ class Detour:
         cfg: see ``DetourCfg``.
 
     Raises:
-        UserError: ``motion`` is neither rmpflow nor ik; or the robot has no RMPflow files, or they do not fit it.
+        UserError: the robot has no RMPflow files, or they do not fit it.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: DetourCfg = DetourCfg()):
-        if cfg.motion not in ("rmpflow", "ik"):
-            raise UserError(f"motion must be rmpflow or ik, got {cfg.motion!r}")
         self.dt, self.cfg, self._n = dt, cfg, len(robot.arm.joints)
-        self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
-        self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None
+        self._move = mover(robot, dt, cfg.motion, cfg.rmpflow, cfg.ik)
         self._down = np.array(robot.down, np.float32)
 
     def init(self, view: View) -> Way:
         """Plans the path from the end effector's position."""
-        return self._begin(over(view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance), view)
-
-    def _begin(self, way: Way, view: View) -> Way:
-        """Returns the path with the set-point where the arm is."""
-        return dataclasses.replace(way, setpoint=view.joint_pos[: self._n]) if self._ik else way
+        return over(view.joint_pos[: self._n], view.ee_pos_w, view.goal_pos_w, view, self.cfg.clearance)
 
     def step(self, memory: Way, view: View) -> tuple[Way, Float[Array, " nu"]]:
         """Computes the targets of the arm's drives; the gripper's stay."""
@@ -129,12 +122,10 @@ class Detour:
         # Constant acceleration within ``ramp``. At a corner a tenth of the speed remains, or the target would stay there.
         speed = self.cfg.speed * jnp.clip(jnp.sqrt(way.to_corner() / self.cfg.ramp), 0.1, 1.0)
         after = way.on(jnp.where(goes, speed * self.dt, 0.0))
+        if self.cfg.motion == "ik":  # the hand points down as far as it can: it would drift if it kept its present orientation
+            orientation = jnp.asarray(self._down)
         target = Target(position + offset, orientation, (after.target() - position) / self.dt, weight)
-        if self._rmpflow:
-            return after, self._rmpflow.arm(view, target)
-        assert self._ik is not None and way.setpoint is not None
-        # The hand points down as far as it can. If it were to keep its present orientation, it would drift.
-        setpoint, targets = self._ik.arm(way.setpoint, dataclasses.replace(target, orientation=jnp.asarray(self._down)))
+        setpoint, targets = self._move(way.setpoint, view, target)
         return dataclasses.replace(after, setpoint=setpoint), targets
 
     def warning(self, memory: Way) -> str:
@@ -204,13 +195,13 @@ class CarryPast(Detour):
         """Plans the path to the object, from above."""
         at = view.objects[self.cfg.object].pos_w + self._offset
         above = at + jnp.array([0.0, 0.0, self.cfg.approach])
-        way = self._begin(Way.through(view.ee_pos_w, above, above, at), view)  # as many corners as the path over obstacles
+        way = Way.through(view.joint_pos[: self._n], view.ee_pos_w, above, above, at)  # as many corners as over obstacles
         return CarryMemory(way, jnp.zeros((), jnp.int32), jnp.asarray(self._offset))
 
     def step(self, memory: CarryMemory, view: View) -> tuple[CarryMemory, Float[Array, " nu"]]:  # type: ignore[override]
         """Computes the targets of all drives."""
         at, holds = view.objects[self.cfg.object].pos_w, memory.there >= self._closed
-        off = dataclasses.replace(over(at, view.goal_pos_w, view, self.cfg.clearance), setpoint=memory.way.setpoint)
+        off = over(memory.way.setpoint, at, view.goal_pos_w, view, self.cfg.clearance)
         way = jax.tree.map(lambda new, old: jnp.where(memory.there == self._closed, new, old), off, memory.way)
         arrived = jnp.linalg.norm(way.corners[-1] - view.ee_pos_w) < self.cfg.near
         slip = jnp.clip(view.ee_pos_w - at, self._offset - 0.03, self._offset + 0.03)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from mjx_nero.config.bounds import OneOf
 from mjx_nero.control.controller import Memory
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.rmpflow import Obstacles, RmpFlow, Target
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
+
+Joints = Float[Array, " nj"]
+Motion = Annotated[str, OneOf("rmpflow", "ik")]  # what moves an arm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +100,7 @@ class IkArm:
         self._max_step = np.array(robot.arm.speed, np.float32) * dt
         self._lead = np.array(robot.arm.lead, np.float32)
 
-    def arm(self, q: Float[Array, " nj"], target: Target) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
+    def arm(self, q: Joints, view: View, target: Target) -> tuple[Joints, Joints]:
         """Returns the next set-point on the way to ``target``, and the drives' targets, ahead of it by their lag [rad]."""
         assert target.position is not None and target.orientation is not None
         after = rate_limit(self._ik.local(target.position, target.orientation, q).q, q, step=jnp.asarray(self._max_step))
@@ -130,7 +136,7 @@ class RmpFollower:
         target = Target(view.goal_pos_w, view.goal_quat_w, view.goal_linvel_w)
         return memory, jnp.concatenate([self.arm(view, target), view.ctrl[self._n :]])
 
-    def arm(self, view: View, target: Target) -> Float[Array, " nj"]:
+    def arm(self, view: View, target: Target) -> Joints:
         """Computes the targets of the arm's drives on the way to ``target`` [rad]."""
         obstacles = Obstacles.seen(view) if self._obstacles is None else self._obstacles
         q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, obstacles, self.dt)
@@ -139,3 +145,18 @@ class RmpFollower:
     def warning(self, memory: Memory) -> str:
         """Returns no warning."""
         return ""
+
+
+def mover(robot: RobotCfg, dt: float, motion: Motion, rmpflow: RmpCfg, ik: IkCfg) -> Callable[..., tuple[Joints, Joints]]:
+    """Makes what moves an arm along a path: (set-point, view, target) -> the next set-point and the drives' targets [rad].
+
+    Args:
+        motion: ``rmpflow``, which starts from the measured joints and returns the set-point as it is, or ``ik``.
+
+    Raises:
+        UserError: the robot has no RMPflow files, or they do not fit it.
+    """
+    if motion == "ik":
+        return IkArm(robot, dt, ik).arm
+    follower = RmpFollower(robot, dt, rmpflow)
+    return lambda q, view, target: (q, follower.arm(view, target))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math
 from mjx_nero.config.bounds import NonNegative
-from mjx_nero.control.follow_target import IkArm, RmpCfg, RmpFollower
+from mjx_nero.control.follow_target import Motion, RmpCfg, mover
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg
 from mjx_nero.control.rmpflow import Target
@@ -49,7 +49,7 @@ class PickPlaceCfg:
     end_effector_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # A straight line from the front to the tutorial's goal runs through the robot's base.
     arc: bool = True
-    motion: str = "rmpflow"
+    motion: Motion = "rmpflow"
     rmpflow: RmpCfg = RmpCfg()
     # Tight: the solver corrects at once, in a later step, what it leaves out now, and the drives' lead turns that into a kick.
     ik: IkCfg = IkCfg(position_tolerance=1e-5, orientation_tolerance=1e-4)
@@ -95,14 +95,12 @@ class PickPlace:
         cfg: see ``PickPlaceCfg``.
 
     Raises:
-        UserError: ``events_dt`` is not ten shares in 0 to 1, ``motion`` is unknown, or ``tower`` has nothing to move.
+        UserError: ``events_dt`` is not ten shares in 0 to 1, or ``tower`` has nothing to move.
     """
 
     def __init__(self, robot: RobotCfg, dt: float, cfg: PickPlaceCfg = PickPlaceCfg()):
         if len(cfg.events_dt) != len(PHASES) or not all(0 < share <= 1 for share in cfg.events_dt):
             raise UserError(f"events_dt takes {len(PHASES)} shares above 0 and up to 1, got {cfg.events_dt}")
-        if cfg.motion not in ("rmpflow", "ik"):
-            raise UserError(f"motion must be rmpflow or ik, got {cfg.motion!r}")
         if len(cfg.tower) < 2:
             raise UserError(f"tower names what stays or {GOAL!r}, then one or more objects to put there, got {cfg.tower}")
         self.dt, self.cfg = dt, cfg
@@ -110,8 +108,7 @@ class PickPlace:
         self.steps = np.array([int(np.ceil(1 / share - 1e-6)) for share in cfg.events_dt], np.int32)
         self.steps[[_CLOSE, _OPEN]] += round(cfg.wait / dt)
         self.gripper = ParallelGripper(robot)
-        self._rmpflow = RmpFollower(robot, dt, cfg.rmpflow) if cfg.motion == "rmpflow" else None
-        self._ik = IkArm(robot, dt, cfg.ik) if cfg.motion == "ik" else None
+        self._move = mover(robot, dt, cfg.motion, cfg.rmpflow, cfg.ik)
         self._n, self._down = len(robot.arm.joints), np.array(robot.down, np.float32)
         self._offset = np.array(cfg.end_effector_offset, np.float32)
         self._moves = len(cfg.tower) - 1
@@ -182,15 +179,12 @@ class PickPlace:
         return self._pose(view, below) + jnp.array([0.0, 0.0, self.cfg.rise, 0.0])
 
     def _arm(self, memory: PickPlaceMemory, view: View, target: Pose, tilt) -> tuple[Float[Array, " nj"], Float[Array, " nj"]]:
-        """The next set-point, where one is kept, and the targets of the arm's drives."""
+        """The next set-point, and the targets of the arm's drives."""
         down = math.quat_mul(math.axis_angle(jnp.array([0.0, 0.0, 1.0]), target[3]), jnp.asarray(self._down))
         velocity = (target - memory.target)[:3] / self.dt
         jump = jnp.linalg.norm(velocity) > _FASTEST
         wanted = Target(target[:3], math.quat_mul(down, math.quat_exp(tilt)), jnp.where(jump, 0.0, velocity))
-        if self._rmpflow:
-            return memory.setpoint, self._rmpflow.arm(view, wanted)
-        assert self._ik is not None
-        return self._ik.arm(memory.setpoint, wanted)
+        return self._move(memory.setpoint, view, wanted)
 
     def _target(self, memory: PickPlaceMemory, s, place: Pose, grip, root) -> Pose:
         phase, pick, start, center = memory.phase, memory.pick, memory.start, root[:2]

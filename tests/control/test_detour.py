@@ -6,7 +6,8 @@ import pytest
 
 from mjx_nero.control.detour import Way
 
-UP = Way.through(*(jnp.array(p, jnp.float32) for p in ([0, 0, 0], [0, 0, 0.1], [0.4, 0, 0.1], [0.4, 0, 0.05])))
+STILL = jnp.zeros(0)  # no arm
+UP = Way.through(STILL, *(jnp.array(p, jnp.float32) for p in ([0, 0, 0], [0, 0, 0.1], [0.4, 0, 0.1], [0.4, 0, 0.05])))
 
 
 @pytest.mark.parametrize(
@@ -27,5 +28,5 @@ def test_a_target_goes_from_corner_to_corner(travelled, at):
 
 
 def test_a_leg_without_length_is_passed_over():
-    way = Way.through(*(jnp.array(p, jnp.float32) for p in ([0, 0, 0.1], [0, 0, 0.1], [0.4, 0, 0.1], [0.4, 0, 0])))
+    way = Way.through(STILL, *(jnp.array(p, jnp.float32) for p in ([0, 0, 0.1], [0, 0, 0.1], [0.4, 0, 0.1], [0.4, 0, 0])))
     np.testing.assert_allclose(way.on(0.1).target(), [0.1, 0, 0.1], atol=1e-6)
