@@ -240,7 +240,7 @@ def of_folder(draw: random.Random, folder: pathlib.Path) -> Made:
 
 
 def mesh(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], None]]:
-    """One mesh, a folder of one, or a name that is none; a cache beside it that is another's, at times."""
+    """One mesh, a folder of one, or a name that is none."""
     here = folder / "home" / "in"
     here.mkdir()
     (folder / "mine" / "m.mtl").write_text("secret")
@@ -257,10 +257,6 @@ def mesh(draw: random.Random, folder: pathlib.Path) -> tuple[str, Callable[[], N
     name, content = makers[kind](draw)
     path = here / (name if draw.random() < 0.95 else name.rpartition(".")[0] + draw.choice((".obj", ".stl", ".glb", ".zip", "")))
     path.write_bytes(content)
-    if draw.random() < 0.2:
-        path.with_name(path.name + ".solid").write_bytes(
-            draw.choice((b"", draw.randbytes(2000), struct.pack("<Q", 2**60) + b"{}"))
-        )
     scale = draw.choice(("1", "1", "0.1", "1e-9", "1e9", "0.001"))
     given = here if kind == "folder" and draw.random() < 0.5 else path
     return f"{kind} {path.name}, {len(content)} bytes, scale {scale}", functools.partial(

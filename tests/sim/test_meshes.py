@@ -1,5 +1,6 @@
 """Objects from files: what is read of a mesh, how it is cut, weighed and kept, and how it rests in a scene."""
 
+import dataclasses
 import importlib.util
 import pathlib
 import re
@@ -12,6 +13,7 @@ import pytest
 import trimesh
 
 from mjx_nero import UserError
+from mjx_nero.files import cache
 from mjx_nero.sim import objects, scene
 from mjx_nero.sim.objects import making, rests, solid, store
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
@@ -126,7 +128,7 @@ def test_own_objects_rest_where_they_are_put():
             assert rests.up(np.array(pose[3:])) @ rests.up(data.qpos[at + 3 : at + 7]) > np.cos(0.03), (name, k)
 
 
-def test_cut_once_and_kept_beside_the_file(tmp_path, monkeypatch):
+def test_cut_once_and_kept_in_the_users_cache(tmp_path, monkeypatch):
     """An L of two boxes is cut into two parts or a few; the second time nothing is cut."""
     parts = [trimesh.creation.box((0.1, 0.03, 0.02)), trimesh.creation.box((0.02, 0.03, 0.1)).apply_translation((-0.04, 0, 0.04))]
     path = tmp_path / "l.stl"
@@ -135,8 +137,8 @@ def test_cut_once_and_kept_beside_the_file(tmp_path, monkeypatch):
     assert 2 <= len(found.sizes) <= 4
     hulls = sum(trimesh.PointCloud(part).convex_hull.volume for part in found.parts)
     assert hulls == pytest.approx(found.volume, rel=0.1)
-    kept = tmp_path / "l.stl.solid"
-    assert kept.is_file() and not list(tmp_path.glob(".*"))
+    assert {each.name for each in tmp_path.iterdir()} == {"l.stl", "cache"}
+    (kept,) = (tmp_path / "cache" / "mjx_nero" / "objects").iterdir()
 
     def refuse(*_):
         raise AssertionError("cut again")
@@ -144,31 +146,19 @@ def test_cut_once_and_kept_beside_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(making, "make", refuse)
     store._found.cache_clear()
     again = objects.find(str(path))
-    assert (again.points == found.points).all() and again.rgba == found.rgba
+    for field in dataclasses.fields(found):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(found, field.name))
     kept.write_bytes(kept.read_bytes()[:-8])  # damaged
     store._found.cache_clear()
     with pytest.raises(AssertionError, match="cut again"):
         objects.find(str(path))
 
 
-def test_kept_in_the_users_cache(block, monkeypatch, tmp_path):
-    """Where the folder of the file may not be written to."""
-    allowed = store.os.access
-    monkeypatch.setattr(store.os, "access", lambda path, mode: pathlib.Path(path) != block.parent and allowed(path, mode))
-    objects.find(str(block))
-    assert not list(block.parent.glob("*.solid")) and len(list((tmp_path / "cache" / "mjx_nero" / "objects").iterdir())) == 1
-
-
-def test_what_is_kept_is_checked(block):
-    """Nobody else's numbers: a cache whose parts are not finite is made anew."""
+def test_without_a_cache_it_is_made_each_time(block, monkeypatch):
+    monkeypatch.setattr(cache, "folder", lambda: None)
     first = objects.find(str(block))
-    kept = block.with_name("block.obj.solid")
-    content = bytearray(kept.read_bytes())
-    at = content.find(first.points.tobytes())
-    content[at : at + 8] = np.array(np.nan).tobytes()
-    kept.write_bytes(content)
     store._found.cache_clear()
-    assert np.isfinite(objects.find(str(block)).points).all()
+    assert (objects.find(str(block)).points == first.points).all()
 
 
 def test_without_the_library(tmp_path, monkeypatch):

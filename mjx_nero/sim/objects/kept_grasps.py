@@ -1,24 +1,18 @@
 """Grasps of things by a hand, as padded tables. They take seconds to find, so they are kept in the user's cache."""
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors import numpy as tensors
 
-from mjx_nero import files
-from mjx_nero.files import cache
-from mjx_nero.sim.objects import grasps, rests, store
+from mjx_nero.sim.objects import grasps, kept, rests, store
 from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.types import UserError
 
 NONE = 1e3  # cost of an entry that only pads the table
 _VERSION = 1
-_MAX_KEPT = 1_000_000  # bytes
 Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -53,20 +47,11 @@ def _kept(solid: Solid, hand: Hand) -> list[grasps.Grasps]:
     said = hashlib.sha256(repr((_VERSION, grasps.MOST, dataclasses.astuple(hand))).encode())
     for array in (solid.points, solid.sizes, solid.rest_quat):
         said.update(np.ascontiguousarray(array).tobytes())
-    folder = cache.folder()
-    path = folder / "objects" / f"{said.hexdigest()[:32]}.grasps" if folder else None
-    if path and path.is_file():
-        with contextlib.suppress(UserError, SafetensorError, KeyError):
-            read = tensors.load(files.read_bytes(path, _MAX_KEPT))
-            return [
-                grasps.Grasps(*(read[f"{i}.{field.name}"] for field in dataclasses.fields(grasps.Grasps)))
-                for i in range(len(solid.rest_quat))
-            ]
-    found = [grasps.find(solid, quat, hand) for quat in solid.rest_quat]
-    if path:
-        arrays = {
-            f"{i}.{name}": np.ascontiguousarray(x) for i, each in enumerate(found) for name, x in dataclasses.asdict(each).items()
-        }
-        with contextlib.suppress(UserError):
-            files.write(path, tensors.save(arrays))
-    return found
+
+    def make() -> dict[str, np.ndarray]:
+        found = [grasps.find(solid, quat, hand) for quat in solid.rest_quat]
+        return {f"{i}.{name}": value for i, each in enumerate(found) for name, value in dataclasses.asdict(each).items()}
+
+    read = kept.arrays(f"{said.hexdigest()[:32]}.grasps", make)
+    names = [field.name for field in dataclasses.fields(grasps.Grasps)]
+    return [grasps.Grasps(*(read[f"{i}.{name}"] for name in names)) for i in range(len(solid.rest_quat))]

@@ -1,6 +1,8 @@
 """A mesh object: its convex parts, mass properties and resting poses for the physics, and the mesh to draw."""
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -47,6 +49,18 @@ class Solid:
     def parts(self) -> list[Float[np.ndarray, "k 3"]]:
         """Corners of each convex part [m]."""
         return np.split(self.points, np.cumsum(self.sizes)[:-1])
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> "Solid":
+        """Makes a solid of its ``arrays``."""
+        volume, density, rgba = (arrays[name].tolist() for name in ("volume", "density", "rgba"))
+        plain: dict[str, Any] = {"volume": volume, "density": density, "rgba": tuple(rgba)}
+        return cls(**{**arrays, **plain, "note": arrays["note"].tobytes().decode()})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns all fields as arrays, to be kept in a file."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {**fields, "note": np.frombuffer(self.note.encode(), np.uint8)}
 
     def scaled(self, by: float) -> "Solid":
         """The same thing ``by`` times as large."""
