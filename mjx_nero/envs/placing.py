@@ -1,8 +1,6 @@
 """Mesh objects in tasks that place: where they belong, when they count as standing and as left, and the script."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,7 +17,6 @@ OVER, DONE = 0.03, 0.004  # [m] heights over the place: where the straight desce
 STEP = 0.005  # [s] physics step: at 10 ms, flat things that lie on many corners tremble too fast to count as at rest
 AWAY = 0.02  # [m] clearance of the pads beside or above an object that the hand has left
 MEETS = 0.01  # [m] below half this height, the hand yields to what the thing stands on
-T = TypeVar("T", bound=Term)
 
 
 def places(condition: Term) -> bool:
@@ -59,24 +56,14 @@ def applied(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
     grip = expert(cfg.robot, name, item)["grasp_thing"]
     put = {f"pick.{key}": value for key, value in grip.items()}
     put |= {"over": OVER, "top": MEETS, "done": DONE, "turns": turns, "away": round(place.clearance + AWAY, 4)}
-    ends = dataclasses.replace(
-        cfg.success, condition=_there(cfg.success.condition, place), distance=_there(cfg.success.distance, place)
-    )
+
+    def there(term: Term) -> Term:
+        return dataclasses.replace(term, params={**term.params, "place": place}) if "place" in term.params else term
+
     return dataclasses.replace(
-        cfg,
+        cfg.changed(there),
         sim=cfg.sim.finer(STEP),
         episode_length_s=cfg.episode_length_s + LONGER,
         command=dataclasses.replace(cfg.command, params={**cfg.command.params, **still}),
-        rewards=_all_there(cfg.rewards, place),
-        success=ends,
         controllers={"put_thing": put},
     )
-
-
-def _there(term: T, place: towers.Place) -> T:
-    own: dict[str, Any] = {"place": place} if "place" in term.params else {}
-    return dataclasses.replace(term, params={**term.params, **own})
-
-
-def _all_there(terms: Mapping[str, T], place: towers.Place) -> dict[str, T]:
-    return {key: _there(term, place) for key, term in terms.items()}

@@ -287,6 +287,20 @@ class EnvCfg:
         groups = {name: dataclasses.replace(group, corruption=False) for name, group in self.observations.items()}
         return dataclasses.replace(self, observations=groups)
 
+    def changed(self, change: Callable[[Any], Any]) -> "EnvCfg":
+        """Returns the task with ``change(term)`` in place of every term that reads a view."""
+
+        def each(terms: Mapping[str, Term]) -> dict[str, Any]:
+            return {name: change(term) for name, term in terms.items()}
+
+        ends = {"condition": change(self.success.condition), "distance": change(self.success.distance)}
+        return dataclasses.replace(
+            self,
+            observations={n: dataclasses.replace(group, terms=each(group.terms)) for n, group in self.observations.items()},
+            success=dataclasses.replace(self.success, **ends),
+            **{name: each(getattr(self, name)) for name in ("rewards", "terminations", "metrics")},
+        )
+
     def view_terms(self) -> dict[str, Mapping[str, Term]]:
         """Collects the terms that read a view, by the dotted names of their groups in the episode's memory."""
         observed = {f"observations.{name}": group.terms for name, group in self.observations.items()}

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from mjx_nero.envs import placing
 from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import randomization, success
-from mjx_nero.mdp.terms import ONCE, ObservationGroup, Term
+from mjx_nero.mdp.terms import ONCE, Term
 from mjx_nero.sim import contacts
 from mjx_nero.sim.objects import body, events, rests
 from mjx_nero.sim.scene import ObjectCfg
@@ -23,7 +23,6 @@ STEP = 0.005  # [s] physics step: at 10 ms, things held at their rim slip out
 _UPRIGHT = np.cos(np.radians(3.0))
 SCRIPTS = ("pick_up", "grasp_thing")  # of tasks that lift one object
 LIFTS, PUSHES, PLACES = "lifts", "pushes", "places"
-T = TypeVar("T", bound=Term)
 
 
 def overridden(cfg: EnvCfg, fields: Mapping[str, Any]) -> EnvCfg:
@@ -61,7 +60,7 @@ def applied(cfg: EnvCfg) -> EnvCfg:
         "sim": contacts.crowded(cfg.robot, scene, cfg.sim),
         "randomization": _kept(cfg.randomization, name, item),
     }
-    cfg = _sizes(dataclasses.replace(cfg, **changed), name)
+    cfg = dataclasses.replace(cfg, **changed).changed(lambda term: _sized(term, name))
     return {LIFTS: _lifted, PUSHES: _pushed, PLACES: placing.applied}[what](cfg, name, item)
 
 
@@ -111,16 +110,6 @@ def _pushed(cfg: EnvCfg, name: str, item: ObjectCfg) -> EnvCfg:
     return dataclasses.replace(cfg, command=command, controllers={})
 
 
-def _sizes(cfg: EnvCfg, name: str) -> EnvCfg:
-    """Returns the task with terms that measure from the thing's surface."""
-    groups: dict[str, Any] = {each: _own_size(getattr(cfg, each), name) for each in ("rewards", "terminations", "metrics")}
-    groups["success"] = dataclasses.replace(
-        cfg.success, condition=_sized(cfg.success.condition, name), distance=_sized(cfg.success.distance, name)
-    )
-    groups["observations"] = {key: _seen(group, name) for key, group in cfg.observations.items()}
-    return dataclasses.replace(cfg, **groups)
-
-
 def laid(cfg: EnvCfg) -> EnvCfg:
     """Returns the task with ``at_rest`` events that know all shapes of their object, in the scene's order.
 
@@ -143,16 +132,8 @@ def laid(cfg: EnvCfg) -> EnvCfg:
     return cfg if found == cfg.events else dataclasses.replace(cfg, events=found)
 
 
-def _seen(group: ObservationGroup, name: str) -> ObservationGroup:
-    return dataclasses.replace(group, terms=_own_size(group.terms, name))
-
-
-def _own_size(terms: Mapping[str, T], name: str) -> dict[str, T]:
-    return {key: _sized(term, name) for key, term in terms.items()}
-
-
-def _sized(term: T, name: str) -> T:
-    """The term, measured from the surface of a mesh. A thing without symmetry looks the same only after a full turn."""
+def _sized(term: Term, name: str) -> Term:
+    """Returns the term, measured from the surface of a mesh. A thing without symmetry looks the same only after a full turn."""
     if term.params.get("object") != name:
         return term
     own = {"minimal_height": LIFTED, "grasp_radius": NEAR, "fold": 1}
