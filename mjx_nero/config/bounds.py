@@ -45,16 +45,16 @@ class Ascending:
 
 @dataclasses.dataclass(frozen=True, init=False)
 class OneOf:
-    """One of some names."""
+    """One of some names or numbers."""
 
-    names: tuple[str, ...]
+    names: tuple[str | int, ...]
 
-    def __init__(self, *names: str):
+    def __init__(self, *names: str | int):
         object.__setattr__(self, "names", names)
 
-    def fault(self, value: str) -> str:
+    def fault(self, value: str | int) -> str:
         """See ``Bounds.fault``."""
-        return "" if value in self.names else f"must be one of {', '.join(self.names)}"
+        return "" if value in self.names else f"must be one of {', '.join(map(str, self.names))}"
 
 
 Positive = Annotated[float, Bounds(0.0, above=True)]

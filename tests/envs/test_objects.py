@@ -114,7 +114,7 @@ def test_shapes_start_where_they_touch_the_table(shape, size, quat, height):
     [
         (
             {"scene.objects.cube.shape": "cone"},
-            "scene.objects.cube.shape must be one of box, sphere, capsule, cylinder, can or mesh, got 'cone'",
+            "scene.objects.cube.shape must be one of box, sphere, capsule, cylinder, can, mesh, got 'cone'",
         ),
         ({"scene.objects.cube.size": (0.1,)}, "scene.objects.cube.size of a box is its three edges, got"),
         ({"scene.objects": {"cube": cube(0.03, 0.03), "link4": ObjectCfg()}}, "scene.objects.link4 needs another name"),

@@ -1,11 +1,12 @@
 """The config of a free object."""
 
 import dataclasses
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
-from mjx_nero.config.bounds import NonNegative, Positive
+from mjx_nero.config.bounds import NonNegative, OneOf, Positive
 from mjx_nero.sim import quats
 from mjx_nero.sim.objects import store
 from mjx_nero.sim.objects.solid import Solid
@@ -42,11 +43,11 @@ class ObjectCfg:
         density: density of a mesh [kg/m3], which gives its mass; 0: that of its ``object.yaml``, or else 500.
     """
 
-    shape: str = "box"
+    shape: Annotated[str, OneOf(*SHAPES, "mesh")] = "box"
     size: tuple[Positive, ...] = (0.03, 0.03, 0.03)
     mass: Positive = 0.03
     friction: tuple[NonNegative, NonNegative, NonNegative] = (1.0, 0.005, 0.0001)
-    condim: int = 3
+    condim: Annotated[int, OneOf(1, 3, 4, 6)] = 3
     pos: tuple[float, float, float] = (0.35, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     rgba: tuple[float, float, float, float] = (0.85, 0.3, 0.2, 1.0)

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_nero.config import bounds
 from mjx_nero.sim.objects import body as mesh_body
 from mjx_nero.sim.objects import shapes
 from mjx_nero.sim.objects.cfg import SHAPES, ObjectCfg, as_geom, side
@@ -37,8 +38,7 @@ def add(spec: mujoco.MjSpec, objects: Mapping[str, ObjectCfg], visuals: bool) ->
 
 
 def _add(spec: mujoco.MjSpec, name: str, item: ObjectCfg, visuals: bool) -> None:
-    if item.shape not in (*SHAPES, "mesh"):
-        raise UserError(f"scene.objects.{name}.shape must be one of {', '.join(SHAPES)} or mesh, got {item.shape!r}")
+    bounds.check(item, name=f"scene.objects.{name}")
     if item.shape == "mesh":
         return _add_mesh(spec, name, item, visuals)
     says = SHAPES[item.shape][1]
@@ -76,8 +76,6 @@ def _add(spec: mujoco.MjSpec, name: str, item: ObjectCfg, visuals: bool) -> None
 
 
 def _add_body(spec: mujoco.MjSpec, name: str, item: ObjectCfg):
-    if item.condim not in (1, 3, 4, 6):
-        raise UserError(f"scene.objects.{name}.condim must be 1, 3, 4 or 6, got {item.condim}")
     if name == "goal" or spec.body(name) or spec.joint(name) or spec.geom(name):
         raise UserError(f"scene.objects.{name} needs another name: the robot or the scene already uses it")
     x, y, above = item.pos
