@@ -8,7 +8,7 @@ inverts itself, from targets back to entries.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,18 +72,6 @@ class Act:
 
 Description = dict[str, Any]  # ``type``, and the fields that ``deploy.executor`` reads for that type
 Bounds = tuple[np.ndarray, np.ndarray]  # least and greatest entries
-
-
-class ActionTerm(Protocol):
-    """The protocol of action terms, described at the top of this module."""
-
-    home: np.ndarray
-
-    def init(self, key: Key, act: Act) -> Memory: ...
-    def step(self, memory: Memory, own: Float[Array, " n"], act: Act) -> tuple[Memory, Act]: ...
-    def describe(self) -> Description | None: ...
-    def bounds(self) -> Bounds: ...
-    def invert(self, act: Act, late: int) -> Float[Array, "... n"]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -461,7 +449,7 @@ class Chain:
         for name, term in terms.items():
             if (group := term.params.get("group")) and group not in groups:
                 raise UserError(f"actions.{name}.params.group is {group!r}, and the drives' groups are: {', '.join(groups)}")
-        self.terms: dict[str, ActionTerm] = {name: term.func(groups, **term.params) for name, term in terms.items()}
+        self.terms: dict[str, Any] = {name: term.func(groups, **term.params) for name, term in terms.items()}
         self._groups, sizes = groups, [len(term.home) for term in self.terms.values()]
         self._splits = np.cumsum(sizes)[:-1]
         if not sum(sizes):
