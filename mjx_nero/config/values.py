@@ -75,7 +75,7 @@ def read(kind: Any, value: Any, name: str) -> Any:
         return value if callable(value) else _refuse(name, "a function", value)
     if origin in UNTYPED:
         return _literal(value)
-    found = {float: _float, int: _int, bool: _bool, str: _str}.get(origin, lambda x: x if isinstance(x, origin) else None)(value)
+    found = {float: _float, int: _int, bool: _bool}.get(origin, lambda x: x if isinstance(x, origin) else None)(value)
     return _refuse(name, _WORDS.get(origin, f"a {getattr(origin, '__name__', origin)}"), value) if found is None else found
 
 
@@ -155,10 +155,6 @@ def _bool(value: Any) -> bool | None:
     if isinstance(value, str):
         return {"true": True, "false": False}.get(value.strip().lower())
     return value if isinstance(value, bool) else None
-
-
-def _str(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def _literal(value: Any, depth: int = 0) -> Any:

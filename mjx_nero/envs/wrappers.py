@@ -1,4 +1,4 @@
-"""Training wrappers: a batch axis, automatic restarts, Brax's bookkeeping and expert starts."""
+"""Training wrappers: batches with automatic restarts, and expert starts."""
 
 import mjx_nero.sim.quiet  # noqa: F401
 
@@ -17,40 +17,24 @@ Start = tuple[Sim, Carry]
 PHASES = 8  # equal parts of an expert's episode
 
 
-class AutoReset(Wrapper):
-    """Starts a new episode when one ends (``ManipulationEnv.step_and_reset``), at the level of the task's curriculum."""
+class Batch(Wrapper):
+    """Many environments side by side. An ended episode restarts in the same step, at the level of the task's curriculum.
+
+    ``reset`` takes keys [n, ...], ``step`` states and actions [n, ...]. ``info`` also holds what Brax's PPO reads besides
+    ``truncation``.
+    """
 
     def reset(self, rng: Key, starts: Starts | None = None) -> State:
-        return self.env.reset(rng, self.env.first_level, starts)
+        state = jax.vmap(lambda key: self.env.reset(key, self.env.first_level, starts))(rng)
+        return state.replace(info={**state.info, "episode_metrics": {}, "episode_done": state.done})
 
     def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
-        return self.env.step_and_reset(state, action, start)
-
-
-class Vectorize(Wrapper):
-    """Batches the environment: ``reset`` takes keys [n, ...], ``step`` takes states and actions [n, ...]."""
-
-    def reset(self, rng: Key, starts: Starts | None = None) -> State:
-        return jax.vmap(self.env.reset, (0, None))(rng, starts)
-
-    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
-        return jax.vmap(self.env.step)(state, action, start)
+        state = jax.vmap(self.env.step_and_reset)(state, action, start)
+        return state.replace(info={**state.info, "episode_done": state.done})
 
     def following(self, state: State, starts: Starts | None = None) -> Start:
         """Draws the start of each environment's next episode: see ``ManipulationEnv.step_and_reset``."""
         return jax.vmap(self.env.following, (0, None))(state, starts)
-
-
-class BraxEpisode(Wrapper):
-    """Adds the bookkeeping fields that Brax's PPO reads besides ``truncation``."""
-
-    def reset(self, rng: Key, starts: Starts | None = None) -> State:
-        state = self.env.reset(rng, starts)
-        return state.replace(info={**state.info, "episode_metrics": {}, "episode_done": state.done})
-
-    def step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
-        state = self.env.step(state, action, start)
-        return state.replace(info={**state.info, "episode_done": state.done})
 
 
 class ExpertStarts(Wrapper):
@@ -95,6 +79,5 @@ def begun(env: Env, key: Key, k_phase: Key, num_envs: int, bank: Bank | None) ->
 
 
 def for_training(env: ManipulationEnv) -> Env:
-    """Wraps an environment for training: batched, restarting, with Brax's bookkeeping and, if the task asks, expert starts."""
-    made = BraxEpisode(Vectorize(AutoReset(env)))
-    return ExpertStarts(made) if env.cfg.curriculum.expert_starts else made
+    """Wraps an environment for training: batched, restarting and, if the task asks, with expert starts."""
+    return ExpertStarts(Batch(env)) if env.cfg.curriculum.expert_starts else Batch(env)

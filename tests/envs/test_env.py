@@ -448,7 +448,7 @@ def test_a_sick_step_at_the_time_out_is_no_truncation(finish, start):
 def test_training_wrapper_adds_braxs_fields(batch):
     state = batch.reset(0)
     assert state.info["episode_metrics"] == {} and (state.info["episode_done"] == 0).all()
-    assert isinstance(batch.train_env, wrappers.BraxEpisode)
+    assert isinstance(batch.train_env, wrappers.Batch)
 
 
 def test_both_models_have_the_same_state(env):

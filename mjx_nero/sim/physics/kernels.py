@@ -29,7 +29,9 @@ def make(
 
     Problem, problem = packed("Problem", values)
 
-    @wp.func_native("".join(map(_constant, constants, constants.values())) + source(name))
+    source = resources.files(__package__).joinpath(f"{name}.cu").read_text()
+
+    @wp.func_native("".join(map(_constant, constants, constants.values())) + source)
     def work(tid: int, problem: Problem): ...  # type: ignore[valid-type]
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -119,11 +121,6 @@ def captured(run: Callable[[], None]) -> Callable[[], None]:
     with wp.ScopedCapture() as capture:
         run()
     return functools.partial(wp.capture_launch, capture.graph)
-
-
-def source(name: str) -> str:
-    """The text of a source of this folder."""
-    return resources.files(__package__).joinpath(f"{name}.cu").read_text()
 
 
 def load(work: Callable[[], None]) -> None:
