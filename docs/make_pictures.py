@@ -23,7 +23,7 @@ from PIL import Image
 from mjx_nero.learn import policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import evaluation, videos
-from mjx_nero.sim import objects, render
+from mjx_nero.sim import render, solids
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, results
 from mjx_nero.tools.inspection import things
@@ -90,7 +90,7 @@ def seeing(folder: pathlib.Path) -> None:
 
 def objects_sheet(path: pathlib.Path) -> None:
     """Draws the package's objects at rest, and behind each its convex parts."""
-    each = [things.picture(things.of(name), 426, 240) for name in objects.names()]
+    each = [things.picture(things.of(name), 426, 240) for name in solids.names()]
     sheet = np.concatenate([np.concatenate(each[i : i + 3], axis=1) for i in range(0, len(each), 3)])
     Image.fromarray(sheet).save(path, optimize=True)
 

@@ -119,7 +119,7 @@ class ShapeView:
     points: Float[Array, "n 3"]  # corners of its hull [m]
     middle: Float[Array, "3"]  # middle of its bounding box [m]
     edges: Float[Array, "3"]  # edges of that box [m]
-    code: Float[Array, " k"]  # description for policies (``sim.objects.shapes.code``) [m]
+    code: Float[Array, " k"]  # description for policies (``sim.solids.shapes.code``) [m]
 
 
 @struct.dataclass

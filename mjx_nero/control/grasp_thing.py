@@ -14,8 +14,8 @@ from mjx_nero.config.bounds import Positive
 from mjx_nero.control.pick_up import CLOSE, UNREACHABLE, PickUp, PickUpCfg, PickUpMemory
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import grasp
-from mjx_nero.sim.objects import kept_grasps
 from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.solids import kept_grasps
 from mjx_nero.types import UserError, View
 
 _GAPS = 9  # number of gaps for which the place of the pads' middle is computed

@@ -9,8 +9,8 @@ from mjx_nero.envs.gripping import LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import towers
 from mjx_nero.mdp.terms import Term
-from mjx_nero.sim.objects import rests, shapes
 from mjx_nero.sim.scene import ObjectCfg
+from mjx_nero.sim.solids import rests, shapes
 
 LONGER = 3.0  # [s] extra time of the script compared with a box: it lowers the thing slowly
 OVER, DONE = 0.03, 0.004  # [m] heights over the place: where the straight descent begins, and where the hand opens

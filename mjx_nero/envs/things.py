@@ -14,8 +14,9 @@ from mjx_nero.envs.task import EnvCfg
 from mjx_nero.mdp import randomization, success
 from mjx_nero.mdp.terms import ONCE, Term
 from mjx_nero.sim import contacts
-from mjx_nero.sim.objects import body, events, rests
+from mjx_nero.sim.objects import body, events
 from mjx_nero.sim.scene import ObjectCfg
+from mjx_nero.sim.solids import rests
 from mjx_nero.types import UserError
 
 LONGER = 2.0  # [s] extra time of the script compared with a cube: it searches for a grasp, and lifts loose grasps slowly

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from mjx_nero.sim import linkage
-from mjx_nero.sim.objects.grasps import Hand
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
+from mjx_nero.sim.solids.grasps import Hand
 from mjx_nero.types import UserError
 
 SHARE, MOST = 0.4, 0.6  # of the opening: a cube's edge, and the longest edge that leaves room to miss the middle

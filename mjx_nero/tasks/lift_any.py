@@ -24,7 +24,7 @@ from mjx_nero.envs.task import (
 )
 from mjx_nero.mdp import commands, metrics, observations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
-from mjx_nero.sim import contacts, objects
+from mjx_nero.sim import contacts, solids
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.objects import events as thing_events
 from mjx_nero.sim.robot import RobotCfg
@@ -33,7 +33,7 @@ from mjx_nero.tasks.lift import carrying
 
 THING = "thing"
 HELD_OUT = ("l_bracket", "bowl", "screwdriver")
-SEEN = tuple(name for name in objects.names() if name not in HELD_OUT)
+SEEN = tuple(name for name in solids.names() if name not in HELD_OUT)
 
 
 def thing(files: tuple[str, ...]) -> ObjectCfg:

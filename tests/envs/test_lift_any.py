@@ -15,9 +15,11 @@ from mjx_nero.learn.ppo import learner as ppo
 from mjx_nero.mdp import observations, rewards
 from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.runs import evaluation
-from mjx_nero.sim import grasp, objects, scene
-from mjx_nero.sim.objects import bank, body, events, grasps, rests, shapes
+from mjx_nero.sim import grasp, scene, solids
+from mjx_nero.sim.objects import bank, events
+from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.physics.mjx import JaxPhysics
+from mjx_nero.sim.solids import grasps, rests, shapes
 from mjx_nero.tasks import lift_any, registry
 from mjx_nero.tasks.lift_any import HELD_OUT, SEEN, THING
 from mjx_nero.types import SHAPE, ObjectView, ShapeView, Start
@@ -47,14 +49,14 @@ def test_a_drawn_colour_stays_and_the_other_shapes_are_hidden(worlds):
     banks = bank.Banks(worlds.physics_model, worlds.cfg.scene.objects, lambda: model)
     third = SimpleNamespace(memory={SHAPE: {THING: jnp.array(2)}})
     rgba = banks.scenery(None, third, {"geom_rgba": drawn})["look"]["geom_rgba"]
-    rows = np.array([model.geom(body.drawn_name(THING, k)).id for k in range(count)])
+    rows = np.array([model.geom(bodies.drawn_name(THING, k)).id for k in range(count)])
     assert rgba[rows, 3].tolist() == [float(k == 2) for k in range(count)]
     np.testing.assert_array_equal(rgba[:, :3], drawn[:, :3])
     np.testing.assert_array_equal(np.delete(rgba[:, 3], rows), 0.5)
 
 
 def test_a_quarter_is_held_out():
-    assert len(HELD_OUT) == 3 and len(SEEN) == 9 and {*HELD_OUT, *SEEN} == set(objects.names())
+    assert len(HELD_OUT) == 3 and len(SEEN) == 9 and {*HELD_OUT, *SEEN} == set(solids.names())
     for preset, files in (("default", SEEN), ("held_out", HELD_OUT), ("all", (*SEEN, *HELD_OUT))):
         item = env_cfg("nero_lift_any", preset).scene.objects[THING]
         assert (item.file, *item.bank) == files
@@ -74,10 +76,8 @@ def test_every_world_has_the_masses_of_its_shape(worlds, starts, see):
         for field in ("dof_invweight0", "dof_M0"):
             assert np.asarray(fields[field])[world, dof:][:6] == pytest.approx(getattr(alone, field)[dof:][:6], rel=1e-4)
         assert np.asarray(fields["body_subtreemass"])[world, 0] == pytest.approx(alone.body_subtreemass[0], rel=1e-5)
-        ids = index[world][
-            [worlds.physics_model.geom(g).id for g in objects.body.names(THING, worlds.cfg.scene.objects[THING].solids)]
-        ]
-        assert (ids >= 0).sum() == 1 + len(objects.find(name).sizes)
+        ids = index[world][[worlds.physics_model.geom(g).id for g in bodies.names(THING, worlds.cfg.scene.objects[THING].solids)]]
+        assert (ids >= 0).sum() == 1 + len(solids.find(name).sizes)
 
 
 def one(worlds, name):
@@ -121,7 +121,7 @@ def test_rests_are_drawn_as_often_as_they_come():
     blank = Start(joint_pos=jnp.zeros(1), object_pos_w=pos, object_quat_w={"cube": jnp.array([1.0, 0, 0, 0])})
     draw = jax.jit(jax.vmap(lambda key: events.at_rest(key, blank, files=("mug",))))
     drawn = draw(jax.random.split(jax.random.PRNGKey(1), 4000))
-    mug = objects.find("mug")
+    mug = solids.find("mug")
     ups = np.array([rests.up(quat) for quat in np.asarray(drawn.object_quat_w["cube"])])
     own = np.array([rests.up(quat) for quat in mug.rest_quat])
     which = (ups @ own.T).argmax(1)
@@ -142,14 +142,14 @@ def test_some_of_the_shapes_in_another_order_are_those_that_are_named():
     which, poses = np.asarray(drawn.shape[THING]), (drawn.object_pos_w[THING], drawn.object_quat_w[THING])
     assert {*which} == {0, 2}
     for shape, pos, quat in zip(which, *map(np.asarray, poses), strict=True):
-        solid = objects.find(("mug", "hammer", "ring")[shape])
+        solid = solids.find(("mug", "hammer", "ring")[shape])
         assert pos[2] == pytest.approx(solid.height(quat), abs=1e-4)
     with pytest.raises(UserError, match="files names spoon, but file and bank of scene.objects.thing are mug, hammer, ring"):
         make("nero_lift_any", impl="native", **bank, **{"events.reset_object_shape.params.files": ("spoon",)})
 
 
 def mesh_view(view, name: str, pos, quat=(1.0, 0.0, 0.0, 0.0)):
-    solid = objects.find(name)
+    solid = solids.find(name)
     middle, edges = shapes.box(solid)
     shape = ShapeView(
         jnp.zeros((), jnp.int32),
@@ -163,7 +163,7 @@ def mesh_view(view, name: str, pos, quat=(1.0, 0.0, 0.0, 0.0)):
 def test_held_counts_from_the_surface(finish):
     """A hammer on end, 20 cm tall: its lowest point counts, and the box around it."""
     view = finish.env.view(finish.reset(jax.random.PRNGKey(0)))
-    solid, up = objects.find("hammer"), (0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # its x axis, the handle, points up
+    solid, up = solids.find("hammer"), (0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # its x axis, the handle, points up
     low = solid.height(np.array(up))
     ee = np.asarray(view.ee_pos_w)
     for pos, held in (
@@ -186,7 +186,7 @@ def test_grasps_of_a_bar(tmp_path):
     import trimesh
 
     trimesh.creation.box((0.2, 0.03, 0.04)).export(tmp_path / "bar.stl")
-    solid = objects.find(str(tmp_path / "bar.stl"))
+    solid = solids.find(str(tmp_path / "bar.stl"))
     hand = grasps.Hand(opening=0.08, closed=0.0, pad=(0.01, 0.02, 0.006), lowest=0.01)
     flat = next(quat for quat in solid.rest_quat if abs(rests.up(quat)[2]) > 0.99)
     found = grasps.find(solid, flat, hand)
@@ -202,7 +202,7 @@ def test_hands_can_grasp_every_object(robot):
     """In nearly every way in which it rests: the lines of the best grasps meet its parts on both sides."""
     hand = grasp.hand(registry.robot(robot))
     for name in ("mug", "wrench"):
-        solid = objects.find(name)
+        solid = solids.find(name)
         for quat in solid.rest_quat[:2]:
             found = grasps.find(solid, quat, hand)
             assert len(found.cost), name
@@ -245,7 +245,7 @@ def test_object_in_the_place_of_the_box(file, stands):
     """It starts and ends as its file has it, or as it mostly rests; start and goal differ by place and heading alone."""
     cfg = env_cfg("nero_place", **{"object.file": file})
     env = make("nero_place", impl="native", **{"object.file": file})
-    item, solid = cfg.scene.objects["box"], objects.find(file)
+    item, solid = cfg.scene.objects["box"], solids.find(file)
     assert env.cfg.scene.objects == cfg.scene.objects and env.cfg.controllers == cfg.controllers  # once, not twice
     up = rests.up(np.array(item.quat))
     assert (up[2] > 0.999) == stands

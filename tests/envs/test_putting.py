@@ -13,7 +13,7 @@ import pytest
 from mjx_nero import UserError, env_cfg, list_presets, make
 from mjx_nero.envs import wrappers
 from mjx_nero.runs import evaluation, starts
-from mjx_nero.sim import fixtures, objects, scene
+from mjx_nero.sim import fixtures, scene, solids
 from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -74,7 +74,7 @@ def test_every_arm_has_a_peg_that_fits_the_hole(robot, preset):
 def test_a_ring_around_the_post_hangs_wherever_it_lies_there():
     """Its hole leaves it a play, and beside the post it would lie far outside of that."""
     place = env_cfg("nero_hang_ring").success.condition.params["place"]
-    around = np.linalg.norm(objects.find("ring").vertices[:, :2], axis=1)
+    around = np.linalg.norm(solids.find("ring").vertices[:, :2], axis=1)
     post = next(geom for geom in fixtures.read("stand").geoms if geom.name == "post")
     play, beside = around.min() - post.size[0], around.max() + post.size[0]
     assert 0.014 < play < place.within[0] < 0.5 * beside

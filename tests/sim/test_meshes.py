@@ -14,13 +14,14 @@ import trimesh
 
 from mjx_nero import UserError
 from mjx_nero.files import cache
-from mjx_nero.sim import objects, scene
-from mjx_nero.sim.objects import making, rests, solid, store
+from mjx_nero.sim import scene, solids
+from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+from mjx_nero.sim.solids import making, rests, solid, store
 from mjx_nero.tasks import registry
 
 EDGES = (0.04, 0.06, 0.1)
-NAMES = objects.names()
+NAMES = solids.names()
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def textured(folder: pathlib.Path) -> pathlib.Path:
 
 def test_mass_and_rests_of_a_box(block):
     """By hand: m = rho x y z, I_xx = m (y^2 + z^2) / 12; it rests on six sides, and most often on the largest."""
-    found = objects.find(str(block))
+    found = solids.find(str(block))
     x, y, z = EDGES
     assert found.volume == pytest.approx(x * y * z) and found.center == pytest.approx((1, 2, 3))
     by_hand = found.volume / 12 * np.diag([y * y + z * z, x * x + z * z, x * x + y * y])
@@ -72,18 +73,18 @@ def test_kinds_of_files(tmp_path, kind):
     """The same solid from each; glTF's y is up, so its box lies turned."""
     mesh = trimesh.creation.box(EDGES)
     mesh.export(tmp_path / f"a.{kind}")
-    found = objects.find(str(tmp_path / f"a.{kind}"))
+    found = solids.find(str(tmp_path / f"a.{kind}"))
     x, y, z = EDGES
     assert np.ptp(found.points, axis=0) == pytest.approx((x, z, y) if kind == "glb" else (x, y, z), abs=1e-6)
     assert found.volume == pytest.approx(x * y * z, rel=1e-5)
 
 
 def test_texture_is_drawn(tmp_path):
-    found = objects.find(str(textured(tmp_path)))
+    found = solids.find(str(textured(tmp_path)))
     assert found.texture.shape == (8, 16, 3) and len(found.uv) == len(found.vertices) and found.sizes.tolist() == [8]
     cube = ObjectCfg(shape="mesh", file=str(tmp_path / "slab.obj"))
     model = scene.build(registry.robot("nero"), SceneCfg(objects={"cube": cube}), SimCfg())
-    geom = model.geom(objects.body.drawn_name("cube", 0))
+    geom = model.geom(bodies.drawn_name("cube", 0))
     material = model.geom_matid[geom.id]
     texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
     assert (model.tex_width[texture], model.tex_height[texture]) == (16, 8)
@@ -101,7 +102,7 @@ def test_own_objects_are_what_their_script_makes(tmp_path):
     for name, (make, density, _) in makes["OBJECTS"].items():
         parts = [trimesh.PointCloud(points).convex_hull for points in make()]
         assert (store.HOME / name / "parts.obj").read_text() == makes["_obj"](parts), name
-        found = objects.find(name)
+        found = solids.find(name)
         assert len(found.sizes) == len(parts) <= solid.MAX_PARTS and found.sizes.max() <= solid.MAX_CORNERS
         assert found.density == density and 0.03 < density * found.volume < 0.3
         for part in parts:  # each part lies in the union, and the union in the parts' hull
@@ -133,7 +134,7 @@ def test_cut_once_and_kept_in_the_users_cache(tmp_path, monkeypatch):
     parts = [trimesh.creation.box((0.1, 0.03, 0.02)), trimesh.creation.box((0.02, 0.03, 0.1)).apply_translation((-0.04, 0, 0.04))]
     path = tmp_path / "l.stl"
     trimesh.boolean.union(parts, engine="manifold").export(path)
-    found = objects.find(str(path))
+    found = solids.find(str(path))
     assert 2 <= len(found.sizes) <= 4
     hulls = sum(trimesh.PointCloud(part).convex_hull.volume for part in found.parts)
     assert hulls == pytest.approx(found.volume, rel=0.1)
@@ -145,20 +146,20 @@ def test_cut_once_and_kept_in_the_users_cache(tmp_path, monkeypatch):
 
     monkeypatch.setattr(making, "make", refuse)
     store._found.cache_clear()
-    again = objects.find(str(path))
+    again = solids.find(str(path))
     for field in dataclasses.fields(found):
         np.testing.assert_array_equal(getattr(again, field.name), getattr(found, field.name))
     kept.write_bytes(kept.read_bytes()[:-8])  # damaged
     store._found.cache_clear()
     with pytest.raises(AssertionError, match="cut again"):
-        objects.find(str(path))
+        solids.find(str(path))
 
 
 def test_without_a_cache_it_is_made_each_time(block, monkeypatch):
     monkeypatch.setattr(cache, "folder", lambda: None)
-    first = objects.find(str(block))
+    first = solids.find(str(block))
     store._found.cache_clear()
-    assert (objects.find(str(block)).points == first.points).all()
+    assert (solids.find(str(block)).points == first.points).all()
 
 
 def test_without_the_library(tmp_path, monkeypatch):
@@ -166,7 +167,7 @@ def test_without_the_library(tmp_path, monkeypatch):
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "coacd" else there(name, *a))
     with pytest.raises(UserError, match=r"ring.stl is not convex, and .* needs coacd: install the extra \(pip install"):
-        objects.find(str(tmp_path / "ring.stl"))
+        solids.find(str(tmp_path / "ring.stl"))
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,7 @@ def test_without_the_library(tmp_path, monkeypatch):
 def test_faults_of_files(tmp_path, name, text, says):
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match=says):
-        objects.find(str(tmp_path / name))
+        solids.find(str(tmp_path / name))
 
 
 def test_faults_of_configs(block, tmp_path):

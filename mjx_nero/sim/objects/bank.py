@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 from mjx_nero.sim.objects import body as bodies
-from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.parts import Fields, Part
+from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import SHAPE, Carry, Sim, Start, View
 
 _GEOMS = ("geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")

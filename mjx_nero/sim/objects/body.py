@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
 _MESH = mujoco.mjtGeom.mjGEOM_MESH

@@ -8,8 +8,8 @@ import numpy as np
 
 from mjx_nero.config.bounds import NonNegative, OneOf, Positive
 from mjx_nero.sim import quats
-from mjx_nero.sim.objects import store
-from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.solids import store
+from mjx_nero.sim.solids.solid import Solid
 
 # Shape -> MuJoCo's type, and what ``ObjectCfg.size`` says of it.
 SHAPES = {

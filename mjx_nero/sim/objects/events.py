@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive, Range
-from mjx_nero.sim.objects import store
+from mjx_nero.sim.solids import store
 from mjx_nero.types import Key, Start
 
 

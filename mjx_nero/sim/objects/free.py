@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from mjx_nero.config import bounds
 from mjx_nero.sim.objects import body as mesh_body
-from mjx_nero.sim.objects import shapes
 from mjx_nero.sim.objects.cfg import SHAPES, ObjectCfg, as_geom, side
 from mjx_nero.sim.parts import Fields, Part
+from mjx_nero.sim.solids import shapes
 from mjx_nero.types import LOOK, SHAPE, TARGET, Appearance, Carry, ObjectView, ShapeView, Sim, Start, UserError, View
 
 # Contact bits: objects meet the table by bit 1, robots by bit 2, and one another by bit 4. Robot geoms have no type, so they

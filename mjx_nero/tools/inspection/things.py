@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 
 from mjx_nero.runs import console
-from mjx_nero.sim import objects, render
-from mjx_nero.sim.objects import rests
+from mjx_nero.sim import render, solids
+from mjx_nero.sim.objects import body as bodies
 from mjx_nero.sim.scene import ObjectCfg
+from mjx_nero.sim.solids import rests
 from mjx_nero.types import UserError
 
 _COLOURS = ((0.86, 0.37, 0.34), (0.36, 0.6, 0.85), (0.45, 0.7, 0.42), (0.93, 0.72, 0.3), (0.62, 0.45, 0.75), (0.4, 0.72, 0.72))
@@ -95,7 +96,7 @@ def picture(thing: Thing, width: int = 1280, height: int = 480) -> np.ndarray:
     Raises:
         UserError: this machine cannot draw.
     """
-    solid = objects.find(thing.file).scaled(thing.scale)
+    solid = solids.find(thing.file).scaled(thing.scale)
     far = 1.25 * float(np.linalg.norm(thing.edges))
     spec = mujoco.MjSpec()
     spec.add_texture(
@@ -115,7 +116,7 @@ def picture(thing: Thing, width: int = 1280, height: int = 480) -> np.ndarray:
         spec.add_mesh(name=f"part {i}").uservert = part.ravel().tolist()
     for i, (quat, up, _) in enumerate(thing.rests):
         x = far * (i - (len(thing.rests) - 1) / 2)
-        objects.body.draw(spec, world.add_body(pos=[x, 0, up], quat=quat), f"rest {i}", 0, solid)
+        bodies.draw(spec, world.add_body(pos=[x, 0, up], quat=quat), f"rest {i}", 0, solid)
         body = world.add_body(pos=[x, far, up], quat=quat)
         for k in range(len(solid.sizes)):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part {k}", rgba=[*_COLOURS[k % len(_COLOURS)], 1])

@@ -13,9 +13,9 @@ import numpy as np
 
 from mjx_nero import files
 from mjx_nero.config import bounds, values
-from mjx_nero.sim.objects import kept, solid
-from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.robot import ASSETS
+from mjx_nero.sim.solids import kept, solid
+from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
 HOME = ASSETS / "objects"
@@ -90,7 +90,7 @@ def _found(path: pathlib.Path, *_changed: int) -> Solid:
         key.update(hashlib.sha256(part).digest())
 
     def make() -> dict[str, np.ndarray]:
-        from mjx_nero.sim.objects import making, reading  # configs and help do not need them
+        from mjx_nero.sim.solids import making, reading  # configs and help do not need them
 
         try:
             raw = reading.read(whole, content)

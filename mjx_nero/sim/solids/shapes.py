@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.solids.solid import Solid
 
 DIRECTIONS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)

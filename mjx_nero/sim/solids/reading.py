@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 from mjx_nero import files
-from mjx_nero.sim.objects import glb
-from mjx_nero.sim.objects.store import GREY, KINDS
+from mjx_nero.sim.solids import glb
+from mjx_nero.sim.solids.store import GREY, KINDS
 from mjx_nero.types import UserError
 
 MAX_TRIANGLES = 4_000_000

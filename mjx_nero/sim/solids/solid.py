@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mjx_nero.sim.objects import rests
+from mjx_nero.sim.solids import rests
 
 MAX_PARTS, MAX_CORNERS = 16, 48  # parts of an object; corners of a part
 DENSITY = 500.0  # [kg/m3] if none is given

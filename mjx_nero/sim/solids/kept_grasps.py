@@ -6,9 +6,9 @@ import hashlib
 
 import numpy as np
 
-from mjx_nero.sim.objects import grasps, kept, rests, store
-from mjx_nero.sim.objects.grasps import Hand
-from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.solids import grasps, kept, rests, store
+from mjx_nero.sim.solids.grasps import Hand
+from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
 NONE = 1e3  # cost of an entry that only pads the table

@@ -9,9 +9,9 @@ import sys
 import numpy as np
 import trimesh
 
-from mjx_nero.sim.objects import pieces, rests
-from mjx_nero.sim.objects.reading import Raw
-from mjx_nero.sim.objects.solid import DENSITY, MAX_CORNERS, MAX_PARTS, Solid
+from mjx_nero.sim.solids import pieces, rests
+from mjx_nero.sim.solids.reading import Raw
+from mjx_nero.sim.solids.solid import DENSITY, MAX_CORNERS, MAX_PARTS, Solid
 from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles

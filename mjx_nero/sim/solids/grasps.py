@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from mjx_nero.sim.objects import rests
-from mjx_nero.sim.objects.solid import Solid
+from mjx_nero.sim.solids import rests
+from mjx_nero.sim.solids.solid import Solid
 
 MOST = 8  # grasps per resting pose
 TURNS = 12  # directions in half a turn
