@@ -1,11 +1,11 @@
-"""The header of a policy or checkpoint. The file is untrusted, so this is read with limits before any library sees the file."""
+"""The header of a policy or checkpoint. The file is untrusted: its sizes are limited before it is parsed."""
 
 import math
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
+from safetensors import SafetensorError, safe_open
 
 from mjx_nero import files
 from mjx_nero.config.values import short
@@ -41,20 +41,20 @@ def read(path: pathlib.Path) -> tuple[Arrays, dict[str, str]]:
         UserError: the file is missing, too large or damaged.
     """
     with files.open_file(path) as (file, size):
-        length = int.from_bytes(file.read(8), "little")
         if size > MAX_FILE:
             raise UserError(f"{path} has {size / 1e9:.0f} GB: files above {MAX_FILE / 1e9:.0f} GB are not read")
-        head = file.read(length) if length <= min(MAX_HEAD, size - 8) else b""
+        if int.from_bytes(file.read(8), "little") > MAX_HEAD:
+            raise damaged(path)
     try:
-        found = files.parse_json(head)
-        texts = found.pop("__metadata__")
-        arrays = {name: _array(entry) for name, entry in found.items()}
-        whole = sum(last - first for _, _, first, last in arrays.values()) == size - 8 - length
-        if not whole or len(arrays) > MAX_ARRAYS or not all(isinstance(text, str) for text in texts.values()):
-            raise ValueError
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        with safe_open(path, framework="numpy") as held:
+            parts = {name: held.get_slice(name) for name in held.keys()}
+            arrays = {name: (DTYPES[part.get_dtype()], tuple(part.get_shape())) for name, part in parts.items()}
+            texts = held.metadata() or {}
+    except (SafetensorError, OSError, KeyError):
         raise damaged(path) from None
-    return {name: (kind, shape) for name, (kind, shape, _, _) in arrays.items()}, texts
+    if len(arrays) > MAX_ARRAYS:
+        raise damaged(path)
+    return arrays, texts
 
 
 def damaged(path: pathlib.Path) -> UserError:
@@ -90,15 +90,6 @@ def acts_alike(*metas: Mapping[str, Any]) -> bool:
     """Returns whether two policies' actions have the same kinds. Files before 0.5.0 do not say; they take joint positions."""
     said = [list(meta["actions"]) for meta in metas if "actions" in meta]
     return said[0] == said[1] if len(said) == 2 else all(kinds[:1] == ["JointPosition"] for kinds in said)
-
-
-def _array(entry: Any) -> tuple[str, tuple[int, ...], int, int]:
-    """Returns type, shape, first byte and end of an array."""
-    kind, shape, (first, last) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
-    whole = all(type(n) is int and 0 <= n < 1 << 40 for n in (*shape, first, last))
-    if not whole or len(shape) > 8 or math.prod(shape) * np.dtype(DTYPES[kind]).itemsize != last - first:
-        raise ValueError
-    return DTYPES[kind], shape, first, last
 
 
 def _word(value: Any) -> bool:
