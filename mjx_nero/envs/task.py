@@ -298,7 +298,9 @@ class EnvCfg:
             self,
             observations={n: dataclasses.replace(group, terms=each(group.terms)) for n, group in self.observations.items()},
             success=dataclasses.replace(self.success, **ends),
-            **{name: each(getattr(self, name)) for name in ("rewards", "terminations", "metrics")},
+            rewards=each(self.rewards),
+            terminations=each(self.terminations),
+            metrics=each(self.metrics),
         )
 
     def view_terms(self) -> dict[str, Mapping[str, Term]]:
