@@ -171,6 +171,44 @@ def test_what_is_kept_is_checked(block):
     assert np.isfinite(objects.find(str(block)).points).all()
 
 
+def test_convex_pieces_are_not_cut_again(tmp_path, monkeypatch):
+    """A file of convex parts, as many simulators keep them, needs no library and stays exact."""
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "coacd" else there(name, *a))
+    apart = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (0.0, 0.05)]
+    trimesh.util.concatenate(apart).export(tmp_path / "two.stl")
+    found = objects.find(str(tmp_path / "two.stl"))
+    assert found.sizes.tolist() == [8, 8] and found.volume == pytest.approx(2 * 0.02**3)
+    assert sorted(part[:, 0].mean() for part in found.parts) == pytest.approx([-0.025, 0.025])
+
+
+def test_a_scan_that_lacks_a_triangle_is_a_solid(tmp_path):
+    """It is closed, weighed as a whole and, as it is convex, not cut."""
+    ball = trimesh.creation.icosphere(2, 0.03)
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    ball.export(tmp_path / "ball.obj")
+    found = objects.find(str(tmp_path / "ball.obj"))
+    assert len(found.sizes) == 1 and found.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
+
+
+def test_what_is_not_cut_in_time_is_cut_more_coarsely(tmp_path, monkeypatch):
+    trimesh.creation.annulus(0.02, 0.04, 0.02).export(tmp_path / "ring.stl")
+    tried = []
+
+    def cut(mesh, surface, effort):
+        tried.append((surface, effort))
+        corners = trimesh.creation.box((0.08, 0.08, 0.02)).vertices
+        return [np.asarray(corners)] if effort == "quick" else None
+
+    monkeypatch.setattr(making, "_cut_apart", cut)
+    assert len(objects.find(str(tmp_path / "ring.stl")).sizes) == 1 and tried == [("closed", "careful"), ("closed", "quick")]
+    (tmp_path / "ring.stl.solid").unlink()
+    store._found.cache_clear()
+    monkeypatch.setattr(making, "_cut_apart", lambda *a: None)
+    with pytest.raises(UserError, match="ring.stl cannot be cut into convex parts in time and memory"):
+        objects.find(str(tmp_path / "ring.stl"))
+
+
 def test_without_the_library(tmp_path, monkeypatch):
     trimesh.creation.annulus(0.02, 0.04, 0.02).export(tmp_path / "ring.stl")
     there = importlib.util.find_spec

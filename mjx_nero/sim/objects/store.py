@@ -20,7 +20,8 @@ from safetensors import numpy as tensors
 from mjx_nero import files
 from mjx_nero.config import bounds, values
 from mjx_nero.files import cache
-from mjx_nero.sim.objects import solid
+from mjx_nero.sim.objects import materials, solid
+from mjx_nero.sim.objects.materials import GREY
 from mjx_nero.sim.objects.solid import Solid
 from mjx_nero.sim.robot import ASSETS
 from mjx_nero.types import UserError
@@ -31,8 +32,7 @@ MAX_KEPT = 30_000_000  # bytes
 ENDING = ".solid"
 KINDS = (".obj", ".stl", ".glb")
 MAX_BYTES = 300_000_000  # of a mesh file
-GREY = (0.7, 0.7, 0.72, 1.0)
-_VERSION = 8  # of the cached format
+_VERSION = 9  # of the cached format
 _ARRAYS = {field.name for field in dataclasses.fields(Solid) if field.name not in ("volume", "rgba", "density", "note")}
 
 
@@ -96,7 +96,8 @@ def _found(path: pathlib.Path, *_changed: int) -> Solid:
     content = files.read_bytes(whole, MAX_BYTES)
     more = files.read_bytes(files.inside(path.parent, about.parts), MAX_BYTES) if about.parts else b""
     key = hashlib.sha256(repr((_VERSION, solid.MAX_PARTS, solid.MAX_CORNERS, dataclasses.astuple(about))).encode())
-    for part in (content, more):
+    look = materials.of(whole, content) if whole.suffix.lower() == ".obj" else materials.Look()
+    for part in (content, more, repr(look.rgba).encode(), look.picture or b""):
         key.update(hashlib.sha256(part).digest())
     places = _places(path, key.hexdigest())
     for place in places:
