@@ -258,6 +258,8 @@ def test_faults_of_configs(block, tmp_path):
 def test_inspection(call, block):
     code, out, err = call("mjx_nero", "inspect", "--object", block, "--scale", 0.5, "--json", "a.json")
     assert code == 0 and not err and "20.0 x 30.0 x 50.0 mm" in out and "0.015 kg, at 500 kg/m³" in out and "10.0 mm" in out
+    out = call("mjx_nero", "inspect", "--object", block, "--scale", 100)[1]
+    assert "is 10 m long: give scale (now 100; 0.001 if the file is in millimetres" in " ".join(out.split())
     code, _, err = call("mjx_nero", "inspect", "--object", "none.stl")
     assert code == 2 and err.startswith("error: cannot read none.stl")
 
