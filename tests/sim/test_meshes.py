@@ -191,6 +191,23 @@ def test_a_scan_that_lacks_a_triangle_is_a_solid(tmp_path):
     assert len(found.sizes) == 1 and found.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
 
 
+def test_what_is_coarser_is_still_closed(monkeypatch):
+    """Folds that make a closed surface open are avoided by other counts and less force, if any of them does."""
+    ball, tried = trimesh.creation.icosphere(5, 0.03), []
+
+    def coarser(mesh, most, force):
+        tried.append((most, force))
+        found = trimesh.creation.icosphere(2, 0.03)
+        if len(tried) < 5:
+            found.update_faces(np.arange(len(found.faces)) > 0)
+        return found
+
+    monkeypatch.setattr(making, "_coarser", coarser)
+    assert making._coarse(ball).is_volume and tried == [(2500, 7), (2500, 5), (2500, 3), (2000, 7), (2000, 5)]
+    monkeypatch.setattr(making, "_coarser", lambda mesh, most, force: trimesh.creation.box().submesh([[0, 1]])[0])
+    assert not making._coarse(ball).is_volume
+
+
 def test_what_is_not_cut_in_time_is_cut_more_coarsely(tmp_path, monkeypatch):
     trimesh.creation.annulus(0.02, 0.04, 0.02).export(tmp_path / "ring.stl")
     tried = []
