@@ -28,6 +28,7 @@ _SHARE, _AHEAD = 0.06, 0.004  # share of an error along the table corrected per 
 # The same share while the object rubs on the rim, and the greatest speed of the search [rad/s]: a set-point that circles
 # faster than errors are corrected leaves the object stuck where it is.
 _RUBS, _ROUND = 0.2, 5.0
+_OWN = 0.005  # [m] greatest error of the arm along each axis that is corrected above the goal
 _CLEARS = 0.003  # [m] height of the object above the rim before it moves across
 _STROKE = 0.005  # [m] depth below the rim at which an object is in
 _CLOSE, _ALIGNED = 1.5e-3, 0.03  # [m, rad] greatest errors of an object that is over its place
@@ -148,7 +149,9 @@ class PutIn:
         leans = jnp.cross(math.rotate(turned, self._own_up(view)), jnp.asarray(_UP))
         upright = math.quat_mul(math.quat_exp(jnp.where(steers, _SHARE, 0.0) * leans), memory.upright)
         share = jnp.where((stage == OVER) & slow, GRIP_FILTER, 0.0)
-        grip = memory.grip + share * (pick.pos - end - memory.grip)
+        # Measured from the set-point, so that the arm's own error is corrected as well, but not the lag of an arm on its way.
+        own = view.ee_pos_w + jnp.clip(pick.pos - view.ee_pos_w, -_OWN, _OWN)
+        grip = memory.grip + share * (own - end - memory.grip)
         turn = jnp.clip(_TURN_SHARE * lacks, -_TURN * self.dt, _TURN * self.dt)
         yaw = pick.yaw + jnp.where(steers, turn, 0.0)
         pos, sought = self._position(memory, view, grip, end)
@@ -192,7 +195,7 @@ class PutIn:
         # Down, but never far below the hand.
         height = seen[2] - goal[2]
         entered = height < cfg.top - _STROKE
-        press = jnp.where(entered, cfg.push, cfg.press)
+        press = jnp.where(entered | (height > cfg.top + _STROKE), cfg.push, cfg.press)
         low = jnp.maximum(pos[2] - step, jnp.maximum(view.ee_pos_w[2] - press, goal[2] + grip[2] - press))
         stands = ~entered & (height < cfg.top + _STROKE) & (falls < _STANDS * cfg.speed)
         radius = cfg.pitch * memory.turned / (2 * jnp.pi)

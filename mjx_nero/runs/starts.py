@@ -30,6 +30,7 @@ from mjx_nero.types import Bank, Shown
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
 EPISODES = 64
 # Maximum standard deviation of the noise on the expert's actions, by whether they are velocities: noisy positions shake the arm.
+# A task whose learner must be calmer than that (``min_std``) is shown no more than the learner's own noise.
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 # A controller of 64 arms is thousands of operations that are too small to share among threads.
@@ -152,6 +153,11 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
     return play
 
 
+def most_noise(env: ManipulationEnv) -> float:
+    """Returns the greatest standard deviation of the noise on the expert's actions."""
+    return min(NOISE["JointVelocity" in env.action_kinds], env.cfg.training.get("min_std") or np.inf)
+
+
 def _milestone(cfg: EnvCfg) -> str | None:
     """Returns the name of the metric that says when the hard part is done; None if there is none."""
     return next((name for name, term in cfg.metrics.items() if term.milestone), None)
@@ -168,7 +174,7 @@ def _processor() -> jax.Device | None:
 def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
     """Plays one episode per key; returns the arguments of ``way``, and the steps as second."""
     grasp = f"metrics.{_milestone(env.cfg)}"
-    noise = NOISE["JointVelocity" in env.action_kinds] * jnp.arange(len(keys))[:, None] / len(keys)
+    noise = most_noise(env) * jnp.arange(len(keys))[:, None] / len(keys)
 
     def step(carry: tuple, key: Array) -> tuple:
         state, memory, alive = carry

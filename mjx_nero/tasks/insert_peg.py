@@ -24,6 +24,7 @@ DENSITY = 1000.0  # [kg/m3]
 OVER = 0.01  # [m] height over the block at which the script carries the peg
 ABOVE = 0.025  # [m] height above the peg from which the hand descends; a hand that lags would knock the peg over
 PRESS = 0.002  # [m] how far the script presses onto the rim
+DONE = 0.005  # [m] height over the bottom at which the hand lets go: pads that slipped down the peg stand on the block
 AWAY = 0.08  # [m] how far the hand rises once it has let go
 
 
@@ -55,7 +56,7 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
     )
     grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), LONG + ABOVE, object="peg", turns=(task.fold,))
     put = {**grip, "foot": LONG / 2, "over": DEEP + OVER, "top": DEEP, "turns": task.fold, "reach": 0.002}
-    put |= {"press": PRESS, "away": AWAY}
+    put |= {"press": PRESS, "done": DONE, "away": AWAY}
     return task.cfg({"put_in": put})
 
 

@@ -71,6 +71,19 @@ def test_a_visited_start_is_a_row_of_its_phase():
     np.testing.assert_allclose(often, [0.5, 0.25, 0.25], atol=0.08)
 
 
+def test_noise_of_what_is_shown():
+    """0.1 of full speed, 0.02 for positions; less only where the learner's own noise may be less."""
+    for kinds, training, most in (
+        (["JointVelocity", "BinaryGripper"], {}, 0.1),
+        (["JointPosition"], {}, 0.02),
+        (["JointVelocity"], {"min_std": 0.05}, 0.05),
+        (["JointVelocity"], {"min_std": 0.2}, 0.1),
+        (["JointVelocity"], {"min_std": 0.0}, 0.1),
+    ):
+        env = types.SimpleNamespace(action_kinds=kinds, cfg=types.SimpleNamespace(training=training))
+        assert starts.most_noise(env) == most
+
+
 def test_what_is_worth_starting_from():
     """Ten steps. Two of four have succeeded for 3 and 10 steps; grasped at the steps 2 and 9; one has not grasped."""
     grasped = np.zeros((10, 4), bool)

@@ -5,6 +5,7 @@ import importlib.util
 import pathlib
 import re
 import runpy
+import shutil
 
 import imageio.v3 as imageio
 import mujoco
@@ -162,6 +163,61 @@ def test_without_a_cache_it_is_made_each_time(block, monkeypatch):
     assert (solids.find(str(block)).points == first.points).all()
 
 
+def test_convex_pieces_are_not_cut_again(tmp_path, monkeypatch):
+    """A file of convex parts, as many simulators keep them, needs no library and stays exact."""
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "coacd" else there(name, *a))
+    apart = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (0.0, 0.05)]
+    trimesh.util.concatenate(apart).export(tmp_path / "two.stl")
+    found = solids.find(str(tmp_path / "two.stl"))
+    assert found.sizes.tolist() == [8, 8] and found.volume == pytest.approx(2 * 0.02**3)
+    assert sorted(part[:, 0].mean() for part in found.parts) == pytest.approx([-0.025, 0.025])
+
+
+def test_a_scan_that_lacks_a_triangle_is_a_solid(tmp_path):
+    """It is closed, weighed as a whole and, as it is convex, not cut."""
+    ball = trimesh.creation.icosphere(2, 0.03)
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    ball.export(tmp_path / "ball.obj")
+    found = solids.find(str(tmp_path / "ball.obj"))
+    assert len(found.sizes) == 1 and found.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
+
+
+def test_what_is_coarser_is_still_closed(monkeypatch):
+    """Folds that make a closed surface open are avoided by other counts and less force, if any of them does."""
+    ball, tried = trimesh.creation.icosphere(5, 0.03), []
+
+    def coarser(mesh, most, force):
+        tried.append((most, force))
+        found = trimesh.creation.icosphere(2, 0.03)
+        if len(tried) < 5:
+            found.update_faces(np.arange(len(found.faces)) > 0)
+        return found
+
+    monkeypatch.setattr(making, "_coarser", coarser)
+    assert making._coarse(ball).is_volume and tried == [(2500, 7), (2500, 5), (2500, 3), (2000, 7), (2000, 5)]
+    monkeypatch.setattr(making, "_coarser", lambda mesh, most, force: trimesh.creation.box().submesh([[0, 1]])[0])
+    assert not making._coarse(ball).is_volume
+
+
+def test_what_is_not_cut_in_time_is_cut_more_coarsely(tmp_path, monkeypatch):
+    trimesh.creation.annulus(0.02, 0.04, 0.02).export(tmp_path / "ring.stl")
+    tried = []
+
+    def cut(mesh, surface, effort):
+        tried.append((surface, effort))
+        corners = trimesh.creation.box((0.08, 0.08, 0.02)).vertices
+        return [np.asarray(corners)] if effort == "quick" else None
+
+    monkeypatch.setattr(making, "_cut_apart", cut)
+    assert len(solids.find(str(tmp_path / "ring.stl")).sizes) == 1 and tried == [("closed", "careful"), ("closed", "quick")]
+    shutil.rmtree(tmp_path / "cache")
+    store._found.cache_clear()
+    monkeypatch.setattr(making, "_cut_apart", lambda *a: None)
+    with pytest.raises(UserError, match="ring.stl cannot be cut into convex parts in time and memory"):
+        solids.find(str(tmp_path / "ring.stl"))
+
+
 def test_without_the_library(tmp_path, monkeypatch):
     trimesh.creation.annulus(0.02, 0.04, 0.02).export(tmp_path / "ring.stl")
     there = importlib.util.find_spec
@@ -211,6 +267,8 @@ def test_faults_of_configs(block, tmp_path):
 def test_inspection(call, block):
     code, out, err = call("mjx_nero", "inspect", "--object", block, "--scale", 0.5, "--json", "a.json")
     assert code == 0 and not err and "20.0 x 30.0 x 50.0 mm" in out and "0.015 kg, at 500 kg/m³" in out and "10.0 mm" in out
+    out = call("mjx_nero", "inspect", "--object", block, "--scale", 100)[1]
+    assert "is 10 m long: give scale (now 100; 0.001 if the file is in millimetres" in " ".join(out.split())
     code, _, err = call("mjx_nero", "inspect", "--object", "none.stl")
     assert code == 2 and err.startswith("error: cannot read none.stl")
 

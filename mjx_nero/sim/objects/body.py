@@ -13,6 +13,7 @@ from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
+LEAST, MOST = 0.005, 2.0  # [m] length of an object
 
 
 def add(
@@ -97,8 +98,14 @@ def checked(name: str, solids: list[Solid], scale: float) -> None:
     UserError: a shape is too small or too large to be an object on a table.
     """
     for solid in solids:
-        longest = float(np.ptp(solid.points, axis=0).max())
-        if not 0.005 <= longest <= 2.0:
-            raise UserError(
-                f"scene.objects.{name} is {longest:.3g} m long: give scale (now {scale:g}; a file in millimetres takes 0.001)"
-            )
+        if said := misfit(solid, scale):
+            raise UserError(f"scene.objects.{name} {said}")
+
+
+def misfit(solid: Solid, scale: float) -> str:
+    """Says why a solid is too small or too large to be an object on a table; empty: it is not."""
+    longest = float(np.ptp(solid.points, axis=0).max())
+    if LEAST <= longest <= MOST:
+        return ""
+    units = "0.001 if the file is in millimetres, 0.01 in centimetres, 0.0254 in inches"
+    return f"is {longest:.3g} m long: give scale (now {scale:g}; {units})"

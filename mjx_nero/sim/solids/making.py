@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import itertools
 import pathlib
 import subprocess
 import sys
@@ -16,9 +17,10 @@ from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of a mesh to cut into pieces
-SECONDS = 12  # of CPU, for the cutting
+SECONDS = {"careful": 12, "quick": 8}  # of CPU, for the cutting: what the first does not finish, the second tries
 MAX_LOOSE = 300  # disconnected pieces
 FLAT = 1e-4  # least thickness, as a share of the length
+CONVEX = 0.97  # least share of its hull's volume that a convex piece fills
 
 
 def make(raw: Raw, parts: list[np.ndarray] | None, density: float = DENSITY) -> Solid:
@@ -53,7 +55,7 @@ def make(raw: Raw, parts: list[np.ndarray] | None, density: float = DENSITY) -> 
         texture=raw.texture if drawn.metadata.get("uv") else np.zeros((0, 0, 3), np.uint8),
         rgba=_colour(raw) if not drawn.metadata.get("uv") else raw.rgba,
         density=density,
-        note=note,
+        note="; ".join(filter(None, (note, raw.missing and f"drawn without {raw.missing}, which is not there"))),
     )
 
 
@@ -71,6 +73,7 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
     mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
     if not mesh.is_watertight:  # in a closed mesh, merging nearly equal vertices would open it
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        trimesh.repair.fill_holes(mesh)  # scans lack a triangle here and there
     a, b, c = mesh.faces.T
     mesh.update_faces((a != b) & (b != c) & (c != a))  # thin triangles stay: without them a closed surface has slits
     mesh.update_faces(mesh.unique_faces())
@@ -82,8 +85,8 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
     return mesh, drawn, note
 
 
-def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """Removes triangles where the surface is flattest until ``most`` are left."""
+def _coarser(mesh: trimesh.Trimesh, most: int, force: float = 7) -> trimesh.Trimesh:
+    """Removes triangles where the surface is flattest until ``most`` are left; with less ``force`` fewer folds arise."""
     if len(mesh.faces) <= most:
         return mesh
     if importlib.util.find_spec("fast_simplification") is None:
@@ -91,37 +94,57 @@ def _coarser(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     import fast_simplification
 
     vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
-    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most)
+    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most, agg=force)
     return trimesh.Trimesh(vertices, faces, process=True)
 
 
+def _coarse(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh to cut: coarser, and still closed if possible, as an open surface takes the library much longer."""
+    if len(mesh.faces) <= COARSE:
+        return mesh
+    tries = (_coarser(mesh, round(share * COARSE), force) for share in (1.0, 0.8, 0.6, 0.4) for force in (7, 5, 3))
+    first = next(tries)
+    return next((found for found in itertools.chain([first], tries) if found.is_volume), first) if mesh.is_volume else first
+
+
 def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
-    """Cuts a mesh into convex parts. A convex mesh is its own only part.
+    """Cuts a mesh into convex parts. A mesh of a few convex pieces is cut already.
 
     Raises:
         UserError: the library is not installed, or fails.
     """
-    hull = _hull(np.asarray(mesh.vertices))
-    if mesh.is_volume and mesh.volume > 0.97 * hull.volume:
-        return [np.asarray(hull.vertices)]
-    pieces_of_it = int(trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices)).max()) + 1
-    if pieces_of_it > MAX_LOOSE:
-        raise UserError(f"is {pieces_of_it:,} disconnected pieces, not a solid: at most {MAX_LOOSE} are cut")
+    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
+    count = int(labels.max()) + 1
+    if count > MAX_LOOSE:
+        raise UserError(f"is {count:,} disconnected pieces, not a solid: at most {MAX_LOOSE} are cut")
+    if count <= MAX_PARTS and mesh.is_volume:
+        each = mesh.submesh([np.flatnonzero(labels[mesh.faces[:, 0]] == k) for k in range(count)])
+        hulls = [_hull(np.asarray(piece.vertices)) for piece in each]
+        if all(piece.volume > CONVEX * hull.volume for piece, hull in zip(each, hulls, strict=True)):
+            return [np.asarray(hull.vertices) for hull in hulls]
     if importlib.util.find_spec("coacd") is None:
         raise UserError(
             "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install -e '.[meshes]')"
         )
-    coarse = _coarser(mesh, COARSE)
+    coarse = _coarse(mesh)
     given = io.BytesIO()
     np.savez(given, vertices=np.asarray(coarse.vertices, float), faces=np.asarray(coarse.faces))
-    closed = "closed" if coarse.is_volume else "open"
-    command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(SECONDS), closed]
+    for effort in SECONDS:
+        if (found := _cut_apart(given.getvalue(), "closed" if coarse.is_volume else "open", effort)) is not None:
+            return found
+    raise UserError("cannot be cut into convex parts in time and memory: repair it, or give it fewer triangles")
+
+
+def _cut_apart(mesh: bytes, surface: str, effort: str) -> list[np.ndarray] | None:
+    """Cuts a mesh in a process of its own; None: it fails."""
+    seconds = SECONDS[effort]
+    command = [sys.executable, pieces.__file__, str(MAX_PARTS), str(MAX_CORNERS), str(seconds), surface, effort]
     try:
-        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=20 * SECONDS)
+        done = subprocess.run(command, input=mesh, capture_output=True, timeout=20 * seconds)
     except subprocess.TimeoutExpired:
-        done = None
-    if done is None or done.returncode or not done.stdout:
-        raise UserError("cannot be cut into convex parts in time and memory: repair it, or give it fewer triangles")
+        return None
+    if done.returncode or not done.stdout:
+        return None
     with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
         return np.split(found["points"], np.cumsum(found["sizes"])[:-1])
 

@@ -11,16 +11,25 @@ import sys
 import numpy as np
 
 THRESHOLD = 0.04  # remaining concavity, as a share of the mesh's size
+# Iterations and resolution of the library's search, by whether the surface is closed, and by effort.
+SEARCH = {
+    (True, "careful"): (60, 1000),
+    (False, "careful"): (10, 500),
+    (True, "quick"): (10, 300),
+    (False, "quick"): (3, 300),
+}
+REPAIR = {"careful": 30, "quick": 15}  # cells along an open surface that is made closed
 MAX_MEMORY = 1_500_000_000  # bytes beyond what the libraries take to load
 
 
-def main(most: int, corners: int, seconds: int, closed: bool) -> None:
+def main(most: int, corners: int, seconds: int, closed: bool, effort: str) -> None:
     """Reads ``vertices`` and ``faces`` (npz), writes ``points`` and ``sizes`` of the pieces.
 
     Args:
         most, corners: greatest number of pieces, and of corners of each.
         seconds: CPU time.
         closed: the surface has no holes.
+        effort: ``careful`` or ``quick``.
     """
     import coacd
 
@@ -29,15 +38,16 @@ def main(most: int, corners: int, seconds: int, closed: bool) -> None:
         now = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (now + MAX_MEMORY, now + MAX_MEMORY))
     coacd.set_log_level("off")
+    iterations, resolution = SEARCH[closed, effort]
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as mesh:
         found = coacd.run_coacd(
             coacd.Mesh(mesh["vertices"], mesh["faces"]),
             threshold=THRESHOLD,
             max_convex_hull=most,
             preprocess_mode="off" if closed else "on",  # a surface with holes becomes a thicker one without
-            preprocess_resolution=30,
-            mcts_iterations=60 if closed else 10,
-            resolution=1000 if closed else 500,
+            preprocess_resolution=REPAIR[effort],
+            mcts_iterations=iterations,
+            resolution=resolution,
             decimate=True,
             max_ch_vertex=corners,
             seed=0,
@@ -48,4 +58,4 @@ def main(most: int, corners: int, seconds: int, closed: bool) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "closed")
+    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "closed", sys.argv[5])

@@ -11,15 +11,13 @@ import re
 import numpy as np
 from PIL import Image
 
-from mjx_nero import files
-from mjx_nero.sim.solids import glb
-from mjx_nero.sim.solids.store import GREY, KINDS
+from mjx_nero.sim.solids import glb, materials
+from mjx_nero.sim.solids.materials import GREY, Look
+from mjx_nero.sim.solids.store import KINDS
 from mjx_nero.types import UserError
 
 MAX_TRIANGLES = 4_000_000
 MAX_NUMBERS = 30_000_000  # in a text file
-MAX_MTL = 1_000_000  # bytes of a file of materials
-MAX_PICTURE = 40_000_000  # bytes
 MAX_PIXELS = 8192  # along an edge of a picture
 PIXELS = 1024  # along an edge, as drawn
 _FAR = 1e6  # bound of a coordinate
@@ -35,6 +33,7 @@ class Raw:
         uv: [n, 2], or empty: places of the vertices in the texture.
         texture: uint8 [height, width, 3], or empty.
         rgba: colour.
+        missing: a file of its materials that is not there; empty: all are.
     """
 
     vertices: np.ndarray
@@ -42,6 +41,7 @@ class Raw:
     uv: np.ndarray
     texture: np.ndarray
     rgba: tuple[float, float, float, float]
+    missing: str = ""
 
 
 def read(path: pathlib.Path, content: bytes) -> Raw:
@@ -58,13 +58,15 @@ def read(path: pathlib.Path, content: bytes) -> Raw:
     if kind not in KINDS:
         raise UserError(f"{path} is not a supported mesh: give one of {', '.join(KINDS)}")
     try:
-        vertices, faces, uv, picture, rgba = {".obj": _obj, ".stl": _stl, ".glb": _glb}[kind](path, content)
+        vertices, faces, uv, look = {".obj": _obj, ".stl": _stl, ".glb": _glb}[kind](path, content)
+    except UserError:
+        raise
     except ValueError as error:
         raise UserError(f"{path} cannot be read as {kind[1:].upper()}: {' '.join(str(error).split())[:160]}") from None
-    return _checked(path, vertices, faces, uv, picture, rgba)
+    return _checked(path, vertices, faces, uv, look)
 
 
-def _checked(path, vertices, faces, uv, picture, rgba) -> Raw:
+def _checked(path, vertices, faces, uv, look: Look) -> Raw:
     if not len(faces) or not len(vertices):
         raise UserError(f"{path} holds no triangles")
     if len(faces) > MAX_TRIANGLES:
@@ -73,10 +75,10 @@ def _checked(path, vertices, faces, uv, picture, rgba) -> Raw:
         raise UserError(f"{path} has a coordinate that is not finite or not below {_FAR:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UserError(f"{path} has a triangle with vertices that it does not have")
-    texture = np.zeros((0, 0, 3), np.uint8) if picture is None else _picture(path, picture)
+    texture = np.zeros((0, 0, 3), np.uint8) if look.picture is None else _picture(path, look.picture)
     if not texture.size or len(uv) != len(vertices) or not np.isfinite(uv).all():
         uv = np.zeros((0, 2))
-    return Raw(vertices.astype(float), faces.astype(np.int64), uv.astype(np.float32), texture, rgba)
+    return Raw(vertices.astype(float), faces.astype(np.int64), uv.astype(np.float32), texture, look.rgba, look.missing)
 
 
 def _stl(path, content: bytes):
@@ -92,7 +94,7 @@ def _stl(path, content: bytes):
         raise ValueError("its vertices do not make up triangles")
     vertices, inverse = np.unique(corners, axis=0, return_inverse=True) if np.isfinite(corners).all() else (corners, None)
     faces = (np.arange(len(corners)) if inverse is None else inverse).reshape(-1, 3)
-    return vertices, faces, np.zeros((0, 2)), None, GREY
+    return vertices, faces, np.zeros((0, 2)), Look()
 
 
 def _obj(path: pathlib.Path, content: bytes):
@@ -109,14 +111,14 @@ def _obj(path: pathlib.Path, content: bytes):
     if (sizes < 3).any():
         raise ValueError("a face of fewer than three corners")
     fan = _fan(sizes)
-    picture, rgba = _materials(path, content)
-    if not len(textured) or picture is None or not all(b"/" in word for word in corners):
-        return places, at[fan], np.zeros((0, 2)), None, rgba
+    look = materials.of(path, content)
+    if not len(textured) or look.picture is None or not all(b"/" in word for word in corners):
+        return places, at[fan], np.zeros((0, 2)), dataclasses.replace(look, picture=None)
     seams = _indices([word.split(b"/")[1] for word in corners], len(textured))
     pairs, each = np.unique(np.stack([at, seams], axis=1), axis=0, return_inverse=True)
     if pairs.min() < 0 or pairs[:, 0].max() >= len(places) or pairs[:, 1].max() >= len(textured):
         raise ValueError("a face with vertices that it does not have")
-    return places[pairs[:, 0]], each.reshape(-1)[fan], textured[pairs[:, 1]], picture, rgba
+    return places[pairs[:, 0]], each.reshape(-1)[fan], textured[pairs[:, 1]], look
 
 
 def _fan(sizes: np.ndarray) -> np.ndarray:
@@ -150,42 +152,9 @@ def _numbers(lines: list[bytes], what: str, least: int = 3) -> np.ndarray:
     return np.array(words).astype(float).reshape(-1, width)[:, :least]
 
 
-def _materials(path: pathlib.Path, content: bytes) -> tuple[bytes | None, tuple[float, float, float, float]]:
-    """The first texture and the first colour that the file's materials name."""
-    found = re.search(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", content, re.MULTILINE)
-    if not found:
-        return None, GREY
-    text = files.read_bytes(_beside(path, found[1]), MAX_MTL)
-    colour = re.search(rb"^[ \t]*Kd[ \t]+([^\r\n]+)", text, re.MULTILINE)
-    rgb = np.clip(_numbers([colour[1]], "Kd")[0], 0, 1) if colour else np.array(GREY[:3])
-    if not np.isfinite(rgb).all():
-        raise ValueError("a colour that is not finite")
-    picture = re.search(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", text, re.MULTILINE)
-    rgba = (float(rgb[0]), float(rgb[1]), float(rgb[2]), 1.0)
-    return (files.read_bytes(_beside(path, picture[1]), MAX_PICTURE) if picture else None), rgba
-
-
-def _beside(path: pathlib.Path, name: bytes) -> pathlib.Path:
-    """A file that a mesh names, in its own folder or below.
-
-    Raises:
-        UserError: it lies elsewhere.
-    """
-    try:
-        word = name.strip().decode()
-        inner = pathlib.PurePosixPath(word)
-        real = path.parent.joinpath(inner).resolve()
-    except (OSError, RuntimeError, ValueError):
-        raise UserError(f"{path} names an impossible file: correct its mtllib and map_Kd lines") from None
-    outside = "\\" in word or inner.is_absolute() or ".." in inner.parts or not real.is_relative_to(path.parent.resolve())
-    if outside or not word.isprintable() or len(word) > 200:
-        raise UserError(f"{path} names {word[:80]!a}, which is not below its own folder: copy it there")
-    return real
-
-
 def _glb(path: pathlib.Path, content: bytes):
     vertices, faces, uv, picture, rgba = glb.parse(content, MAX_TRIANGLES)
-    return vertices, faces, uv, picture, rgba or GREY
+    return vertices, faces, uv, Look(rgba or GREY, picture)
 
 
 def _picture(path: pathlib.Path, content: bytes) -> np.ndarray:

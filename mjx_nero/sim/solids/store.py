@@ -14,7 +14,8 @@ import numpy as np
 from mjx_nero import files
 from mjx_nero.config import bounds, values
 from mjx_nero.sim.robot import ASSETS
-from mjx_nero.sim.solids import kept, solid
+from mjx_nero.sim.solids import kept, materials, solid
+from mjx_nero.sim.solids.materials import GREY
 from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
@@ -22,8 +23,7 @@ HOME = ASSETS / "objects"
 ABOUT = "object.yaml"
 KINDS = (".obj", ".stl", ".glb")
 MAX_BYTES = 300_000_000  # of a mesh file
-GREY = (0.7, 0.7, 0.72, 1.0)
-_VERSION = 9  # of the cached format
+_VERSION = 10  # of the cached format
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,8 @@ def _found(path: pathlib.Path, *_changed: int) -> Solid:
     content = files.read_bytes(whole, MAX_BYTES)
     more = files.read_bytes(files.inside(path.parent, about.parts), MAX_BYTES) if about.parts else b""
     key = hashlib.sha256(repr((_VERSION, solid.MAX_PARTS, solid.MAX_CORNERS, dataclasses.astuple(about))).encode())
-    for part in (content, more):
+    look = materials.of(whole, content) if whole.suffix.lower() == ".obj" else materials.Look()
+    for part in (content, more, repr(look.rgba).encode(), look.picture or b""):
         key.update(hashlib.sha256(part).digest())
 
     def make() -> dict[str, np.ndarray]:

@@ -63,7 +63,7 @@ def of(file: str, scale: float = 1.0) -> Thing:
         rests=tuple((_floats(q), solid.height(q), float(s)) for q, s in zip(solid.rest_quat, solid.rest_share, strict=True)),
         triangles=len(solid.faces),
         texture=(solid.texture.shape[1], solid.texture.shape[0]) if len(solid.uv) else (0, 0),
-        note=solid.note,
+        note="; ".join(filter(None, (bodies.misfit(solid, scale), solid.note))),
     )
 
 
