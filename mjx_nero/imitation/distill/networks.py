@@ -1,6 +1,5 @@
 """The student's networks: made from a config, and rebuilt from the description in a policy's file."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -84,5 +83,5 @@ def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
     """Rebuilds the student that a policy file describes: a template of its parameters, and its act function."""
     sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=lambda node: isinstance(node, list | tuple))
     net = Student(read(StudentCfg, meta["student"], "student"), meta["action_size"], sizes[TRUTH][0])
-    template = jax.eval_shape(functools.partial(init_params, net, sizes), jax.random.PRNGKey(0))
+    template = jax.eval_shape(lambda: init_params(net, sizes, jax.random.PRNGKey(0)))
     return template, lambda params, obs: apply(net, params, obs)[0]
