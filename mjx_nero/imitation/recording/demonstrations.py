@@ -75,8 +75,8 @@ class Player:
         one = jax.eval_shape(
             self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
         )
-        # Three copies of the steps exist: from the device, ordered by episodes, and being written.
-        device_memory.check_batch(env, size, "--side-by-side", 3.0 * size * env.episode_length * device_memory.size(one))
+        # Copies of the steps: from the device, ordered by slots, and as episodes; meanwhile others are written, from two.
+        device_memory.check_batch(env, size, "--side-by-side", 5.0 * size * env.episode_length * device_memory.size(one))
 
     def close(self) -> None:
         """Frees the renderers."""

@@ -20,6 +20,7 @@ from mjx_nero import cores
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.recording.batches import Batches
+from mjx_nero.imitation.recording.page_locked import PageLocked
 from mjx_nero.sim.cameras.cfg import MARK
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
@@ -159,7 +160,7 @@ class _Traced:
         seen = env.draw_by({name: camera}, "warp")
         draw = jax.jit(jax.vmap(lambda shown: seen(*shown)[name].rgb))
         episodes = max(1, min(EPISODES, PIXELS // (TOGETHER * size[0] * size[1])))
-        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}))
+        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}), PageLocked(TOGETHER))
 
     def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
         return self._draw((qpos, scenery))
