@@ -9,11 +9,11 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from mjx_nero.data import Episode, open_dataset, units
 from mjx_nero.data import episode as names
-from mjx_nero.data import open_dataset, units
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, demos
-from mjx_nero.tools.demos import making
+from mjx_nero.tools.demos import command, making
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays", "--env.episode_length_s", 0.2]
@@ -82,6 +82,20 @@ def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
         np.testing.assert_array_equal(one.column(name), other.column(name))
     code, _, err = call("mjx_nero", "demos", *argv, "--episodes", 9, "--seed", 1)
     assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another --out" in err
+
+
+def test_no_more_is_played_than_is_to_be_kept():
+    """Of every two episodes one succeeds."""
+    episodes = (Episode({"x": np.zeros((1, 1))}, number % 2 == 1, number) for number in itertools.count())
+
+    def take(most, all, wanted):
+        kept, played = command._take(episodes, most, all, wanted)
+        return [each.number for each in kept], played
+
+    assert take(6, False, 2) == ([1, 3], 4)
+    assert take(6, False, 0) == ([], 0)
+    assert take(6, True, 3) == ([4, 5, 6], 3)
+    assert take(4, False, 9) == ([7, 9], 4)
 
 
 def test_an_episode_may_end_with_its_success(call, tmp_path):
