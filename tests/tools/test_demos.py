@@ -6,6 +6,7 @@ import pathlib
 import re
 
 import imageio.v3 as imageio
+import mujoco
 import numpy as np
 import pytest
 
@@ -194,6 +195,19 @@ def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_ray_tracer_needs_no_opengl(monkeypatch):
+    """Not even to make an environment, as nothing is drawn while an agent plays."""
+
+    def missing(*args, **kwargs):
+        raise AssertionError("MuJoCo's renderer was made")
+
+    monkeypatch.setattr(mujoco, "Renderer", missing)
+    cfg = DemosCfg("nero_lift", "rgb", agent="policy", cameras="front", renderer="warp", picture="16x16", episodes=1)
+    schema, player = making.prepare(cfg)
+    assert schema.about["renderer"] == "warp" and schema.features[names.PICTURES + "front"].picture == (16, 16)
+    player.close()
+
+
 def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(call, tmp_path):
     """The bundled policy acts, told where the cube is; both cameras see it as the preset has it looks. Of a step there is what
     LeRobot's policies learn from, and no more."""
