@@ -69,6 +69,21 @@ def test_the_policy_is_a_student_and_begins_as_one(quick):
     np.testing.assert_allclose(np.exp(begun.params.policy["params"]["std_logparam"]), CFG.min_std, rtol=1e-6)
 
 
+def test_a_students_policy_waits_for_its_critic(quick):
+    made = make(dataclasses.replace(CFG, critic_first=1))
+    run, states = jax.jit(made.run, static_argnums=1), [jax.jit(made.init)(jax.random.PRNGKey(0))]
+    for _ in range(2):
+        states.append(run(states[-1], 1)[0])
+    moved = [
+        [
+            any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (part(one), part(next))), strict=True))
+            for part in (lambda s: s.params.policy, lambda s: s.params.value)
+        ]
+        for one, next in zip(states, states[1:], strict=False)
+    ]
+    assert moved == [[False, True], [True, True]]  # policy, critic
+
+
 def test_what_does_not_go_together_is_refused(quick):
     with pytest.raises(UserError, match="imitates no expert, whose steps have no pictures"):
         make(dataclasses.replace(CFG, imitation=1.0))

@@ -97,6 +97,13 @@ class Learner(ppo.Learner):
         truth_loss, seen_error = away(where, batch.obs[TRUTH], normalizer)
         return total + self.cfg.truth_cost * truth_loss, {**metrics, "truth_loss": truth_loss, "seen_error": seen_error}
 
+    def _update(self, state: ppo.TrainState, batch: ppo.Batch, key: Key) -> tuple[losses.PPONetworkParams, Any, ppo.Metrics]:
+        """Leaves the policy as it was in the first iterations, while the critic learns from its steps."""
+        params, opt_state, metrics = super()._update(state, batch, key)
+        waits = state.iteration < self.cfg.critic_first
+        policy = jax.tree.map(lambda old, new: jnp.where(waits, old, new), state.params.policy, params.policy)
+        return params.replace(policy=policy), opt_state, metrics
+
     update_metrics = (*ppo.Learner.update_metrics, "truth_loss", "seen_error")
 
     def policy(self, state: ppo.TrainState) -> tuple:
