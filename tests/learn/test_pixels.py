@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from mjx_nero import ManipulationEnv, UserError
 from mjx_nero.envs import wrappers
 from mjx_nero.learn import learner, policy
 from mjx_nero.learn.pixels.cfg import PixelsCfg, StudentCfg
+from mjx_nero.runs import compiled
 from mjx_nero.tasks import registry
 
 CFG = PixelsCfg(
@@ -94,6 +96,26 @@ def test_what_does_not_go_together_is_refused(quick):
     cfg = dataclasses.replace(learner.cfg_for("ppo", "rgb_fixed", {}), num_envs=8, minibatch_size=16)
     with pytest.raises(UserError, match="the learner ppo reads no pictures: pass --learner pixels"):
         learner.find("ppo").make(wrappers.for_training(env), cfg, 1)
+
+
+def test_pictures_are_first_drawn_when_all_is_prepared(quick, call, monkeypatch):
+    """Otherwise two threads use Warp at once, if the programs come from the compilation cache."""
+    happened, starter = [], compiled.starter
+
+    def prepare(self, *_):
+        time.sleep(0.5)
+        happened.append("prepared")
+
+    def starting(*given):
+        start = starter(*given)
+        return lambda seed: (happened.append("started"), start(seed))[1]
+
+    monkeypatch.setattr(ManipulationEnv, "prepare", prepare)
+    monkeypatch.setattr(compiled, "starter", starting)
+    flags = ["--preset", "rgb_fixed", "--num-envs", 8, "--no-video", "--out", "run", "--distill.minibatch_size", 64]
+    flags += ["--env.episode_length_s", 0.2, "--distill.student.channels", "(8, 8)", "--num-timesteps", 128]
+    code, _, err = call("train", *flags)
+    assert code == 0 and happened[:2] == ["prepared", "started"], err
 
 
 def test_it_trains_is_resumed_and_goes_on_from_a_student(quick, call, tmp_path):

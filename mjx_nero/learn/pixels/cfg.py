@@ -40,9 +40,7 @@ class StudentCfg:
 class PixelsCfg(PpoCfg):
     """PPO's hyperparameters, and the policy's networks. Of ``network`` only the critic's layers and ``init_std`` matter."""
 
-    critic_first: Annotated[int, Bounds(0, 10_000)] = (
-        0  # iterations in which the policy waits for its critic
-    )
+    critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which the policy waits for its critic
     truth_cost: NonNegative = 0.1  # weight of the loss of predicted object positions, in units of their deviation
     student: StudentCfg = StudentCfg()
 
