@@ -146,7 +146,7 @@ def call(monkeypatch, capfd, tmp_path):
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cli, "setup_jax", lambda: None)
-    monkeypatch.setattr(imitation, "STEPS", 20)
+    monkeypatch.setattr(imitation, "PASSES", 1.25)
     monkeypatch.setattr(cli.os, "_exit", sys.exit)  # the end of an interrupted program, not of the tests
     monkeypatch.setenv("COLUMNS", "200")
 

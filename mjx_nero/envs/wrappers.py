@@ -49,7 +49,7 @@ class ExpertStarts(Wrapper):
         rows = bank or jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), jax.eval_shape(self.unwrapped.blank))
         progress = Progress(rows, jnp.full(n, share, jnp.float32), jnp.full(n, -1, jnp.int32), jnp.zeros(n))
         state = self.env.reset(rng, _starts(progress))
-        metrics = {**state.metrics, "visited": jnp.zeros(n)}
+        metrics = {**state.metrics, "visited": jnp.zeros(n), "visited_success": jnp.zeros(n)}
         return state.replace(info={**state.info, "starts": progress}, metrics=metrics)
 
     def following(self, state: State) -> Start:
@@ -61,7 +61,8 @@ class ExpertStarts(Wrapper):
         state = self.env.step(state, action, start)
         done = state.done > 0
         last, won = jnp.where(done, phase, progress.last), jnp.where(done, state.metrics["success"], progress.won)
-        metrics = {**state.metrics, "visited": state.done * (phase > 0)}
+        visited = state.done * (phase > 0)
+        metrics = {**state.metrics, "visited": visited, "visited_success": visited * state.metrics["success"]}
         return state.replace(info={**state.info, "starts": dataclasses.replace(progress, last=last, won=won)}, metrics=metrics)
 
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from mjx_nero.types import Bank, Key
 
-ROWS = 16_384  # number of rows of ``types.Shown``
+DEMONSTRATIONS = 64  # episodes that an expert plays for a learner
+ROWS = 256  # rows of ``types.Shown`` for each of them
 HELD = {"[0]": ".normalizer", "[1]": ".params"}  # ``Kind.held`` of a state with these two
 Params = Any  # a policy's parameters: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
@@ -38,7 +39,8 @@ class Learner(Protocol):
         num_envs: number of environments on all devices together.
         num_devices: number of devices that they are spread over.
         divisor: ``num_envs`` must be a multiple of it.
-        imitates: True if ``init`` also takes ``shown``, ``ROWS`` steps of an expert (``types.Shown``). May be missing: False.
+        imitates: True if ``init`` also takes ``shown``, steps of an expert (``types.Shown``). May be missing: False.
+        demonstrations: number of the expert's episodes, with ``ROWS`` steps in ``shown`` for each. May be missing.
         steps_per_iteration: env steps of an iteration.
     """
 

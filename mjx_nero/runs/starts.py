@@ -24,13 +24,11 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg, EnvCfg, compensated
 from mjx_nero.errors import UserError
-from mjx_nero.learn.learner import ROWS, Learner
+from mjx_nero.learn.learner import DEMONSTRATIONS, ROWS, Learner
 from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
-EPISODES = 64
 # Maximum standard deviation of the noise on the expert's actions, by whether they are velocities: noisy positions shake the arm.
-# A task whose learner must be calmer than that (``min_std``) is shown no more than the learner's own noise.
 NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 # A controller of 64 arms is thousands of operations that are too small to share among threads.
@@ -78,7 +76,8 @@ def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Mak
     """
     env, imitates = learner.env, new and getattr(learner, "imitates", False)
     begins = isinstance(env, wrappers.ExpertStarts)
-    player = functools.cache(lambda: _player(env.unwrapped, learner.num_envs))
+    episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
+    player = functools.cache(lambda: _player(env.unwrapped, min(episodes, learner.num_envs)))
 
     def make(seed: int) -> dict[str, Any]:
         if not begins and not imitates:
@@ -98,7 +97,7 @@ def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Mak
         if not found.enough:
             return {}
         bank = {"bank": rows(found, learner.num_envs, wrappers.PHASES, seed)} if begins else {}
-        return {**bank, **({"shown": steps(found, shown, seed)} if imitates else {})}
+        return {**bank, **({"shown": steps(found, shown, ROWS * episodes, seed)} if imitates else {})}
 
     return make
 
@@ -112,10 +111,10 @@ def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
     return jax.tree.map(lambda x: np.asarray(x)[step, episode], way.states)
 
 
-def steps(way: Way, shown: Shown, seed: int) -> Shown:
-    """Draws ``ROWS`` of the steps [steps, episodes, ...] of the useful episodes, each with the same probability."""
+def steps(way: Way, shown: Shown, n: int, seed: int) -> Shown:
+    """Draws ``n`` of the steps [steps, episodes, ...] of the useful episodes, each with the same probability."""
     rng, count = np.random.default_rng(seed), len(shown.action)
-    at = rng.integers(count, size=ROWS), rng.choice(np.flatnonzero(way.ends), ROWS)
+    at = rng.integers(count, size=n), rng.choice(np.flatnonzero(way.ends), n)
     return jax.tree.map(lambda x: np.asarray(x)[at], shown)
 
 
@@ -128,8 +127,8 @@ def playground(cfg: EnvCfg) -> EnvCfg:
     return dataclasses.replace(compensated(cfg).uncorrupted(), **plain)
 
 
-def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown]]:
-    """Compiles a program that plays the expert's episodes of a seed.
+def _player(own: ManipulationEnv, count: int) -> Callable[[int], tuple[Way, Shown]]:
+    """Compiles a program that plays ``count`` episodes of the expert from a seed.
 
     Raises:
         UserError: the task has no expert.
@@ -137,7 +136,6 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
     cfg, name = own.cfg, next(iter(own.cfg.controllers), None)
     if name is None or _milestone(cfg) is None:
         raise UserError("the task has no script that grasps")
-    count = min(most, EPISODES)
     env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
     quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
     expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
@@ -151,11 +149,6 @@ def _player(own: ManipulationEnv, most: int) -> Callable[[int], tuple[Way, Shown
         return way(states, grasped, won, hold, coming, past, whole=cfg.obstacles is None), shown
 
     return play
-
-
-def most_noise(env: ManipulationEnv) -> float:
-    """Returns the greatest standard deviation of the noise on the expert's actions."""
-    return min(NOISE["JointVelocity" in env.action_kinds], env.cfg.training.get("min_std") or np.inf)
 
 
 def _milestone(cfg: EnvCfg) -> str | None:
@@ -174,7 +167,7 @@ def _processor() -> jax.Device | None:
 def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
     """Plays one episode per key; returns the arguments of ``way``, and the steps as second."""
     grasp = f"metrics.{_milestone(env.cfg)}"
-    noise = most_noise(env) * jnp.arange(len(keys))[:, None] / len(keys)
+    noise = NOISE["JointVelocity" in env.action_kinds] * jnp.arange(len(keys))[:, None] / len(keys)
 
     def step(carry: tuple, key: Array) -> tuple:
         state, memory, alive = carry

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.task import (
-    SHOWN,
+    PRECISE,
     Budget,
     CurriculumCfg,
     EnvCfg,
@@ -27,8 +27,6 @@ from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks.facing import ALONG, BAR, SIDE, TAKER, YAW, Pair, pair
 
 THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
-# Least standard deviation of a learner's actions: at half an arm's length, 0.1 moves the bar faster than STILL.
-CALMEST = 0.05
 CLASH = 0.09  # [m] distance of the grasp points below which the hands, 7 cm wide each way, would collide
 
 
@@ -146,7 +144,7 @@ def default(robot: RobotCfg, taker: RobotCfg | None = None) -> EnvCfg:
         events=_start(two),
         rewards=_rewards(two),
         curriculum=CurriculumCfg(expert_starts=0.5),
-        training={**SHOWN, "min_std": CALMEST},
+        training=PRECISE,
         budget=Budget(steps=300_000_000, success=0.85),
         terminations={
             **stays_on_table(scene, **one),

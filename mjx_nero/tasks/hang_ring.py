@@ -1,6 +1,6 @@
 """Hang ring: pick a ring up from the table, and hang it over the post of a stand. For any robot with a gripper."""
 
-from mjx_nero.envs.task import EnvCfg, Presets
+from mjx_nero.envs.task import PRECISE, EnvCfg, Presets
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -42,7 +42,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         "done": 0.004,
         "press": PRESS,
     }
-    return task.cfg({"put_thing": put})
+    return task.cfg({"put_thing": put}, training=PRECISE)
 
 
 PRESETS: Presets = {"default": default}

@@ -13,7 +13,6 @@ from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg
 from mjx_nero.learn import checkpoint
-from mjx_nero.learn.learner import ROWS
 from mjx_nero.mdp import curriculum, events
 from mjx_nero.runs import starts
 from mjx_nero.types import PHASE, Bank, Shown, Start
@@ -71,19 +70,6 @@ def test_a_visited_start_is_a_row_of_its_phase():
     np.testing.assert_allclose(often, [0.5, 0.25, 0.25], atol=0.08)
 
 
-def test_noise_of_what_is_shown():
-    """0.1 of full speed, 0.02 for positions; less only where the learner's own noise may be less."""
-    for kinds, training, most in (
-        (["JointVelocity", "BinaryGripper"], {}, 0.1),
-        (["JointPosition"], {}, 0.02),
-        (["JointVelocity"], {"min_std": 0.05}, 0.05),
-        (["JointVelocity"], {"min_std": 0.2}, 0.1),
-        (["JointVelocity"], {"min_std": 0.0}, 0.1),
-    ):
-        env = types.SimpleNamespace(action_kinds=kinds, cfg=types.SimpleNamespace(training=training))
-        assert starts.most_noise(env) == most
-
-
 def test_what_is_worth_starting_from():
     """Ten steps. Two of four have succeeded for 3 and 10 steps; grasped at the steps 2 and 9; one has not grasped."""
     grasped = np.zeros((10, 4), bool)
@@ -113,10 +99,10 @@ def test_steps_that_are_shown_are_of_episodes_worth_it():
     """Three steps of four episodes, of which the second and the last are worth it: each step of those as often as any other."""
     step, episode = np.indices((3, 4))
     way = starts.Way(None, np.zeros(4, int), np.array([0, 2, 0, 3]), 1.0, 1.0)
-    found = starts.steps(way, Shown({"state": 10 * step + episode}, step), seed=0)
+    found = starts.steps(way, Shown({"state": 10 * step + episode}, step), 16_384, seed=0)
     which, often = np.unique(found.obs["state"], return_counts=True)
     assert which.tolist() == [1, 3, 11, 13, 21, 23] and (found.obs["state"] // 10 == found.action).all()
-    np.testing.assert_allclose(often / ROWS, 1 / 6, atol=0.02)
+    np.testing.assert_allclose(often / 16_384, 1 / 6, atol=0.02)
 
 
 # --- with physics

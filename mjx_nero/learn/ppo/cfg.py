@@ -10,6 +10,7 @@ from mjx_nero.config.values import hints, read, short
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
+from mjx_nero.learn.learner import DEMONSTRATIONS
 
 PRECISIONS = ("default", "bfloat16", "tensorfloat32", "float32", "high", "highest")
 Rate = Annotated[float, Bounds(0.0, 1.0, above=True)]
@@ -101,6 +102,8 @@ class PpoCfg:
     entropy_cost: NonNegative = 0.01  # weight of the entropy bonus, which keeps the policy exploring
     change_cost: NonNegative = 0.0  # weight of the squared change of mean actions between steps, which keeps the policy calm
     imitation: NonNegative = 0.0  # weight of the distance from the expert's actions, until half of the episodes succeed
+    imitation_lasts: bool = False  # that weight goes by the share of episodes that fail, to the end of training
+    demonstrations: Annotated[int, Bounds(1, 4_096)] = DEMONSTRATIONS  # episodes that the expert plays to be imitated
     critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which an imitating policy waits for its critic
     min_std: NonNegative = 0.2  # minimum standard deviation of actions, so that exploration lasts; 0: none
     max_std: NonNegative = 1.0  # maximum standard deviation, since noise costs nothing where targets saturate; 0: none

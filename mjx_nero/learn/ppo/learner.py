@@ -124,7 +124,7 @@ class Learner(learner.Learner):
             raise UserError(f"ppo.min_std ({cfg.min_std:g}) is above ppo.max_std ({cfg.max_std:g})")
         self.env, self.cfg, self.num_envs = env, cfg, cfg.num_envs
         self.num_devices, self.divisor = num_devices, parts
-        self.imitates = cfg.imitation > 0
+        self.imitates, self.demonstrations = cfg.imitation > 0, cfg.demonstrations
         self._axis = _AXIS if num_devices > 1 else None  # None: a program without any communication
         self._mesh = Mesh(np.array(devices), (_AXIS,))
         self.sizes = env.observation_size
@@ -153,7 +153,7 @@ class Learner(learner.Learner):
         """Makes new networks and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
         normalizer, params = init_params(self.networks, self.measured(self.sizes), k_net)
-        school = imitation.school(self.env.unwrapped, shown) if self.imitates else None
+        school = imitation.school(self.env.unwrapped, shown, self.cfg) if self.imitates else None
         if school and shown is not None:
             normalizer = imitation.seen(normalizer, shown)
             params = imitation.cloned(self.networks, normalizer, params, shown, k_net)
@@ -249,7 +249,7 @@ class Learner(learner.Learner):
             raw = running_statistics.denormalize(batch.returns, returns)
             returns = running_statistics.update(returns, raw, pmap_axis_name=self._axis)
         sums = jax.lax.psum(sums, self._axis) if self._axis else sums
-        school = state.school and state.school.after(sums["sum/success"], sums["sum/episodes"])
+        school = state.school and state.school.after(sums)
         state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns, school)
         return state, {**sums, **metrics}
 
@@ -336,24 +336,30 @@ class Learner(learner.Learner):
         return total, {**metrics, "action_std": jnp.mean(new.scale)}
 
     def _update(self, state: TrainState, batch: Batch, key: Key) -> tuple[losses.PPONetworkParams, optax.OptState, Metrics]:
-        cfg = self.cfg
+        cfg, school = self.cfg, state.school
+        waits = school.waits(state.iteration, cfg) if school else jnp.array(False)
 
         def minibatch(carry, envs_and_key):
             params, opt_state = carry
             envs, key = envs_and_key
             part = jax.tree.map(lambda x: x[:, envs].reshape(-1, *x.shape[2:]), batch)  # flat, for faster products on a CPU
             grads, metrics = jax.grad(self.loss, has_aux=True)(params, state.normalizer, part, key)
-            if state.school:
-                grads = imitation.held_back(grads, state.iteration < cfg.critic_first, state.school)
-                pull = imitation.gradient(self.networks, state.normalizer, params, state.school, key)
+            if school:
+                grads = grads if school.lasts else imitation.held_back(grads, waits)
+                pull = imitation.gradient(self.networks, state.normalizer, params, school, key)
                 grads = jax.tree.map(lambda own, to: own + cfg.imitation * to, grads, pull)
             grads, metrics = self._mean((grads, metrics))
             if cfg.desired_kl:
+                kl = metrics["kl"]
+                if school and school.lasts:  # a policy that stands still says nothing about the rate
+                    kl = jnp.where(waits, cfg.desired_kl, kl)
                 opt_state, _ = optimizer.adaptive_kl_learning_rate(
-                    opt_state, metrics["kl"], cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
+                    opt_state, kl, cfg.desired_kl, cfg.min_learning_rate, cfg.max_learning_rate
                 )
             metrics["learning_rate"] = opt_state[-1].hyperparams["learning_rate"]
             updates, opt_state = self._optimizer.update(grads, opt_state)
+            if school and school.lasts:  # Adam sees what it will move by, so that its first step is no blow
+                updates = imitation.held_back(updates, waits)
             params = optax.apply_updates(params, updates)
             params = params.replace(policy=_bound_std(params.policy, cfg.min_std, cfg.max_std))
             return (params, opt_state), jnp.stack([metrics[name] for name in self.update_metrics])
