@@ -47,16 +47,14 @@ def main(argv: Sequence[str]) -> None:
         near = values.hint(argv[0], COMMANDS)
         raise UserError(f"unknown command {values.short(argv[0])}{near}: choose one of {', '.join(COMMANDS)}")
     module, function, _ = COMMANDS[argv[0]]
-    gc.disable()  # imports make hundreds of thousands of lasting objects: collecting garbage meanwhile takes a tenth of the time
-    try:
-        found = importlib.import_module(module)
-    finally:
-        gc.enable()
+    found = importlib.import_module(module)
     getattr(found, function)(argv[1:])
 
 
 def program(*command: str) -> NoReturn:
     """Runs the console script ``mjx-nero``, or one of its commands as a separate program."""
+    # Imports and traces make hundreds of thousands of lasting objects. Python would look through all of them again and again.
+    gc.set_threshold(100_000)
     cli.run(lambda argv: main([*command, *argv]))
 
 

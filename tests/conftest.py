@@ -62,7 +62,7 @@ from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tasks import registry  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
 
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # as programs do (cli.setup_jax)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # as programs do (cli.setup_jax)
 jax.config.update("jax_default_matmul_precision", "highest")
 # Tracing makes and drops millions of objects; looking through those that stay would take a sixteenth of the tests' time.
 gc.set_threshold(50_000, 10, 10)

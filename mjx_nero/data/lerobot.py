@@ -5,6 +5,7 @@ Source of the format: huggingface/lerobot 0.4.4 and 0.6.1, ``src/lerobot/dataset
 ``number`` are our additions to the format.
 """
 
+import concurrent.futures
 import functools
 import json
 import pathlib
@@ -97,8 +98,10 @@ class LeRobotForm:
     def finish(self) -> None:
         """Writes the statistics of the whole data set."""
         if len(self.lengths):
-            found = {name: stats.of(self.column(name)) for name in [*self.schema.features, *lf.OWN] if name not in self._pictures}
-            plain = {name: {k: v.tolist() for k, v in each.items()} for name, each in found.items()}
+            names = [name for name in [*self.schema.features, *lf.OWN] if name not in self._pictures]
+            with concurrent.futures.ThreadPoolExecutor(2) as pool:  # each holds a whole column in memory
+                found = pool.map(lambda name: stats.of(self.column(name)), names)
+            plain = {name: {k: v.tolist() for k, v in each.items()} for name, each in zip(names, found, strict=True)}
             for name in self._pictures:
                 plain[name] = lf.per_channel(stats.together(self._of_pictures(name)))
             files.write_json(self.path / lf.STATS, plain)

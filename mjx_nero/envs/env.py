@@ -180,7 +180,7 @@ class ManipulationEnv(Env):
     @functools.cached_property
     def state_shape(self) -> State:
         """The result of ``reset``, with shapes in place of arrays."""
-        return jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+        return jax.eval_shape(lambda: self.reset(jax.random.PRNGKey(0)))  # a key made outside would be compiled
 
     @functools.cached_property
     def observation_size(self) -> dict[str, Any]:

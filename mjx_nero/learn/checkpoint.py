@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialize
@@ -129,7 +128,7 @@ def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = No
             raise UserError(f"{path} does not fit: {name} is {kind}{shape}, expected {want.dtype}{want.shape}")
     try:
         with safe_open(path, framework="numpy") as file:
-            leaves = [jnp.asarray(file.get_tensor(name)) for name in wanted]
+            leaves = jax.device_put([file.get_tensor(name) for name in wanted])  # jnp.asarray compiles a program for each
     except (SafetensorError, OSError):
         raise UserError(f"{path} does not fit this environment and these networks, or it is damaged: give another file") from None
     return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -98,7 +98,7 @@ class Kind:
             ``{"['w']": ".best"}``. Empty: only policy files can be played, not checkpoints.
         differing: (description in a file, the run's own) -> the config's fields that differ, by dotted name, with the file's
             values.
-        graph: a module that draws its policies as ONNX graphs, such as ``imitation.distill.graph``; None: they are PPO's layers.
+        graph: a module that draws its policies as ONNX graphs, such as ``learn.pixels.graph``; None: they are PPO's layers.
     """
 
     make: Callable[["Env", Any, int], Learner]
@@ -123,7 +123,12 @@ def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iteratio
 
 # The package's learners: folders whose ``learner`` holds the ``KIND``, and whose ``cfg`` holds presets without importing Brax.
 # ``--learner NAME`` trains with one, ``--NAME.field`` sets its config.
-_OWN = {"ppo": "mjx_nero.learn.ppo", "clone": "mjx_nero.imitation.clone", "distill": "mjx_nero.imitation.distill"}
+_OWN = {
+    "ppo": "mjx_nero.learn.ppo",
+    "clone": "mjx_nero.imitation.clone",
+    "distill": "mjx_nero.imitation.distill",
+    "pixels": "mjx_nero.learn.pixels",
+}
 KINDS: Registry[Kind | str] = Registry("learner", _OWN)
 
 

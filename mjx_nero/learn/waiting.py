@@ -5,6 +5,7 @@ minutes if a program draws pictures.
 """
 
 import concurrent.futures
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -17,8 +18,19 @@ def result_of(function: Callable[..., Any], *args: Any) -> Any:
 
     An accelerator's programs take about a second, and stay in the calling thread.
     """
+    return begun(function, *args, daemon=True)()  # an interrupted program does not wait for it
+
+
+def begun(function: Callable[..., Any], *args: Any, daemon: bool = False) -> Callable[[], Any]:
+    """Begins a call as ``result_of`` does, and returns the function that waits for its result.
+
+    Nothing begins before that function is called if the call stays in the calling thread.
+
+    Args:
+        daemon: the program may end while the call goes on. JAX may crash then.
+    """
     if jax.default_backend() != "cpu" or threading.current_thread() is not threading.main_thread():
-        return function(*args)
+        return functools.partial(function, *args)
     found = concurrent.futures.Future[Any]()
 
     def work() -> None:
@@ -27,5 +39,5 @@ def result_of(function: Callable[..., Any], *args: Any) -> Any:
         except BaseException as error:
             found.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()  # an interrupted program does not wait for it
-    return found.result()
+    threading.Thread(target=work, daemon=daemon).start()
+    return found.result

@@ -111,7 +111,8 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
     prepare, start = spans.timed("physics", env.prepare), spans.timed("first state", start)
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
         waiting = [side_by_side.submit(prepare, run.num_envs // learner.num_devices, run.num_devices)]
-        starting = side_by_side.submit(start)
+        # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
+        starting = side_by_side.submit(_after, waiting[0] if env.cfg.scene.cameras else None, start)
         with spans.span("learner, traced"):
             shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
             program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
@@ -126,6 +127,13 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         for work in waiting:
             work.result()
     return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun, spans.found)
+
+
+def _after(first: concurrent.futures.Future | None, start: Callable[[], Any]) -> Any:
+    """Calls ``start`` when ``first`` is done."""
+    if first is not None:
+        first.result()
+    return start()
 
 
 @contextlib.contextmanager

@@ -32,11 +32,9 @@ def agent(cfg: EvalCfg, env: ManipulationEnv) -> tuple[rollout.Act, Any]:
         return lambda params, obs, key: trained.act(obs), None
 
     # If actions are drive targets, ``zero`` sends the home targets, and ``random`` spreads about them.
-    home = jnp.asarray(env.home_action)
-
     def act(params, obs, key):
         shape = (obs["state"].shape[0], env.action_size)
-        still = jnp.broadcast_to(home, shape)
+        still = jnp.broadcast_to(env.home_action, shape)
         return still if cfg.agent == "zero" else still + jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
     return act, None

@@ -211,8 +211,9 @@ def check(source: Source, meta: dict[str, Any]) -> None:
             raise UserError(
                 f"{path} does not fit: it holds {n} environments, this run has {meta['num_envs']}: pass --num-envs {n}"
             )
-    if there.get("learner", "ppo") != meta["learner"]:
-        raise UserError(f"{path} was made by the learner {there.get('learner', 'ppo')}: pass --learner to say so")
+    made_by = there.get("learner", "ppo")
+    if made_by != meta["learner"] and (source.is_checkpoint or not _same_policies(made_by, meta["learner"])):
+        raise UserError(f"{path} was made by the learner {made_by}: pass --learner to say so")
     sized = ("observations", "observation_size", "action_size")
     if any(map(differs, sized)) or not header.acts_alike(there, meta):
         where = f"{there.get('env')} (preset {there.get('preset')})"
@@ -223,6 +224,11 @@ def check(source: Source, meta: dict[str, Any]) -> None:
     if other := learner.find(meta["learner"]).differing(there, meta):
         flags = " ".join(f"--{meta['learner']}.{name} {_flag(x)}" for name, x in other.items())
         raise UserError(f"{path} does not fit, because its networks differ: pass {flags}")
+
+
+def _same_policies(one: str, other: str) -> bool:
+    """True if two learners train the same kind of policy, so that one can start from the other's."""
+    return one in learner.names() and learner.find(one).policy is learner.find(other).policy
 
 
 def _flag(value: Any) -> str:

@@ -49,7 +49,7 @@ class Draws:
                     if nominal[field].size:
                         self.rows.setdefault(field, set()).update(map(int, drawn))
 
-        jax.eval_shape(note, jax.random.PRNGKey(0))  # only the rows matter, so nothing has to be compiled
+        jax.eval_shape(lambda: note(jax.random.PRNGKey(0)))  # only the rows matter, so nothing has to be compiled
 
     def _model(self, drawn: Fields) -> Model:
         return Model({**{name: jnp.asarray(value) for name, value in self.nominal.items()}, **drawn}, self._index)

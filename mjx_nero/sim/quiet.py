@@ -1,35 +1,70 @@
-"""Imports MJX without two packages that it does not need here, and without the lines that it prints. Import it before Brax.
+"""Imports MJX and Brax's ``Env`` without packages that they do not need here, and without the lines that they print. Import it
+before Brax.
 
-Brax imports MJX, too. The two packages are seldom or never needed, and each takes longer to import than MJX itself:
+These packages are seldom or never needed, and take longer to import than MJX and ``Env`` themselves:
 
 - Warp, with all of MuJoCo Warp, is for MJX's own wrapper of it. Nothing here uses that wrapper: ``physics.mujoco_warp`` calls
   MuJoCo Warp itself. The wrapper works if Warp is imported before this package.
-- trimesh is for the convex hulls of collision meshes. It is imported with the first mesh.
+- trimesh and SciPy's geometry are for the convex hulls of collision meshes.
+- Brax's own environments and engines stand beside ``Env``: in its package, and in its module for the class after it.
+
+All but Warp are imported later, when something first reads an attribute of theirs.
 """
 
 import contextlib
+import importlib
+import importlib.util
 import io
 import sys
 import types
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 
 class _Later(types.ModuleType):
-    """Stands in for trimesh in MJX's module of meshes."""
+    """Stands in for a module, and imports it when one of its attributes is first read."""
 
-    @staticmethod
-    def Trimesh(*args: Any, **kwargs: Any) -> Any:
-        import trimesh
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # Python itself asks for those
+            raise AttributeError(name)
+        if sys.modules.get(self.__name__) is self:  # still hidden: only annotations read it
+            return Any
+        return getattr(importlib.import_module(self.__name__), name)
 
-        return trimesh.Trimesh(*args, **kwargs)
+
+@contextlib.contextmanager
+def _replaced(stand_ins: Mapping[str, Any]) -> Iterator[None]:
+    """Lets imports find stand-ins for modules that are not imported yet. A module that is None cannot be imported."""
+    hidden = {name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules}
+    sys.modules |= hidden
+    try:
+        yield
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
-_stand_ins = {"warp": None, "trimesh": _Later("trimesh")}  # a module that is None there cannot be imported
-_hidden = {name: stand_in for name, stand_in in _stand_ins.items() if name not in sys.modules}
-sys.modules |= _hidden  # type: ignore[arg-type]
-try:
-    with contextlib.redirect_stdout(io.StringIO()):
-        import mujoco.mjx  # noqa: F401
-finally:
-    for _name in _hidden:
-        del sys.modules[_name]
+class _Unread(types.ModuleType):
+    """A package whose own code runs when one of its attributes is first read. Its modules can be imported without it."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self.__class__ = types.ModuleType  # type: ignore[assignment]
+        assert self.__spec__ and self.__spec__.loader
+        self.__spec__.loader.exec_module(self)
+        return getattr(self, name)
+
+
+_MJX = {"warp": None, "trimesh": _Later("trimesh"), "scipy.spatial": _Later("scipy.spatial")}
+_ENGINES = ("brax.generalized.pipeline", "brax.mjx.pipeline", "brax.positional.pipeline", "brax.spring.pipeline", "brax.io.image")
+
+with contextlib.redirect_stdout(io.StringIO()), _replaced(_MJX):
+    importlib.import_module("mujoco.mjx")
+if "brax.envs" not in sys.modules:
+    spec = importlib.util.find_spec("brax.envs")
+    assert spec
+    package = sys.modules["brax"].envs = sys.modules["brax.envs"] = importlib.util.module_from_spec(spec)  # type: ignore[attr-defined]
+    package.__class__ = _Unread
+with _replaced({name: _Later(name) for name in _ENGINES}):
+    importlib.import_module("brax.envs.base")

@@ -11,6 +11,7 @@ from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
+from mjx_nero.tasks import seeing
 from mjx_nero.tasks.building import Tower
 
 TURN = (-math.pi / 6, math.pi / 6)  # [rad] heading of the box at the start and at the goal
@@ -75,4 +76,6 @@ def _lifted(box: ObjectCfg) -> float:
     return round((math.hypot(long, high) - high) / 2 + high / 20, 4)
 
 
-PRESETS: Presets = {"default": default}
+# Where and how the box must lie is told: the teacher observes it relative to the box.
+GOAL = {"target_object_pose": ObservationTerm(observations.pose_command)}
+PRESETS: Presets = {"default": default, **seeing.presets(default, GOAL)}

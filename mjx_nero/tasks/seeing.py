@@ -5,15 +5,17 @@ that observes the objects' positions trains a student that does not (``imitation
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable, Mapping
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg
+from mjx_nero.envs.task import Budget, EnvCfg, Presets
 from mjx_nero.mdp import images, looks, observations
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, Term
 from mjx_nero.sim import drawn
 from mjx_nero.sim.cameras import places
-from mjx_nero.sim.robot import Box
+from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.types import UserError
 
 SIZE = (64, 64)  # pixels
@@ -21,11 +23,21 @@ DISTRACTORS = 6
 PATTERNS = 12  # of ``lifelike``
 STEPS, STEPS_ON_CPU = 20_000_000, 200_000  # env steps of a training run
 _READS = {"rgb": (images.rgb, ("rgb",)), "depth": (images.depth, ("depth",)), "rgbd": (images.rgbd, ("rgb", "depth"))}
+_OF_EXPERTS = ("imitation", "critic_first")
 FIXED = "_fixed"  # suffix of a preset whose episodes all look the same
 PRESETS = (*_READS, *(name + FIXED for name in _READS))
 
 
-def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
+def presets(task: Callable[[RobotCfg], EnvCfg], goal: Mapping[str, ObservationTerm] | None = None) -> Presets:
+    """Lists ``PRESETS`` of a task for any robot. ``goal`` as in ``seen``."""
+
+    def made(robot: RobotCfg, sees: str) -> EnvCfg:
+        return seen(task(robot), sees, goal)
+
+    return {name: functools.partial(made, sees=name) for name in PRESETS}
+
+
+def seen(cfg: EnvCfg, sees: str = "rgb", goal: Mapping[str, ObservationTerm] | None = None) -> EnvCfg:
     """Returns the task with a camera in front and one at the wrist.
 
     The observation group ``state`` has only the robot and the goal, ``pictures`` the cameras' pictures, ``teacher`` what
@@ -33,6 +45,7 @@ def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
 
     Args:
         sees: one of ``PRESETS``.
+        goal: terms that tell the student its goal, which no picture shows, if the task gives it only relative to an object.
 
     Raises:
         UserError: the scene has no object, or the robot's config lacks the region where it works.
@@ -47,7 +60,7 @@ def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
         cfg,
         scene=dataclasses.replace(cfg.scene, cameras=cameras),
         observations={
-            "state": dataclasses.replace(told, terms=own),
+            "state": dataclasses.replace(told, terms={**own, **(goal or {})}),
             "pictures": ObservationGroup({name: ObservationTerm(read, params={"camera": name}) for name in cameras}, apart=True),
             "teacher": dataclasses.replace(told, corruption=False, sensed=False),
             "truth": ObservationGroup(
@@ -55,6 +68,8 @@ def seen(cfg: EnvCfg, sees: str = "rgb") -> EnvCfg:
             ),
         },
         learner="distill",
+        # PPO's settings, without those that need an expert: its steps have no pictures.
+        training={name: value for name, value in cfg.training.items() if name not in _OF_EXPERTS},
         budget=Budget(steps=STEPS, steps_on_cpu=STEPS_ON_CPU),
     )
     return cfg if sees.endswith(FIXED) else randomized(cfg)

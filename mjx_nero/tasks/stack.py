@@ -13,6 +13,7 @@ from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
+from mjx_nero.tasks import seeing
 from mjx_nero.tasks.building import LIFTED, Tower
 
 COLORS = {"blue": (0.2, 0.35, 0.9, 1.0), "red": (0.85, 0.3, 0.2, 1.0), "yellow": (0.95, 0.75, 0.15, 1.0)}  # from the bottom up
@@ -73,4 +74,4 @@ def _each(objects, name, func, noise=0.0) -> dict[str, ObservationTerm]:
     return {name.format(each): ObservationTerm(func, params={"object": each}, noise=noise) for each in objects}
 
 
-PRESETS: Presets = {"default": default, "three": three}
+PRESETS: Presets = {"default": default, "three": three, **seeing.presets(default)}

@@ -254,7 +254,7 @@ def setup_jax() -> None:
             jax.config.update("jax_compilation_cache_dir", str(kept / "jax"))
             cache.heal(kept / "jax")
         os.environ.setdefault("WARP_CACHE_PATH", str(kept / "warp"))  # Warp reads it at its first use
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # a run has dozens of small programs
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a run has dozens of small programs
     logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)  # it also raises what it logs, such as Ctrl-C
 
 

@@ -2,13 +2,12 @@
 
 import dataclasses
 import json
-import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from kinematic import Kinematic
+from pictured import SMALL, patch
 
 from mjx_nero import ManipulationEnv, UserError
 from mjx_nero.envs import wrappers
@@ -16,29 +15,16 @@ from mjx_nero.imitation.distill import teachers
 from mjx_nero.imitation.distill.cfg import DistillCfg, StudentCfg
 from mjx_nero.learn import learner, policy
 from mjx_nero.tasks import registry
-from mjx_nero.types import Picture
 
-EDGE = 16
-SMALL = {"scene.cameras.front.size": (EDGE, EDGE), "scene.cameras.wrist.size": (EDGE, EDGE), "episode_length_s": 0.2}
 CFG = DistillCfg(
     num_envs=8, minibatch_size=64, student=StudentCfg(channels=(8, 8), features=32, layers=(32,), precision="float32")
 )
 
 
-def drawn(qpos, scenery):
-    """Pictures of the table from above, 40 cm wide: where the cube is it is bright."""
-    x, y = jnp.meshgrid(jnp.linspace(0.15, 0.55, EDGE), jnp.linspace(-0.2, 0.2, EDGE), indexing="ij")
-    bright = jnp.exp(-((x - qpos[9]) ** 2 + (y - qpos[10]) ** 2) / 0.05**2)
-    rgb = jnp.tile((255 * bright).astype(jnp.uint8)[..., None], (1, 1, 3))
-    return {"front": Picture(rgb=rgb), "wrist": Picture(rgb=255 - rgb)}
-
-
 @pytest.fixture
 def quick(monkeypatch):
     """Physics and cameras that compile at once."""
-    drawn.draw = types.SimpleNamespace(prepare=lambda *_: None, bytes=lambda: 0)
-    monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
-    monkeypatch.setattr(ManipulationEnv, "cameras", staticmethod(drawn))
+    patch(monkeypatch)
 
 
 def make(cfg=CFG, preset="rgb_fixed", num_devices=1, **fields):
@@ -74,9 +60,15 @@ def test_the_teacher_acts_where_it_should(quick):
 
 def test_the_bundled_policy_of_the_task_teaches():
     cfg = registry.env_cfg("nero_lift", "rgb_fixed")
-    assert teachers.find(ManipulationEnv(cfg, "native")).meta["env"] == "nero_lift"
-    other = ManipulationEnv(registry.env_cfg("so101_lift", "rgb_fixed"), "native")
-    assert teachers.find(other).meta["env"] == "so101_lift"
+    for name in ("nero_lift", "so101_lift"):
+        for preset in ("rgb_fixed", "sim2real_rgb"):
+            meta = teachers.find(ManipulationEnv(registry.env_cfg(name, preset), "native")).meta
+            assert (meta["env"], meta["preset"]) == (name, "sim2real")
+    for name in ("so100_lift", "nero_place", "piper_stack"):  # without a policy of sim2real
+        meta = teachers.find(ManipulationEnv(registry.env_cfg(name, "rgb"), "native")).meta
+        assert (meta["env"], meta["preset"]) == (name, "default")
+    with pytest.raises(UserError, match="train one with the task's preset sim2real"):
+        teachers.find(ManipulationEnv(registry.env_cfg("so100_lift", "sim2real_rgb"), "native"))
     slow = dataclasses.replace(cfg.robot.arm, speed=(0.5,) * 7)
     nobody = dataclasses.replace(cfg, robot=dataclasses.replace(cfg.robot, arm=slow))
     with pytest.raises(UserError, match=r"no bundled policy can teach nero this task: train one .* --distill.teacher RUN"):

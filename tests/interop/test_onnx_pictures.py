@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.imitation.distill import graph as student
-from mjx_nero.imitation.distill import networks
 from mjx_nero.imitation.distill.cfg import StudentCfg
 from mjx_nero.interop import onnx
 from mjx_nero.learn import policy
+from mjx_nero.learn.pixels import graph as student
+from mjx_nero.learn.pixels import networks
 
 
 @pytest.mark.parametrize("preset", ["rgb_fixed", "rgbd_fixed"])

@@ -81,27 +81,44 @@ def test_both_renderers_draw_the_same(worlds, camera):
     assert np.percentile(np.abs(one.depth - other.depth)[same], 99) < 5e-3
 
 
-def test_default_cameras_see_the_cube_and_the_hand():
-    for name in ("nero_lift", "piper_lift", "so101_lift"):
-        cfg = registry.env_cfg(name, "rgb")
-        model, rng = scene.build(cfg.robot, cfg.scene, cfg.sim), np.random.default_rng(1)
-        data, seen = mujoco.MjData(model), {"front": [], "wrist": []}
-        joints = [model.joint(j).qposadr[0] for j in cfg.robot.joints]
-        event = cfg.events["reset_object_position"].params
-        hand = set(np.flatnonzero(model.geom_bodyid >= model.site_bodyid[model.site(cfg.robot.ee_site).id]))
-        with mujoco.Renderer(model, 64, 64) as renderer:
-            renderer.enable_segmentation_rendering()
-            for _ in range(6):
-                data.qpos[joints] = cfg.robot.home
-                data.joint("cube").qpos[:2] = [rng.uniform(*event[axis]) for axis in "xy"]
-                mujoco.mj_forward(model, data)
-                for camera in seen:
-                    renderer.update_scene(data, MARK + camera)
-                    geoms = renderer.render()[..., 0]
-                    seen[camera].append((geoms == model.geom("cube").id).sum())
-                    assert hand & set(geoms.flatten()), (name, camera)
-        either = np.maximum(seen["front"], seen["wrist"])
-        assert (either >= 4).mean() >= 0.8, (name, seen)
+STATES = 24
+
+
+@pytest.mark.parametrize("name", ["nero_lift", "cobotta_lift", "piper_lift", "so100_lift", "so101_lift"])
+def test_default_cameras_see_the_cube_and_the_hand(name):
+    """Over random states the cube covers at least 10 pixels of the front picture in the mean, and 4 in 90% of states.
+
+    The wrist's camera sees 4 pixels or more in two thirds of states at home, from where the hand comes nearer.
+    """
+    cfg = registry.env_cfg(name, "rgb")
+    model, rng = scene.build(cfg.robot, cfg.scene, cfg.sim), np.random.default_rng(1)
+    data, seen = mujoco.MjData(model), {"front": [], "wrist": []}
+    joints = [model.joint(j).qposadr[0] for j in cfg.robot.joints]
+    event = cfg.events["reset_object_position"].params
+    hand = set(np.flatnonzero(model.geom_bodyid >= model.site_bodyid[model.site(cfg.robot.ee_site).id]))
+    with mujoco.Renderer(model, 64, 64) as renderer:
+        renderer.enable_segmentation_rendering()
+        for _ in range(STATES):
+            data.qpos[joints] = cfg.robot.home
+            data.joint("cube").qpos[:2] = [rng.uniform(*event[axis]) for axis in "xy"]
+            mujoco.mj_forward(model, data)
+            for camera in seen:
+                renderer.update_scene(data, MARK + camera)
+                geoms = renderer.render()[..., 0]
+                seen[camera].append((geoms == model.geom("cube").id).sum())
+                assert hand & set(geoms.flatten()), (name, camera)
+    front, wrist = np.array(seen["front"]), np.array(seen["wrist"])
+    assert front.mean() >= 10 and (front >= 4).mean() >= 0.9, front
+    assert (wrist >= 4).mean() >= 2 / 3, wrist
+    assert (np.maximum(front, wrist) >= 4).all(), (front, wrist)
+
+
+def test_cameras_of_bundled_policies_stand_where_they_stood():
+    """Policies that come with the package saw these pictures (``nero_lift_rgb``, ``piper_lift_rgb``)."""
+    nero, piper = (places.find(registry.robot(name)) for name in ("nero", "piper"))
+    assert nero["front"].pos == (0.9145, -0.254, 0.6084) and piper["front"].pos == (0.8571, -0.2642, 0.6253)
+    assert nero["wrist"].pos == (0.15, 0.0, 0.065) and nero["wrist"].quat == (0.3484, 0.6153, 0.6153, 0.3484)
+    assert piper["wrist"].pos == (-0.12, 0.0, 0.065) and piper["wrist"].quat == (-0.3162, -0.6325, 0.6325, 0.3162)
 
 
 @pytest.fixture(scope="module")

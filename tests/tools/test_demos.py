@@ -6,14 +6,15 @@ import pathlib
 import re
 
 import imageio.v3 as imageio
+import mujoco
 import numpy as np
 import pytest
 
+from mjx_nero.data import Episode, open_dataset, units
 from mjx_nero.data import episode as names
-from mjx_nero.data import open_dataset, units
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, demos
-from mjx_nero.tools.demos import making
+from mjx_nero.tools.demos import command, making
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 SHORT = ["--env", "nero_lift", "--agent", "policy", "--all", "--form", "arrays", "--env.episode_length_s", 0.2]
@@ -76,12 +77,26 @@ def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
     argv = [*SHORT, "--side-by-side", 4, "--noise", 0.5, "--out", "d"]
     assert call("mjx_nero", "demos", *argv, "--episodes", 3)[0] == 0
     code, out, err = call("mjx_nero", "demos", *argv, "--episodes", 6)
-    assert code == 0 and "3 new, from 4 played" in out, err
+    assert code == 0 and "3 new, from 3 played" in out, err
     one, other = open_dataset(made), open_dataset(tmp_path / "d")
     for name in (names.QPOS, names.EXECUTED, names.SEEN):
         np.testing.assert_array_equal(one.column(name), other.column(name))
     code, _, err = call("mjx_nero", "demos", *argv, "--episodes", 9, "--seed", 1)
     assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another --out" in err
+
+
+def test_no_more_is_played_than_is_to_be_kept():
+    """Of every two episodes one succeeds."""
+    episodes = (Episode({"x": np.zeros((1, 1))}, number % 2 == 1, number) for number in itertools.count())
+
+    def take(most, all, wanted):
+        kept, played = command._take(episodes, most, all, wanted)
+        return [each.number for each in kept], played
+
+    assert take(6, False, 2) == ([1, 3], 4)
+    assert take(6, False, 0) == ([], 0)
+    assert take(6, True, 3) == ([4, 5, 6], 3)
+    assert take(4, False, 9) == ([7, 9], 4)
 
 
 def test_an_episode_may_end_with_its_success(call, tmp_path):
@@ -180,6 +195,19 @@ def test_mistakes_are_one_line_and_leave_nothing(argv, message, call, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_ray_tracer_needs_no_opengl(monkeypatch):
+    """Not even to make an environment, as nothing is drawn while an agent plays."""
+
+    def missing(*args, **kwargs):
+        raise AssertionError("MuJoCo's renderer was made")
+
+    monkeypatch.setattr(mujoco, "Renderer", missing)
+    cfg = DemosCfg("nero_lift", "rgb", agent="policy", cameras="front", renderer="warp", picture="16x16", episodes=1)
+    schema, player = making.prepare(cfg)
+    assert schema.about["renderer"] == "warp" and schema.features[names.PICTURES + "front"].picture == (16, 16)
+    player.close()
+
+
 def test_pictures_of_a_scenes_cameras_look_different_from_episode_to_episode(call, tmp_path):
     """The bundled policy acts, told where the cube is; both cameras see it as the preset has it looks. Of a step there is what
     LeRobot's policies learn from, and no more."""

@@ -1,38 +1,13 @@
-"""Hyperparameters of distillation and its student: plain data, readable without importing Brax, which takes seconds."""
+"""Hyperparameters of distillation: plain data, readable without importing Brax, which takes seconds."""
 
 import dataclasses
 from typing import Annotated
 
-from mjx_nero.config.bounds import Bounds, NonNegative, OneOf, Positive, Share
-from mjx_nero.config.values import hints, read, short
-from mjx_nero.errors import UserError
-from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
+from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
+from mjx_nero.config.values import hints, read
+from mjx_nero.learn.pixels.cfg import StudentCfg
 
 ENVS = (32, 4096)  # numbers of environments for a CPU and a GPU
-
-
-@dataclasses.dataclass(frozen=True)
-class StudentCfg:
-    """The student's networks: convolutions for each camera, then a multilayer perceptron for features and state.
-
-    Attributes:
-        channels: channels of the convolutions, each of which halves the picture's edges. The first has kernels of 5 x 5 pixels,
-            the others 3 x 3.
-        features: number of features per picture.
-        precision: number format of the convolutions: bfloat16 or float32.
-        layers: widths of the hidden layers before the action.
-    """
-
-    channels: tuple[int, ...] = (32, 64, 64, 64)
-    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 64
-    layers: tuple[int, ...] = (256, 128)
-    precision: Annotated[str, OneOf("bfloat16", "float32")] = "bfloat16"
-
-    def __post_init__(self):
-        for name in ("channels", "layers"):
-            given = getattr(self, name)
-            if not 1 <= len(given) <= MAX_LAYERS or not all(1 <= width <= MAX_WIDTH for width in given):
-                raise UserError(f"student.{name} takes 1 to {MAX_LAYERS} layers of 1 to {MAX_WIDTH}, got {short(given)}")
 
 
 @dataclasses.dataclass(frozen=True)

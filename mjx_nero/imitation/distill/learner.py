@@ -25,11 +25,12 @@ from jaxtyping import Array, Float, Int
 from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
-from mjx_nero.imitation.distill import graph, teachers
+from mjx_nero.imitation.distill import teachers
 from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
-from mjx_nero.imitation.distill.networks import SEEN, SENSED, TRUTH, Student, apply, from_meta, init_params
 from mjx_nero.learn import device_memory, learner
 from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
+from mjx_nero.learn.pixels import graph
+from mjx_nero.learn.pixels.networks import SEEN, SENSED, TRUTH, Student, apply, away, from_meta, init_params, seen_bytes
 from mjx_nero.types import Bank, Key, Shown
 
 Metrics = dict[str, Float[Array, ""]]
@@ -112,18 +113,11 @@ class Learner(learner.Learner):
         """See ``learner.Learner``. A rollout keeps pictures; an update keeps the convolutions' outputs for the gradient."""
         cfg, env = self.cfg, self.env.unwrapped
         state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
-        own = device_memory.size(state.env_state)
+        own, seen = device_memory.size(state.env_state), seen_bytes(cfg.student, self.sizes[SEEN])
         obs = device_memory.size({name: state.env_state.obs[name] for name in (SENSED, SEEN, TRUTH)}) / cfg.num_envs
-        fixed = 2.0 * (device_memory.size(state) - own) + 3 * self.steps_per_iteration / self._minibatches * self._seen_bytes()
-        acting = max(env.physics.footprint().in_program, 2 * self._seen_bytes())
+        fixed = 2.0 * (device_memory.size(state) - own) + 3 * self.steps_per_iteration / self._minibatches * seen
+        acting = max(env.physics.footprint().in_program, 2 * seen)
         return fixed, own / cfg.num_envs + 1.1 * cfg.unroll_length * (obs + 8 * env.action_size) + acting
-
-    def _seen_bytes(self) -> float:
-        """Returns the bytes of the convolutions' outputs for one step, in bfloat16."""
-        total = 0.0
-        for height, width, _ in self.sizes[SEEN].values():
-            total += sum(2 * count * height * width / 4 ** (i + 1) for i, count in enumerate(self.cfg.student.channels))
-        return total
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         """Makes ``iterations`` rollouts and updates; metrics are means over them.
@@ -178,13 +172,10 @@ class Learner(learner.Learner):
     def loss(self, params: Any, normalizer: Any, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         """Computes the squared error of the actions, plus ``truth_cost`` times that of the truth in units of its deviation."""
         action, where = apply(self.network, (normalizer, params), batch.obs)
-        of_truth = running_statistics.NestedMeanStd(mean=normalizer.mean[TRUTH], std=normalizer.std[TRUTH])
-        error = where - running_statistics.normalize(batch.obs[TRUTH], of_truth)
         wanted = jnp.clip(batch.label, -self.cfg.max_action, self.cfg.max_action)
-        action_loss, truth_loss = jnp.mean(jnp.square(action - wanted)), jnp.mean(jnp.square(error))
+        action_loss, (truth_loss, seen_error) = jnp.mean(jnp.square(action - wanted)), away(where, batch.obs[TRUTH], normalizer)
         total = action_loss + self.cfg.truth_cost * truth_loss
-        away = jnp.mean(jnp.linalg.norm((error * of_truth.std).reshape(*error.shape[:-1], -1, 3), axis=-1))  # [m]
-        return total, dict(zip(_METRICS, (total, action_loss, truth_loss, away), strict=True))
+        return total, dict(zip(_METRICS, (total, action_loss, truth_loss, seen_error), strict=True))
 
     def _update(self, state: TrainState, batch: Batch, key: Key) -> tuple[Any, optax.OptState, Metrics]:
         def minibatch(carry, rows):

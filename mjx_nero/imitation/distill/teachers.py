@@ -10,6 +10,7 @@ from mjx_nero.learn import checkpoint, header, policy
 from mjx_nero.sim.fingerprint import fingerprint
 from mjx_nero.sim.robot import ASSETS
 
+USUAL = 1  # greatest delay of actions by default [control steps]
 GROUP = "teacher"  # the observation group that the teacher reads as its ``state``
 
 
@@ -17,8 +18,8 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
     """Finds the teacher's policy.
 
     Args:
-        given: the policy's file; empty: the bundled policy with the same robot, observations and actions, of the preset
-            ``sim2real`` if actions are delayed.
+        given: the policy's file; empty: the bundled policy with the same robot, observations and actions. If actions are
+            delayed, that of the preset ``sim2real``, or else of the default one if the delay is the default's.
 
     Raises:
         UserError: there is no such policy, or it does not fit.
@@ -31,14 +32,21 @@ def find(env: ManipulationEnv, given: str = "") -> policy.Policy:
             raise UserError(f"{given} cannot teach here: {fault}")
         return found
     bundled = [(checkpoint.load_meta(path), path) for path in sorted((ASSETS / "policies").glob("*.safetensors"))]
-    wanted = "sim2real" if "delay" in env.cfg.actions else "default"
-    able = [path for meta, path in bundled if meta["preset"] == wanted and not _misfit(meta, env)]
+    wanted = _presets(env)
+    able = [path for preset in wanted for meta, path in bundled if meta["preset"] == preset and not _misfit(meta, env)]
     if not able:
         raise UserError(
-            f"no bundled policy can teach {env.cfg.robot.name} this task: train one with the task's preset {wanted}, and pass "
-            "--distill.teacher RUN/policy.safetensors"
+            f"no bundled policy can teach {env.cfg.robot.name} this task: train one with the task's preset {wanted[-1]}, and "
+            "pass --distill.teacher RUN/policy.safetensors"
         )
     return policy.load(able[0])
+
+
+def _presets(env: ManipulationEnv) -> tuple[str, ...]:
+    """Lists presets whose policies can teach, the best first."""
+    delay = env.cfg.actions.get("delay")
+    latest = max(delay.params["steps"]) if delay else 0
+    return ("default",) if not latest else ("sim2real", "default") if latest <= USUAL else ("sim2real",)
 
 
 def _misfit(meta: Mapping[str, Any], env: ManipulationEnv) -> str:

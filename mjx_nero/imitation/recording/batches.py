@@ -18,23 +18,31 @@ class _Asked:
     done: Future[np.ndarray] = dataclasses.field(default_factory=Future)
 
 
-class Batches:
-    """Calls a function of rows once for all waiting callers.
+def parts(found: jax.Array, counts: Sequence[int]) -> list[np.ndarray]:
+    """Splits rows on the host: the first count of them, the next count, and so on."""
+    return np.split(np.asarray(found)[: sum(counts)], np.cumsum(counts)[:-1])
 
-    The caller that gets the lock works for all that wait. It releases the lock before the results are on the host, so that the
-    device can compute the next batch meanwhile.
+
+class Batches:
+    """Calls a function of rows once for all waiting callers. The caller that gets the lock works for all that wait.
 
     Args:
         function: arrays [rows, ...] in any tree -> a JAX array [rows, ...]. Only one call of any such function runs at a time,
             because a first call may capture a graph, which nothing else on the device may disturb.
         sizes: numbers of rows that it may be called with, ascending; each is a separate program. No caller may have more rows
             than the last.
+        fetch: brings the callers' rows to the host, as ``parts`` does; under the same lock.
     """
 
     _lock = threading.Lock()
 
-    def __init__(self, function: Callable[[Any], jax.Array], sizes: Sequence[int]):
-        self._function, self._sizes = function, tuple(sizes)
+    def __init__(
+        self,
+        function: Callable[[Any], jax.Array],
+        sizes: Sequence[int],
+        fetch: Callable[[jax.Array, Sequence[int]], list[np.ndarray]] = parts,
+    ):
+        self._function, self._sizes, self._fetch = function, tuple(sizes), fetch
         self._waiting: collections.deque[_Asked] = collections.deque()
 
     def __call__(self, given: Any) -> np.ndarray:
@@ -42,12 +50,8 @@ class Batches:
         mine = _Asked(given, len(jax.tree.leaves(given)[0]))
         self._waiting.append(mine)
         with self._lock:
-            served = self._take()
-            try:
-                found: Any = self._work(served) if served else None
-            except Exception as error:
-                found = error
-        self._hand_out(served, found)
+            if served := self._take():
+                self._serve(served)
         return mine.done.result()
 
     def _take(self) -> list[_Asked]:
@@ -58,23 +62,16 @@ class Batches:
             rows += served[-1].rows
         return served
 
-    def _work(self, served: Sequence[_Asked]) -> jax.Array:
-        rows = sum(each.rows for each in served)
-        size = next(size for size in self._sizes if size >= rows)
-        filled = np.minimum(np.arange(size), rows - 1)
-        together = jax.tree.map(lambda *x: np.concatenate(x)[filled], *(each.given for each in served))
-        return jax.block_until_ready(self._function(together))
-
-    def _hand_out(self, served: Sequence[_Asked], found: Any) -> None:
+    def _serve(self, served: Sequence[_Asked]) -> None:
+        counts = [each.rows for each in served]
         try:
-            if isinstance(found, Exception):
-                raise found
-            results = np.asarray(found)
+            size = next(size for size in self._sizes if size >= sum(counts))
+            filled = np.minimum(np.arange(size), sum(counts) - 1)
+            together = jax.tree.map(lambda *x: np.concatenate(x)[filled], *(each.given for each in served))
+            found = self._fetch(jax.block_until_ready(self._function(together)), counts)
         except Exception as error:
             for each in served:
                 each.done.set_exception(error)
-            return
-        first = 0
-        for each in served:
-            each.done.set_result(results[first : first + each.rows])
-            first += each.rows
+        else:
+            for each, rows in zip(served, found, strict=True):
+                each.done.set_result(rows)

@@ -75,8 +75,8 @@ class Player:
         one = jax.eval_shape(
             self._record, env.state_shape, jax.ShapeDtypeStruct((env.action_size,), jnp.float32), env.state_shape
         )
-        # Three copies of the steps exist: from the device, ordered by episodes, and being written.
-        device_memory.check_batch(env, size, "--side-by-side", 3.0 * size * env.episode_length * device_memory.size(one))
+        # Copies of the steps: from the device, ordered by slots, and as episodes; meanwhile others are written, from two.
+        device_memory.check_batch(env, size, "--side-by-side", 5.0 * size * env.episode_length * device_memory.size(one))
 
     def close(self) -> None:
         """Frees the renderers."""
@@ -96,27 +96,29 @@ class Player:
         won, done = np.zeros(self.size, bool), dict[int, Episode]()
         while True:
             slots, played = waiting.result_of(self._play, slots, jnp.asarray(numbers), key)
-            kept, alive, wins = jax.device_get(played)
+            kept, look, alive, wins = jax.device_get(played)
             kept = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
             counts, ended = alive.sum(axis=0).astype(int), np.asarray(slots[-1]) == 0
             won |= wins.any(axis=0)
             for i in range(self.size):
                 parts[i].append(_cut(kept, i, counts[i]))
                 if ended[i]:
-                    done[int(numbers[i])] = self._episode(parts[i], bool(won[i]), int(numbers[i]))
+                    mine = {name: x[i] for name, x in look.items()}
+                    done[int(numbers[i])] = self._episode(parts[i], mine, bool(won[i]), int(numbers[i]))
                     parts[i], won[i], numbers[i] = [], False, numbers[i] + self.size
             while due in done:
                 yield done.pop(due)
                 due += 1
             slots = self._refill(slots, jnp.asarray(ended), jnp.asarray(numbers), key)
 
-    def _episode(self, parts: list, success: bool, number: int) -> Episode:
+    def _episode(self, parts: list, look: dict[str, np.ndarray], success: bool, number: int) -> Episode:
         arrays = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
         made = Episode(arrays, success, number)
         if not (cameras := self._cameras):
             return made
-        shown = jax.tree.map(lambda *x: np.concatenate(x), *(part[1:] for part in parts))
-        films = {names.PICTURES + name: functools.partial(cameras.frames, name, *shown) for name in cameras.names}
+        qpos, scenery = jax.tree.map(lambda *x: np.concatenate(x), *(part[1:] for part in parts))
+        scenery = scenery.replace(look={name: np.broadcast_to(x, (len(qpos), *x.shape)) for name, x in look.items()})
+        films = {names.PICTURES + name: functools.partial(cameras.frames, name, qpos, scenery) for name in cameras.names}
         return dataclasses.replace(made, pictures=films)
 
     def _begin_all(self, numbers: Array, key: Key) -> tuple:
@@ -135,8 +137,8 @@ class Player:
         """Plays a segment.
 
         Returns:
-            the slots, and for each step [steps, n, ...]: features and everything that pictures need, whether its episode was
-            still going on, and whether the step made it a success.
+            the slots, and for each step [steps, n, ...]: features and what pictures need, whether its episode was still going
+            on, and whether the step made it a success. The look, which stays the same during an episode, is apart [n, ...].
         """
         env, apart = self.env, jax.vmap(jax.random.fold_in, (0, None))(_keys(numbers, key), _NOISE)
 
@@ -148,12 +150,14 @@ class Player:
             after = jax.vmap(env.step)(state, action)
             if self._early:
                 after = jax.vmap(self._ended)(after)
-            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state)) if self._cameras else ()
+            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state).replace(look={})) if self._cameras else ()
             kept = jax.vmap(self._record)(state, clean, after), *drawn
             won = (alive > 0) & (after.done > 0) & (after.metrics["success"] > 0)
             return (after, memory, off, at + 1, alive * (1 - after.done)), (kept, alive, won)
 
-        return jax.lax.scan(step, slots, length=self._steps)
+        look = jax.vmap(env.scenery)(slots[0]).look if self._cameras else {}
+        slots, (kept, alive, won) = jax.lax.scan(step, slots, length=self._steps)
+        return slots, (kept, look, alive, won)
 
     def _ended(self, state: State) -> State:
         """Ends an episode with success if that has held long enough."""

@@ -20,6 +20,7 @@ from mjx_nero import cores
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.recording.batches import Batches
+from mjx_nero.imitation.recording.page_locked import PageLocked
 from mjx_nero.sim.cameras.cfg import MARK
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
@@ -58,7 +59,7 @@ class Cameras:
         self.names = tuple(names)
         sizes = {name: size or (own[name].size if name in own else SIZE) for name in single}
         self.sizes = {name: _beside(name, [sizes[part] for part in name.split("+")]) for name in names}
-        self.renderer = renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
+        self.renderer = chosen(renderer)
         self._drawers: dict[str, _Drawer] = {}
         for name in single:
             traced = self.renderer == "warp" and name in own
@@ -81,6 +82,11 @@ class Cameras:
             now = slice(first, first + TOGETHER)
             parts = [self._drawers[part](qpos[now], scenery[now]) for part in name.split("+")]
             yield from parts[0] if len(parts) == 1 else (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+
+
+def chosen(renderer: str) -> str:
+    """Returns the renderer that draws the scene's own cameras; ``renderer`` may be auto."""
+    return renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
 
 
 def _beside(name: str, sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
@@ -159,7 +165,7 @@ class _Traced:
         seen = env.draw_by({name: camera}, "warp")
         draw = jax.jit(jax.vmap(lambda shown: seen(*shown)[name].rgb))
         episodes = max(1, min(EPISODES, PIXELS // (TOGETHER * size[0] * size[1])))
-        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}))
+        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}), PageLocked(TOGETHER))
 
     def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
         return self._draw((qpos, scenery))

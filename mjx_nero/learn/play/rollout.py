@@ -1,6 +1,7 @@
 """Rollouts: whole episodes played with a policy or a controller."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -158,12 +159,12 @@ class Runner:
         self._run, self._episodes, self._terms = run, episodes, terms
 
     def __call__(self, params: Any, seed: int) -> Episodes:
-        totals, frames, memory = waiting.result_of(self._run, params, *_keys(seed, self._episodes))
+        totals, frames, memory = waiting.result_of(self._run, params, *_keys(np.uint32(seed), self._episodes))
         return _collect(totals, frames, memory, self._terms)
 
     def compiler(self, params: Any) -> Callable[[], None]:
         """Traces the program, and returns a call that compiles it in any thread."""
-        lowered = self._run.lower(params, *_keys(0, self._episodes))
+        lowered = self._run.lower(params, *_keys(np.uint32(0), self._episodes))
 
         def compile() -> None:
             self._run = lowered.compile()
@@ -239,7 +240,8 @@ def runner(
     return Runner(run, episodes, env.cfg.metrics)
 
 
-def _keys(seed: int, episodes: int) -> tuple[Key, Key]:
+@functools.partial(jax.jit, static_argnums=1)  # each operation would be a program of its own
+def _keys(seed: jax.Array, episodes: int) -> tuple[Key, Key]:
     # Training folds nothing into its seed, so an evaluation never repeats the draws of training.
     key = jax.random.fold_in(jax.random.PRNGKey(seed), 0xE7A1)
     k_reset, key = jax.random.split(key)

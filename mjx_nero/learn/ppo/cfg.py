@@ -112,7 +112,7 @@ class PpoCfg:
 
     def __post_init__(self):
         for name, kind in hints(type(self)).items():
-            if name != "network":
+            if not dataclasses.is_dataclass(kind):
                 read(kind, getattr(self, name), f"ppo.{name}")
         if self.matmul_precision not in PRECISIONS:
             raise UserError(f"ppo.matmul_precision takes one of {', '.join(PRECISIONS)}, got {short(self.matmul_precision)}")

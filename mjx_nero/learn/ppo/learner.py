@@ -55,7 +55,7 @@ Metrics = dict[str, Float[Array, ""]]
 Tree = TypeVar("Tree")
 
 _AXIS = "devices"
-_UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action_change", "action_std", "learning_rate")
+UPDATE_METRICS = ("loss", "policy_loss", "value_loss", "entropy", "kl", "action_change", "action_std", "learning_rate")
 
 
 @struct.dataclass
@@ -103,6 +103,8 @@ class Learner(learner.Learner):
         UserError: sizes or options conflict, or the machine has fewer devices.
     """
 
+    update_metrics: tuple[str, ...] = UPDATE_METRICS
+
     def __init__(self, env: Env, cfg: PpoCfg, num_devices: int = 1):
         here = jax.local_devices()
         if num_devices > len(here):
@@ -126,17 +128,31 @@ class Learner(learner.Learner):
         self._axis = _AXIS if num_devices > 1 else None  # None: a program without any communication
         self._mesh = Mesh(np.array(devices), (_AXIS,))
         self.sizes = env.observation_size
-        self.networks = make_networks(self.sizes, env.action_size, cfg.network)
+        self.networks = self.make_networks()
         self.steps_per_iteration = cfg.num_envs * cfg.unroll_length
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=cfg.learning_rate)
         # One flat vector: separate parameters would cost a hundred small kernels per minibatch.
         self._optimizer = optax.flatten(optax.chain(optax.clip_by_global_norm(cfg.max_grad_norm), adam))
         self._make_policy = networks.make_inference_fn(self.networks)
 
+    def make_networks(self) -> networks.PPONetworks:
+        """Makes actor and critic. A learner that differs in them overrides it.
+
+        Raises:
+            UserError: the task's policies see, and these would not.
+        """
+        if "pictures" in self.sizes:
+            raise UserError("the learner ppo reads no pictures: pass --learner pixels, or leave out --learner to have a teacher")
+        return make_networks(self.sizes, self.env.action_size, self.cfg.network)
+
+    def measured(self, groups: Any) -> Any:
+        """Returns those of the observation groups, or of their shapes, that are measured and normalized: all."""
+        return groups
+
     def init(self, key: Key, bank: Bank | None = None, shown: Shown | None = None) -> TrainState:
         """Makes new networks and environments. Episodes start at different phases, so that they do not all end at once."""
         k_net, k_env, k_phase, key = jax.random.split(key, 4)
-        normalizer, params = init_params(self.networks, self.sizes, k_net)
+        normalizer, params = init_params(self.networks, self.measured(self.sizes), k_net)
         school = imitation.school(self.env.unwrapped, shown) if self.imitates else None
         if school and shown is not None:
             normalizer = imitation.seen(normalizer, shown)
@@ -227,7 +243,7 @@ class Learner(learner.Learner):
         with self._networks_precision():
             params, opt_state, metrics = self._update(state, batch, k_update)
         # Updated last: the loss compares with log-probabilities made under the acting statistics.
-        normalizer = running_statistics.update(state.normalizer, batch.obs, pmap_axis_name=self._axis)
+        normalizer = running_statistics.update(state.normalizer, self.measured(batch.obs), pmap_axis_name=self._axis)
         returns = state.returns
         if self.cfg.normalize_returns:  # otherwise they stay what they start as, mean 0 and deviation 1
             raw = running_statistics.denormalize(batch.returns, returns)
@@ -340,14 +356,14 @@ class Learner(learner.Learner):
             updates, opt_state = self._optimizer.update(grads, opt_state)
             params = optax.apply_updates(params, updates)
             params = params.replace(policy=_bound_std(params.policy, cfg.min_std, cfg.max_std))
-            return (params, opt_state), jnp.stack([metrics[name] for name in _UPDATE_METRICS])
+            return (params, opt_state), jnp.stack([metrics[name] for name in self.update_metrics])
 
         k_order, k_loss = jax.random.split(key)
         mine, updates = cfg.num_envs // self.num_devices, cfg.num_epochs * cfg.num_minibatches
         orders = jax.vmap(lambda k: jax.random.permutation(k, mine))(jax.random.split(k_order, cfg.num_epochs))
         each = orders.reshape(updates, -1), jax.random.split(k_loss, updates)
         (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.opt_state), each)
-        return params, opt_state, dict(zip(_UPDATE_METRICS, jnp.mean(metrics, 0), strict=True))
+        return params, opt_state, dict(zip(self.update_metrics, jnp.mean(metrics, 0), strict=True))
 
 
 def _minibatches(cfg: PpoCfg) -> int:

@@ -145,5 +145,5 @@ def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
     """Rebuilds the networks that a policy file describes: a template of their parameters, and their act function."""
     sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=_is_shape)
     nets = make_networks(sizes, meta["action_size"], described(meta["network"]))
-    template = jax.eval_shape(functools.partial(init_params, nets, sizes), jax.random.PRNGKey(0))
+    template = jax.eval_shape(lambda: init_params(nets, sizes, jax.random.PRNGKey(0)))
     return template, lambda params, obs: make_act(nets, params)(obs)

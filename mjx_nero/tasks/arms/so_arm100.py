@@ -103,7 +103,8 @@ def so_arm(prefix: str, robot: RobotCfg, *setups: Any) -> Envs:
         _, presets = envs[f"{prefix}_{task}"]
         envs[f"{prefix}_{task}"] = robot, {**presets, "isaac": functools.partial(_with_recipe, preset=presets["isaac"])}
     del envs[f"{prefix}_reorient"]
-    envs[f"{prefix}_stack"] = robot, {"default": fitted.FITTING["stack"]["default"]}
+    stacks = {name: preset for name, preset in fitted.FITTING["stack"].items() if name != "three"}
+    envs[f"{prefix}_stack"] = robot, stacks
     return envs
 
 

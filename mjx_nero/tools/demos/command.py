@@ -1,11 +1,12 @@
 """The command line of ``demos``."""
 
 import contextlib
-import itertools
+import functools
 import pathlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
+from mjx_nero.data import Episode, writer
 from mjx_nero.errors import UserError
 from mjx_nero.runs import console
 from mjx_nero.tasks import registry
@@ -73,7 +74,7 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
     Raises:
         UserError: see ``main``.
     """
-    from mjx_nero.data import writer
+    from mjx_nero.learn import waiting
     from mjx_nero.tools.demos import making
 
     schema, player = making.prepare(cfg)
@@ -81,14 +82,15 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
     with contextlib.closing(player), writer(out, schema, cfg.form) as form:
         before, tries, none = len(form.lengths), 0, 0
         first = int(form.numbers[-1]) + 1 if before else 0
-        episodes = player(first, cfg.seed)
+        take = functools.partial(_take, player(first, cfg.seed), player.size, cfg.all)
+        batch = waiting.begun(take, cfg.episodes - before)
         while len(form.lengths) < cfg.episodes:
-            played = list(itertools.islice(episodes, player.size))
-            kept = [episode for episode in played if episode.success or cfg.all]
-            tries, none = tries + len(played), 0 if kept else none + len(played)
+            kept, played = batch()
+            batch = waiting.begun(take, cfg.episodes - len(form.lengths) - len(kept))  # plays while the last ones are written
+            tries, none = tries + played, 0 if kept else none + played
             if kept:
-                form.put(kept[: cfg.episodes - len(form.lengths)])
-                console.line(screen, f"{out}: {len(form.lengths)} of {cfg.episodes} episodes; {len(kept)}/{len(played)} kept")
+                form.put(kept)
+                console.line(screen, f"{out}: {len(form.lengths)} of {cfg.episodes} episodes; {len(kept)}/{played} kept")
             elif none >= making.HOPELESS:
                 raise UserError(f"none of {none} episodes succeeded: try another --agent, or keep them with --all")
         frames, new = int(form.lengths.sum()), len(form.lengths) - before
@@ -96,3 +98,13 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
         f"{time.perf_counter() - begun:.1f} s ({time.process_time() - busy:.1f} s of the processor's cores), compilation included"
     )
     print(f"{out}: {len(form.lengths)} episodes, {frames} steps; {new} new, from {tries} played in {took}")
+
+
+def _take(episodes: Iterator[Episode], most: int, all: bool, wanted: int) -> tuple[list[Episode], int]:
+    """Plays until ``wanted`` episodes are to be kept, but at most ``most``. Returns those to keep, and how many were played."""
+    kept, played = list[Episode](), 0
+    while len(kept) < wanted and played < most:
+        episode, played = next(episodes), played + 1
+        if episode.success or all:
+            kept.append(episode)
+    return kept, played

@@ -19,7 +19,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, drive_targets, for_controllers
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import teachers
-from mjx_nero.imitation.recording import demonstrations
+from mjx_nero.imitation.recording import demonstrations, pictures
 from mjx_nero.imitation.recording.demonstrations import Player
 from mjx_nero.imitation.recording.pictures import Cameras
 from mjx_nero.learn import bundled, policy
@@ -64,7 +64,9 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     told = not cfg.policy and teachers.GROUP in env_cfg.observations  # the agent is told what others must see
     if not acts or told:  # pictures that no term reads are not drawn
         kept = {name: env_cfg.observations[name] for name in ("state", teachers.GROUP) if name in env_cfg.observations}
-        env_cfg = dataclasses.replace(env_cfg, observations=kept)
+        # While an agent plays, nothing is drawn, so the other renderer may be missing.
+        scene = dataclasses.replace(env_cfg.scene, renderer=pictures.chosen(cfg.renderer))
+        env_cfg = dataclasses.replace(env_cfg, observations=kept, scene=scene)
     env = ManipulationEnv(for_controllers(env_cfg) if drives else env_cfg, impl="native", num_envs=size)
     if acts and told:
         teacher = teachers.find(env)

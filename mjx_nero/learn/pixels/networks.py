@@ -1,6 +1,5 @@
 """The student's networks: made from a config, and rebuilt from the description in a policy's file."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,8 +12,8 @@ from brax.training.acme import running_statistics, specs
 from flax import linen
 
 from mjx_nero.config.values import read
-from mjx_nero.imitation.distill.cfg import StudentCfg
 from mjx_nero.learn.learner import Act, Observation
+from mjx_nero.learn.pixels.cfg import StudentCfg
 from mjx_nero.types import Key
 
 SENSED, SEEN, TRUTH = "state", "pictures", "truth"  # observation groups: two inputs, and a second target
@@ -67,8 +66,13 @@ def init_params(net: Student, sizes: Mapping[str, Any], key: Key) -> tuple[Any, 
     """Makes new (statistics of state and truth, network parameters)."""
     shapes = {name: specs.Array(tuple(sizes[name]), jnp.dtype("float32")) for name in (SENSED, TRUTH)}
     normalizer = running_statistics.init_state(shapes).replace(std_eps=jnp.float32(1e-4))
+    return normalizer, init_variables(net, sizes, key)
+
+
+def init_variables(net: Student, sizes: Mapping[str, Any], key: Key) -> Any:
+    """Makes new network parameters."""
     pictures = {name: jnp.zeros((1, *shape)) for name, shape in sizes[SEEN].items()}
-    return normalizer, net.init(key, jnp.zeros((1, *sizes[SENSED])), pictures)
+    return net.init(key, jnp.zeros((1, *sizes[SENSED])), pictures)
 
 
 def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.Array, jax.Array]:
@@ -80,9 +84,25 @@ def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.
     return found
 
 
+def away(where: jax.Array, truth: jax.Array, normalizer: Any) -> tuple[jax.Array, jax.Array]:
+    """Returns the squared error of predicted positions in units of their deviation, and the mean distance [m]."""
+    of_truth = running_statistics.NestedMeanStd(mean=normalizer.mean[TRUTH], std=normalizer.std[TRUTH])
+    error = where - running_statistics.normalize(truth, of_truth)
+    distance = jnp.linalg.norm((error * of_truth.std).reshape(*error.shape[:-1], -1, 3), axis=-1)
+    return jnp.mean(jnp.square(error)), jnp.mean(distance)
+
+
 def from_meta(meta: Mapping[str, Any]) -> tuple[Any, Act]:
     """Rebuilds the student that a policy file describes: a template of its parameters, and its act function."""
     sizes = jax.tree.map(tuple, meta["observation_size"], is_leaf=lambda node: isinstance(node, list | tuple))
     net = Student(read(StudentCfg, meta["student"], "student"), meta["action_size"], sizes[TRUTH][0])
-    template = jax.eval_shape(functools.partial(init_params, net, sizes), jax.random.PRNGKey(0))
+    template = jax.eval_shape(lambda: init_params(net, sizes, jax.random.PRNGKey(0)))
     return template, lambda params, obs: apply(net, params, obs)[0]
+
+
+def seen_bytes(cfg: StudentCfg, pictures: Mapping[str, tuple[int, ...]]) -> float:
+    """Returns the bytes of the convolutions' outputs for one picture of each shape [height, width, channels], in bfloat16."""
+    total = 0.0
+    for height, width, _ in pictures.values():
+        total += sum(2 * count * height * width / 4 ** (i + 1) for i, count in enumerate(cfg.channels))
+    return total

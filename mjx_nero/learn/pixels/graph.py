@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mjx_nero.envs.task import EnvCfg
-from mjx_nero.imitation.distill import networks
+from mjx_nero.learn.pixels import networks
 from mjx_nero.learn.policy import Policy
 
 Graph = Any

@@ -1,0 +1,1 @@
+"""Policies that act on pictures: their networks, their ONNX graph, and PPO for them. ``imitation.distill`` trains them, too."""

@@ -1,0 +1,100 @@
+"""What a start costs: the packages that commands import, and the programs that they compile."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_nero.learn import checkpoint
+from mjx_nero.learn.play import rollout
+
+ROOT = pathlib.Path(__file__).parents[1]
+# Runs a command, and prints which packages and modules it has imported and the names of the programs that it has compiled.
+WATCHED = """
+import atexit, json, sys
+programs = []
+if "jax" in sys.argv[1]:
+    import jax
+    def note(event, seconds, fun_name="", **_):
+        if event.endswith("backend_compile_duration"):
+            programs.append(fun_name)
+    jax.monitoring.register_event_duration_secs_listener(note)
+atexit.register(lambda: print(json.dumps([list(sys.modules), programs])))
+del sys.argv[1]
+from mjx_nero.__main__ import program
+program()
+"""
+# Their import takes longer than that of MuJoCo, and what starts here does without.
+SELDOM = {"scipy.spatial", "scipy.optimize", "trimesh", "warp", "jaxopt", "brax.generalized.pipeline", "brax.envs.ant"}
+
+
+def _watched(*argv: str, jax: str = "") -> tuple[set[str], list[str]]:
+    done = subprocess.run([sys.executable, "-c", WATCHED, jax, *argv], stdout=subprocess.PIPE, text=True, cwd=ROOT, check=True)
+    modules, programs = json.loads(done.stdout.splitlines()[-1])
+    return set(modules), programs
+
+
+@pytest.fixture
+def compiled():
+    """The names of the programs that are compiled from here on."""
+    names: list[str] = []
+
+    def note(event, seconds, fun_name="", **_):
+        if event.endswith("backend_compile_duration"):
+            names.append(fun_name)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(note)
+
+
+def test_an_evaluation_compiles_few_programs_and_imports_no_other_engine():
+    argv = ("eval", "--env", "nero_reach", "--episodes", "3", "--env.episode_length_s", "0.1")
+    modules, programs = _watched(*argv, jax="jax")
+    assert programs.count("jit(run)") == 1 and len(programs) <= 4, programs  # 23 once
+    assert not modules & SELDOM
+
+
+@pytest.mark.parametrize(("command", "absent"), [("--help", {"jax", "mujoco", "numpy"}), ("list-envs", {"brax", "mujoco.mjx"})])
+def test_commands_that_compute_nothing_import_little(command, absent):
+    modules, programs = _watched(command)
+    assert "mjx_nero.__main__" in modules and not modules & absent and not programs
+
+
+def test_brax_is_whole_for_others():
+    code = """
+import mjx_nero.envs.env
+import brax.envs, brax.generalized.pipeline
+assert issubclass(mjx_nero.envs.env.ManipulationEnv, brax.envs.Env) and brax.envs.base.Env is brax.envs.Env
+assert brax.envs.ant.Ant is brax.envs._envs["ant"]
+from brax.envs.base import g_pipeline
+assert g_pipeline.step is brax.generalized.pipeline.step
+import scipy.spatial, trimesh
+from mujoco.mjx._src import mesh
+assert mesh.spatial.ConvexHull is scipy.spatial.ConvexHull and mesh.trimesh.Trimesh is trimesh.Trimesh
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, cwd=ROOT, env={**os.environ, "JAX_PLATFORMS": "cpu"})
+
+
+def test_reading_a_file_compiles_nothing(compiled, tmp_path):
+    tree = {str(n): np.full((n, 3), n, np.float32) for n in range(31, 37)}  # shapes that no other test has
+    checkpoint.save(tmp_path / "a.safetensors", tree, {})
+    found = checkpoint.load(tmp_path / "a.safetensors", tree)
+    assert not compiled
+    for name, value in tree.items():
+        assert isinstance(found[name], jax.Array) and found[name].dtype == np.float32
+        np.testing.assert_array_equal(found[name], value)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31 + 5, 2**32 - 1])
+def test_keys_of_episodes_are_one_program(compiled, seed):
+    keys, key = rollout._keys(np.uint32(seed), 37)
+    assert set(compiled) <= {"jit(_keys)"}
+    k_reset, own = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(seed), 0xE7A1))
+    np.testing.assert_array_equal(keys, jax.random.split(k_reset, 37))
+    np.testing.assert_array_equal(key, own)
