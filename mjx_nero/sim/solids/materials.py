@@ -21,7 +21,7 @@ _MAX_NAME = 200  # characters
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How a mesh looks.
+    """The look of a mesh.
 
     Attributes:
         rgba: colour.
