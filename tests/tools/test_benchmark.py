@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import types
+from importlib import metadata
 
 import imageio.v3 as imageio
 import jax
@@ -11,9 +12,10 @@ import jax.numpy as jnp
 import mujoco
 import pytest
 
+import mjx_nero
 from mjx_nero.runs import compiled
 from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
-from mjx_nero.tools.benchmark import command, drawing, learning, plot, throughput
+from mjx_nero.tools.benchmark import command, drawing, learning, machine, plot, throughput
 from mjx_nero.tools.benchmark.program import Program, spread, warp_mb
 
 MISTAKES = [
@@ -78,6 +80,16 @@ def test_rows_json_and_plot(call, tmp_path):
     assert str(tmp_path) not in (tmp_path / "rows.json").read_text()
     assert imageio.imread(tmp_path / "rows.png").std() > 5
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
+    def version(name):
+        if name == "mjx-nero":
+            raise metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(metadata, "version", version)
+    assert machine.versions()["mjx-nero"] == mjx_nero.__version__
 
 
 def test_the_command_names_no_folder():

@@ -42,7 +42,7 @@ def name(machine: Row) -> str:
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python and of the packages that affect results, and the commit of a checkout."""
-    found = machines.versions()
+    found = {"mjx-nero": mjx_nero.__version__} | machines.versions()  # a checkout that is not installed has a version, too
     del found["device"]
     for package in ("jaxlib", "numpy"):
         found[package] = metadata.version(package)
