@@ -17,7 +17,7 @@ from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of a mesh to cut into pieces
-SECONDS = {"careful": 12, "quick": 8}  # of CPU, for the cutting: what the first does not finish, the second tries
+SECONDS = {"careful": 12, "quick": 14}  # of CPU, for the cutting: what the first does not finish, the second tries
 MAX_LOOSE = 300  # disconnected pieces
 FLAT = 1e-4  # least thickness, as a share of the length
 CONVEX = 0.97  # least share of its hull's volume that a convex piece fills
