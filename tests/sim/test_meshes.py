@@ -183,6 +183,19 @@ def test_a_scan_that_lacks_a_triangle_is_a_solid(tmp_path):
     assert len(found.sizes) == 1 and found.volume == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
 
 
+def test_small_holes_are_filled_and_rims_are_not():
+    """By hand: a tube of 20 cm, 2 cm wide and open at both ends, has holes of 6.3 cm; the rim of a cup is 3.1 times its width."""
+    tube = trimesh.creation.cylinder(0.01, 0.2, sections=24)
+    tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)
+    assert not tube.is_watertight
+    filled = making._filled(tube, 0.2)
+    assert filled.is_volume and filled.volume == pytest.approx(np.pi * 0.01**2 * 0.2, rel=0.02)
+    assert not making._filled(tube, 0.06).is_watertight
+    cup = trimesh.creation.cylinder(0.04, 0.06, sections=24)
+    cup.update_faces(cup.face_normals[:, 2] < 0.5)
+    assert not making._filled(cup, 0.08).is_watertight
+
+
 def test_what_is_coarser_is_still_closed(monkeypatch):
     """Folds that make a closed surface open are avoided by other counts and less force, if any of them does."""
     ball, tried = trimesh.creation.icosphere(5, 0.03), []

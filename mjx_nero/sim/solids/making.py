@@ -17,9 +17,10 @@ from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of a mesh to cut into pieces
-SECONDS = {"careful": 12, "quick": 8}  # of CPU, for the cutting: what the first does not finish, the second tries
+SECONDS = {"careful": 12, "quick": 14}  # of CPU, for the cutting: what the first does not finish, the second tries
 MAX_LOOSE = 300  # disconnected pieces
 FLAT = 1e-4  # least thickness, as a share of the length
+HOLE = 1.0  # greatest length of a hole's edge that is filled, as a share of the length; the rim of a cup is three times it
 CONVEX = 0.97  # least share of its hull's volume that a convex piece fills
 
 
@@ -73,7 +74,7 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
     mesh = trimesh.Trimesh(drawn.vertices, drawn.faces, process=False)
     if not mesh.is_watertight:  # in a closed mesh, merging nearly equal vertices would open it
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        trimesh.repair.fill_holes(mesh)  # scans lack a triangle here and there
+        mesh = _filled(mesh, HOLE * size)
     a, b, c = mesh.faces.T
     mesh.update_faces((a != b) & (b != c) & (c != a))  # thin triangles stay: without them a closed surface has slits
     mesh.update_faces(mesh.unique_faces())
@@ -83,6 +84,24 @@ def _cleaned(raw: Raw) -> tuple[trimesh.Trimesh, trimesh.Trimesh, str]:
     if mesh.is_watertight and not mesh.is_volume:
         mesh.fix_normals()
     return mesh, drawn, note
+
+
+def _filled(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
+    """Fills holes whose edge is at most ``longest``: triangles that a scan lacks, and ends of handles within the body."""
+    alone = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    follow = {int(b): int(a) for a, b in mesh.edges[alone]}
+    if len(follow) < len(alone):
+        return mesh  # holes that touch
+    faces = []
+    while follow:
+        loop = [next(iter(follow))]
+        while (after := follow.pop(loop[-1], loop[0])) != loop[0]:
+            loop.append(after)
+        follow.pop(loop[-1], None)
+        points = mesh.vertices[loop]
+        if len(loop) > 2 and np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum() <= longest:
+            faces += [(loop[0], b, c) for b, c in itertools.pairwise(loop[1:])]
+    return trimesh.Trimesh(mesh.vertices, np.concatenate([mesh.faces, faces]), process=False) if faces else mesh
 
 
 def _coarser(mesh: trimesh.Trimesh, most: int, force: float = 7) -> trimesh.Trimesh:
