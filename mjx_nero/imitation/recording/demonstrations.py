@@ -158,6 +158,7 @@ class Player:
             won = (alive > 0) & (after.done > 0) & (after.metrics["success"] > 0)
             return (after, memory, off, at + 1, alive * (1 - after.done)), (kept, alive, won)
 
+        steps: tuple
         look = jax.vmap(env.scenery)(slots[0]).look if self._cameras else {}
         slots, steps = jax.lax.scan(step, slots, length=self._steps)
         return slots, (look, *steps)
