@@ -96,7 +96,7 @@ class Player:
         won, done = np.zeros(self.size, bool), dict[int, Episode]()
         while True:
             slots, played = waiting.result_of(self._play, slots, jnp.asarray(numbers), key)
-            kept, look, alive, wins = jax.device_get(played)
+            look, kept, alive, wins = jax.device_get(played)
             kept = jax.tree.map(lambda x: np.ascontiguousarray(x.swapaxes(0, 1)), kept)
             counts, ended = alive.sum(axis=0).astype(int), np.asarray(slots[-1]) == 0
             won |= wins.any(axis=0)
@@ -117,7 +117,8 @@ class Player:
         if not (cameras := self._cameras):
             return made
         qpos, scenery = jax.tree.map(lambda *x: np.concatenate(x), *(part[1:] for part in parts))
-        scenery = scenery.replace(look={name: np.broadcast_to(x, (len(qpos), *x.shape)) for name, x in look.items()})
+        look = {name: np.broadcast_to(x, (len(qpos), *x.shape)) for name, x in look.items()}
+        scenery = dataclasses.replace(scenery, look=look)
         films = {names.PICTURES + name: functools.partial(cameras.frames, name, qpos, scenery) for name in cameras.names}
         return dataclasses.replace(made, pictures=films)
 
@@ -150,14 +151,17 @@ class Player:
             after = jax.vmap(env.step)(state, action)
             if self._early:
                 after = jax.vmap(self._ended)(after)
-            drawn = (state.pipeline_state.qpos, jax.vmap(env.scenery)(state).replace(look={})) if self._cameras else ()
+            drawn: tuple = ()
+            if self._cameras:
+                drawn = state.pipeline_state.qpos, dataclasses.replace(jax.vmap(env.scenery)(state), look={})
             kept = jax.vmap(self._record)(state, clean, after), *drawn
             won = (alive > 0) & (after.done > 0) & (after.metrics["success"] > 0)
             return (after, memory, off, at + 1, alive * (1 - after.done)), (kept, alive, won)
 
+        steps: tuple
         look = jax.vmap(env.scenery)(slots[0]).look if self._cameras else {}
-        slots, (kept, alive, won) = jax.lax.scan(step, slots, length=self._steps)
-        return slots, (kept, look, alive, won)
+        slots, steps = jax.lax.scan(step, slots, length=self._steps)
+        return slots, (look, *steps)
 
     def _ended(self, state: State) -> State:
         """Ends an episode with success if that has held long enough."""

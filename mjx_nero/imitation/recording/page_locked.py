@@ -23,7 +23,8 @@ class PageLocked:
         import warp as wp
 
         wp.init()
-        self._rows, self._stream = rows, None  # a stream of our own, made at the first copy
+        self._rows = rows
+        self._stream: Any = None  # our own, made at the first copy
         self._free: dict[tuple, collections.deque[Any]] = collections.defaultdict(collections.deque)  # by shape and type
 
     def __call__(self, found: jax.Array, counts: Sequence[int]) -> list[np.ndarray]:
