@@ -92,7 +92,7 @@ def _filled(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
     follow = {int(b): int(a) for a, b in mesh.edges[alone]}
     if len(follow) < len(alone):
         return mesh  # holes that touch
-    faces = []
+    faces: list[tuple[int, int, int]] = []
     while follow:
         loop = [next(iter(follow))]
         while (after := follow.pop(loop[-1], loop[0])) != loop[0]:
