@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero.config import values
 from mjx_nero.deploy.body import Body
-from mjx_nero.deploy.executor import Joints
+from mjx_nero.deploy.executor import Joints, names
 from mjx_nero.deploy.fence import Box, Fence, FenceCfg
 from mjx_nero.deploy.safety import Limits, Safety, SafetyCfg
 from mjx_nero.errors import UserError
@@ -15,7 +16,8 @@ from mjx_nero.errors import UserError
 Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
 _FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: larger values are a mistake or an attack
-NEEDED = ("joints", "gripper", "body", "command", "objects")
+NEEDED = ("env", "preset", "robot", "control_dt", "observations", "joints", "gripper", "base", "body", "command", "objects")
+MOST = {"bodies": 150, "shapes": 150, "couplings": 100}  # the fence compares all pairs of shapes
 
 
 def check(metadata: Mapping[str, Any]) -> None:
@@ -26,7 +28,19 @@ def check(metadata: Mapping[str, Any]) -> None:
     """
     if missing := [name for name in NEEDED if name not in metadata]:
         raise UserError(f"the policy file lacks {', '.join(missing)}: export the policy again with this version")
-    own = Joints.of(metadata)
+    for name in ("env", "preset", "robot"):
+        values.read(str, metadata[name], f"the policy file's {name!r}")
+    try:
+        own, grips = Joints.of(metadata), names(metadata, "gripper")
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    body = values.read(Mapping[str, object], metadata["body"], "the policy file's 'body'")
+    for name, most in MOST.items():
+        values.read(tuple[Mapping[str, object], ...], body.get(name), f"the policy file's 'body.{name}'")
+        if len(body[name]) > most:
+            raise UserError(f"the policy file describes {len(body[name])} {name}: more than {most} are not supported")
+    if not set(own.names) - set(grips):
+        raise UserError("the policy file takes all joints for the gripper's: export the policy again")
     right = (-_FAR <= own.lower) & (own.lower <= own.home) & (own.home <= own.upper) & (own.upper <= _FAR) & (own.speed <= _FAST)
     if not right.all() or own.dt > _SLOW:
         name = own.names[int(np.argmin(right))]
