@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import config, files
+from mjx_nero import config
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
@@ -34,7 +34,7 @@ def record_main(argv: Sequence[str]) -> None:
     arms.add_limits(parser)
     parser.add_argument(
         "--out",
-        type=cli.path(".csv"),
+        type=cli.output(".csv"),
         required=True,
         help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
@@ -45,7 +45,6 @@ def record_main(argv: Sequence[str]) -> None:
             f"--{field.name}", type=kind, default=field.default, help=f"{about[field.name]} (default: %(default)s)"
         )
     args, _ = parser.parse(argv)
-    files.check_writable(args.out)
     if args.arm:
         _record_arm(parser, args)
         return
@@ -85,12 +84,10 @@ def identify_main(argv: Sequence[str]) -> None:
     )
     _add_robot(parser)
     parser.add_argument(
-        "--out", type=cli.path(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
+        "--out", type=cli.output(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
     )
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
+    parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
     args, _ = parser.parse(argv)
-    for path in filter(None, (args.out, args.plot)):
-        files.check_writable(path)
     plant = Plant(registry.robot(args.robot), args.dt)
     joints = plant.robot.arm.joints
     log = logs.read(args.log, joints)
