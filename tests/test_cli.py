@@ -161,7 +161,7 @@ def test_flags_are_made_of_a_config():
         (["--minutes", "-1"], r"^--minutes must be at least 0, got '-1' \(see --help\)$"),
         (["--minutes", "nan"], "^--minutes takes a finite number, got 'nan'"),
         (["--how", "warm"], "invalid choice: 'warm'"),
-        (["--where", ""], "^--where takes a path"),
+        (["--where", ""], "^--where got an empty value"),
     ],
 )
 def test_flags_of_a_config_keep_to_its_bounds(argv, message):

@@ -19,6 +19,8 @@ from mjx_nero.tools.deploy import FAULT, arms
 from mjx_nero.tools.identification.report import save, save_plot, table
 
 _DT = 0.005
+_ARM = {"port", "gripper", "calibration", "emulate", "identified", "speed", "table", "workspace", "apart", "hottest"}
+_SIMULATED = {"noise", "resolution", "scatter", "offset", "delay", "seed", "rate", "dt"}
 
 
 def record_main(argv: Sequence[str]) -> None:
@@ -45,6 +47,9 @@ def record_main(argv: Sequence[str]) -> None:
             f"--{field.name}", type=kind, default=field.default, help=f"{about[field.name]} (default: %(default)s)"
         )
     args, _ = parser.parse(argv)
+    if wrong := parser.given(argv) & (_SIMULATED if args.arm else _ARM):
+        flags = ", ".join(f"--{name}" for name in sorted(wrong))
+        parser.error(f"{flags}: only for {'a simulated arm, leave out --arm' if args.arm else '--arm, pass it, too'}")
     if args.arm:
         _record_arm(parser, args)
         return
