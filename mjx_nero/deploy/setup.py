@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_nero.config import values
 from mjx_nero.deploy.body import Body
 from mjx_nero.deploy.executor import Joints, names
 from mjx_nero.deploy.fence import Box, Fence, FenceCfg
@@ -28,17 +27,18 @@ def check(metadata: Mapping[str, Any]) -> None:
     """
     if missing := [name for name in NEEDED if name not in metadata]:
         raise UserError(f"the policy file lacks {', '.join(missing)}: export the policy again with this version")
-    for name in ("env", "preset", "robot"):
-        values.read(str, metadata[name], f"the policy file's {name!r}")
     try:
         own, grips = Joints.of(metadata), names(metadata, "gripper")
     except ValueError as error:
         raise UserError(str(error)) from None
-    body = values.read(Mapping[str, object], metadata["body"], "the policy file's 'body'")
+    body: Any = metadata["body"]
+    if not isinstance(body, Mapping) or not all(isinstance(metadata[name], str) for name in ("env", "preset", "robot")):
+        raise UserError("the policy file takes names for env, preset and robot, and a description of the body: export it again")
     for name, most in MOST.items():
-        values.read(tuple[Mapping[str, object], ...], body.get(name), f"the policy file's 'body.{name}'")
-        if len(body[name]) > most:
-            raise UserError(f"the policy file describes {len(body[name])} {name}: more than {most} are not supported")
+        if not isinstance(body.get(name), list) or len(body[name]) > most:
+            raise UserError(
+                f"the policy file's body takes a list of at most {most} {name}: export it again, or use a simpler model"
+            )
     if not set(own.names) - set(grips):
         raise UserError("the policy file takes all joints for the gripper's: export the policy again")
     right = (-_FAR <= own.lower) & (own.lower <= own.home) & (own.home <= own.upper) & (own.upper <= _FAR) & (own.speed <= _FAST)
