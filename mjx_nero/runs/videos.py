@@ -120,7 +120,7 @@ def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) ->
             assert encoder.stdin
             with contextlib.suppress(BrokenPipeError):  # the encoder has failed, and says why
                 for image in itertools.chain([first], images):
-                    encoder.stdin.write(np.ascontiguousarray(image))
+                    encoder.stdin.write(np.ascontiguousarray(image).data)
             said = encoder.communicate()[1].decode(errors="replace").splitlines()
         if encoder.returncode:
             raise OSError(said[-1].rpartition(": ")[2] if said else f"the encoder ended with status {encoder.returncode}")
