@@ -8,6 +8,8 @@ import os
 import pathlib
 import subprocess
 import sys
+import tempfile
+import time
 from typing import Annotated
 
 import pytest
@@ -16,7 +18,7 @@ import mjx_nero
 from mjx_nero import config, control, env_cfg, list_envs, list_presets
 from mjx_nero.__main__ import COMMANDS
 from mjx_nero.config import bounds
-from mjx_nero.runs import evaluation, training
+from mjx_nero.runs import evaluation, signals, training
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, train
@@ -159,7 +161,7 @@ def test_flags_are_made_of_a_config():
         (["--minutes", "-1"], r"^--minutes must be at least 0, got '-1' \(see --help\)$"),
         (["--minutes", "nan"], "^--minutes takes a finite number, got 'nan'"),
         (["--how", "warm"], "invalid choice: 'warm'"),
-        (["--where", ""], "^--where takes a path"),
+        (["--where", ""], "^--where got an empty value"),
     ],
 )
 def test_flags_of_a_config_keep_to_its_bounds(argv, message):
@@ -305,3 +307,40 @@ def test_help_and_list_envs_import_little():
     assert not {command: HEAVY & names for command, names in modules.items() if HEAVY & names}
     assert not {command: len(names) for command, names in modules.items() if len(names) > 1200 and command not in FITS}
     assert "jax" not in _python("-c", "import sys, mjx_nero; print(*sys.modules)").stdout.split()
+
+
+# --- ends
+
+
+@pytest.mark.parametrize("number", signals.SIGNALS)
+def test_a_signal_lets_every_command_clean_up(tmp_path, monkeypatch, capfd, number):
+    def main(argv):
+        with tempfile.TemporaryDirectory(dir=tmp_path):
+            print("half of it", end="")
+            os.kill(os.getpid(), number)
+            time.sleep(10)
+
+    monkeypatch.setattr(cli.os, "_exit", sys.exit)
+    with pytest.raises(SystemExit) as stop:
+        cli.run(main)
+    assert stop.value.code == 128 + number and capfd.readouterr() == ("half of it", "interrupted\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_last_of_the_output_may_find_nobody():
+    """Python holds a short output back until its end, and complains there in lines of its own."""
+    read, write = os.pipe()
+    os.close(read)
+    full, env = os.open("/dev/full", os.O_WRONLY), {**os.environ, "PYTHONUNBUFFERED": ""}
+    for stdout, code, said in ((write, 1, ""), (full, 2, "error: [Errno 28] No space left on device\n")):
+        command = [sys.executable, "-m", "mjx_nero", "list-envs", "--help"]
+        done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, env=env, cwd=ROOT)
+        assert (done.returncode, done.stderr) == (code, said)
+
+
+def test_files_do_not_become_a_closed_output(tmp_path):
+    """A caller such as cron may close the standard streams; a file then got the number that libraries write messages to."""
+    code = f"from mjx_nero.tools import cli; cli.run(lambda _: print(open({str(tmp_path / 'a')!r}, 'w').fileno()))"
+    command = ["sh", "-c", 'exec "$@" 0<&- 2>&-', "sh", sys.executable, "-c", code]
+    done = subprocess.run(command, stdout=subprocess.PIPE, cwd=ROOT)
+    assert done.returncode == 0 and int(done.stdout) > 2

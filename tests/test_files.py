@@ -1,6 +1,7 @@
 """Files are read with limits: what is regular, small and plain, and nothing else."""
 
 import os
+import subprocess
 
 import pytest
 
@@ -83,3 +84,47 @@ def test_messages_are_one_short_line():
     message = str(UserError("a\nb\t\x1b[2J \u202e" + "x" * 1000 + " change it"))
     assert message.startswith("a b \\x1b[2J \\u202exxx") and message.endswith("xxx change it")
     assert message.isprintable() and len(message) <= 480
+
+
+def test_two_that_write_a_file_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
+    """The one that ends last is what stays, whole; what a killed process left of the same file goes away."""
+    ours, path = os.getpid(), tmp_path / "a.json"
+    with files.whole(path) as mine:
+        mine.write_text("mine, first half")
+        with monkeypatch.context() as patch:
+            patch.setattr(files.os, "getpid", lambda: os.getppid())  # another process that runs
+            with files.whole(path) as theirs:
+                theirs.write_text("theirs")
+            assert theirs != mine and path.read_text() == "theirs"
+        mine.write_text("mine, both halves")
+    assert path.read_text() == "mine, both halves" and list(tmp_path.iterdir()) == [path]
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    lefts = [tmp_path / f".a.{pid}.part.json" for pid in (dead.pid, ours, 99999999999)]
+    for left in lefts:
+        left.write_text("half")
+    files.write(path, b"{}")
+    assert set(tmp_path.iterdir()) == {path, lefts[2]}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere/a.json", "cannot write .*nowhere/a.json: the folder .*nowhere does not exist"),
+        ("file/a.json", "cannot write .*file/a.json: the folder .*file does not exist"),
+        ("folder", "folder is a folder: give a file name"),
+        ("/proc/a.json", "cannot write /proc/a.json: No such file or directory"),  # a folder, and root may write to it
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_work(tmp_path, name, message):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=message):
+        files.check_writable(tmp_path / name)
+
+
+def test_what_can_be_written_can_have_the_longest_name(tmp_path):
+    path = tmp_path / f"{'x' * 250}.json"
+    files.check_writable(path)
+    files.write_json(path, {})
+    assert list(tmp_path.iterdir()) == [path]

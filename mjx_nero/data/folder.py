@@ -25,12 +25,15 @@ Write = Callable[[pathlib.Path], Any]  # writes the file at that path
 
 @contextlib.contextmanager
 def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
-    """Claims the folder of a data set for this process until the context ends. It is made if it does not exist.
+    """Claims the folder of a data set for this process until the context ends.
+
+    It is made if it does not exist. If it holds no episode at the end, what was made here is removed.
 
     Raises:
         UserError: the folder holds something else or another schema, belongs to a running process, or cannot be written.
     """
     _check(path, schema)
+    made = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
         lock = files.lock(path / _LOCK)
@@ -39,14 +42,21 @@ def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
     try:
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(path / PART)
-        if not (path / ABOUT).exists():
+        if _bare(path):  # new, or left without an episode by an agent of another kind
             files.write_json(path / ABOUT, schema.to_json())
         yield path
     finally:
+        shutil.rmtree(path / PART, ignore_errors=True)
+        with contextlib.suppress(OSError, UserError):
+            if _bare(path):
+                (path / ABOUT).unlink(missing_ok=True)
+                (path / "meta").rmdir()
         with contextlib.suppress(OSError):
-            shutil.rmtree(path / PART, ignore_errors=True)
             (path / _LOCK).unlink()
         os.close(lock)
+        if made:
+            with contextlib.suppress(OSError):  # the folder is not empty
+                path.rmdir()
 
 
 def schema_of(path: pathlib.Path) -> Schema:
@@ -71,12 +81,9 @@ def _check(path: pathlib.Path, schema: Schema) -> None:
         return
     if not path.is_dir():
         raise UserError(f"{path} is not a folder: pass another --out")
-    held = [entry.name for entry in os.scandir(path) if entry.name not in (_LOCK, PART)]
-    if not held:
+    if _bare(path):
         return
     if not files.inside(path, *ABOUT.split("/")).exists():
-        if held == ["meta"] and not any(not name.startswith(".") for name in os.listdir(path / "meta")):
-            return  # left by a process that was killed before it wrote anything
         raise UserError(f"{path} is not empty and holds no demonstrations: pass another --out")
     there, here = _flat(schema_of(path).to_json()), _flat(files.finite(schema.to_json()))
     if other := [name for name in here | there if here.get(name) != there.get(name)]:
@@ -86,6 +93,15 @@ def _check(path: pathlib.Path, schema: Schema) -> None:
             f"{path} holds other demonstrations ({name.removeprefix('about.')} was {was}, here it is {now}): "
             "pass another --out, or the same flags as before"
         )
+
+
+def _bare(path: pathlib.Path) -> bool:
+    """Returns whether a folder holds no more than what is written before the first episode."""
+    held = {entry.name for entry in os.scandir(path)} - {_LOCK, PART}
+    if held != {"meta"}:
+        return not held
+    meta = files.inside(path, "meta")
+    return meta.is_dir() and all(f"meta/{name}" == ABOUT or name.startswith(".") for name in os.listdir(meta))
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

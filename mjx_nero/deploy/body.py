@@ -83,6 +83,8 @@ class Body:
         self._nodes: list[Node] = []
         places: dict[str | None, tuple[int, np.ndarray]] = {None: (-1, np.eye(4))}
         for body in description["bodies"]:
+            if body["name"] in places:
+                raise ValueError(f"two bodies are called {body['name']!r}")
             places[body["name"]] = self._place(body, *places[body["parent"]])
         del places[None]
         self._set_shapes(description["shapes"], places)

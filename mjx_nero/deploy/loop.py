@@ -8,25 +8,45 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero.deploy import setup
 from mjx_nero.deploy.arm import Clock, Feedback
-from mjx_nero.deploy.executor import Lag
+from mjx_nero.deploy.executor import Joints, Lag
 from mjx_nero.deploy.guard import Guarded
 from mjx_nero.deploy.lateness import MOST, Lateness
 from mjx_nero.deploy.observe import Observer
-from mjx_nero.deploy.places import Lost
+from mjx_nero.deploy.places import Everywhere, Lost
 from mjx_nero.deploy.policy import Policy
 from mjx_nero.deploy.safety import Fault
+from mjx_nero.errors import UserError
 
 Stop = Callable[[], Fault | None]
+_SOMEWHERE = [0.3, 0.0, 0.3]  # a goal [m]
 
 
 class Brain(Policy):
     """A policy with its observations, its action chain and its drives' lag: turns feedback into intended joint positions."""
 
     def warm(self) -> None:
-        """Runs the network once, because the first time takes much longer."""
-        seen = {name: np.zeros(shape, np.uint8) for name, shape in self.cameras.items()}
-        self.act({term["name"]: np.zeros(term["size"] // term["history"]) for term in self.metadata["observations"]}, seen)
+        """Makes one step at home, without an arm: the first one takes much longer, and shows whether the metadata are whole.
+
+        Raises:
+            UserError: the metadata are not what ``export`` writes, or need what no arm has.
+        """
+        try:
+            with np.errstate(all="ignore"):
+                body, home = setup.body_of(self.metadata), Joints.of(self.metadata).home
+                pictures = {name: np.zeros(shape, np.uint8) for name, shape in self.cameras.items()}
+                observer = Observer(self.metadata, body, _SOMEWHERE, Everywhere(), lambda *_: pictures)
+                feedback = Feedback(0.0, home, np.zeros_like(home))
+                self.begin(observer, feedback)
+                first, room = self(feedback, 0.0), setup.room_for(self.metadata, body, 0.0)
+            if not (np.isfinite(first).all() and np.isfinite(room).all()):
+                raise ValueError("they lead to numbers that are not finite")
+        except UserError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            raise UserError(f"the policy's metadata are not what export writes ({what}): export the policy again") from None
         gc.collect()
 
     def begin(self, observer: Observer, feedback: Feedback, delay: float | None = None) -> None:

@@ -60,9 +60,12 @@ def _turn(seen: Seen) -> np.ndarray:
     return rotation_vector(product(seen.ee_quat * [1, -1, -1, -1], seen.goal_quat))
 
 
+_FOLDS = 100  # more need too much memory, and differ by less than 4 degrees
+
+
 def _object_turn(seen: Seen, fold: int = 1, object: str = "cube") -> np.ndarray:
     """Computes the shortest rotation of an object to the goal; the object has a ``fold``-fold symmetry about z."""
-    halves = np.pi * np.arange(fold) / fold
+    halves = np.pi * np.arange(min(fold, _FOLDS)) / fold
     turns = [np.array([np.cos(h), 0.0, 0.0, np.sin(h)]) for h in halves]
     back = seen.objects[object].quaternion * [1, -1, -1, -1]
     ways = [rotation_vector(product(product(seen.goal_quat, turn), back)) for turn in turns]

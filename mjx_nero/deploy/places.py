@@ -82,6 +82,17 @@ def _numbers(value: Any, count: int) -> np.ndarray:
     return np.array(value, float)
 
 
+class Everywhere:
+    """Every object, at one place in front of the robot; for tries without an arm."""
+
+    def find(self, name: str, now: float) -> Place:
+        """See ``Places``."""
+        return Place(np.array([0.3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def close(self) -> None:
+        """See ``Places``."""
+
+
 class Known:
     """Poses that were reported, each with its time.
 

@@ -28,6 +28,9 @@ class Remote:
     def __init__(self, spec: Spec):
         self.fault: Fault | None = None
         self.sent = 0.0
+        told = json.dumps(vars(spec)).encode()
+        if len(told) > PACKET:
+            raise UserError(f"the policy describes its robot in {len(told):,} bytes: more than {PACKET:,} are not supported")
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._channel.settimeout(_PATIENCE)
         argv, own = children.command("mjx_nero.deploy.server", str(theirs.fileno())), children.environment()
@@ -35,7 +38,7 @@ class Remote:
         self._process = subprocess.Popen(argv, pass_fds=fds, stdin=none, start_new_session=True, env=own)
         self.pid = self._process.pid
         theirs.close()
-        self._channel.send(json.dumps(vars(spec)).encode())
+        self._channel.send(told)
 
     def ready(self) -> None:
         """Waits until the arm answers.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.body import Body
-from mjx_nero.deploy.executor import Joints
+from mjx_nero.deploy.executor import Joints, names
 from mjx_nero.deploy.fence import Box, Fence, FenceCfg
 from mjx_nero.deploy.safety import Limits, Safety, SafetyCfg
 from mjx_nero.errors import UserError
@@ -15,7 +15,8 @@ from mjx_nero.errors import UserError
 Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
 _FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: larger values are a mistake or an attack
-NEEDED = ("joints", "gripper", "body", "command", "objects")
+NEEDED = ("env", "preset", "robot", "control_dt", "observations", "joints", "gripper", "base", "body", "command", "objects")
+MOST = {"bodies": 150, "shapes": 150, "couplings": 100}  # the fence compares all pairs of shapes
 
 
 def check(metadata: Mapping[str, Any]) -> None:
@@ -26,7 +27,20 @@ def check(metadata: Mapping[str, Any]) -> None:
     """
     if missing := [name for name in NEEDED if name not in metadata]:
         raise UserError(f"the policy file lacks {', '.join(missing)}: export the policy again with this version")
-    own = Joints.of(metadata)
+    try:
+        own, grips = Joints.of(metadata), names(metadata, "gripper")
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    body: Any = metadata["body"]
+    if not isinstance(body, Mapping) or not all(isinstance(metadata[name], str) for name in ("env", "preset", "robot")):
+        raise UserError("the policy file takes names for env, preset and robot, and a description of the body: export it again")
+    for name, most in MOST.items():
+        if not isinstance(body.get(name), list) or len(body[name]) > most:
+            raise UserError(
+                f"the policy file's body takes a list of at most {most} {name}: export it again, or use a simpler model"
+            )
+    if not set(own.names) - set(grips):
+        raise UserError("the policy file takes all joints for the gripper's: export the policy again")
     right = (-_FAR <= own.lower) & (own.lower <= own.home) & (own.home <= own.upper) & (own.upper <= _FAR) & (own.speed <= _FAST)
     if not right.all() or own.dt > _SLOW:
         name = own.names[int(np.argmin(right))]

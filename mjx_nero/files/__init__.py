@@ -2,10 +2,12 @@
 
 import contextlib
 import fcntl
+import glob
 import json
 import math
 import os
 import pathlib
+import re
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
@@ -255,15 +257,20 @@ YamlLoader.yaml_constructors = {
 
 
 def check_writable(path: pathlib.Path) -> None:
-    """Checks before long work that its result can be written to a file.
+    """Checks before long work that its result can be written to a file, by writing an empty one beside it.
 
     Raises:
         UserError: it is a folder, or its folder does not exist or is not writable.
     """
     if path.is_dir():
         raise UserError(f"{path} is a folder: give a file name")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise UserError(f"cannot write {path}: the folder {path.parent} does not exist or is not writable")
+    part = _part(path)
+    try:
+        part.touch()
+        part.unlink()
+    except OSError as error:
+        why = error.strerror or error if path.parent.is_dir() else f"the folder {path.parent} does not exist"
+        raise UserError(f"cannot write {path}: {why}") from None
 
 
 class _FolderRemoved(UserError):
@@ -277,10 +284,10 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
         UserError: it cannot be written.
     """
-    part = path.with_name(f".{path.stem}{PART}{path.suffix}")
+    part = _part(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.unlink(missing_ok=True)  # a link there would redirect the write
+        _tidy(path)  # a link there would redirect the write
         yield part
         sync(part)
         part.replace(path)
@@ -293,6 +300,32 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def _part(path: pathlib.Path) -> pathlib.Path:
+    """Returns where this process writes a file before the file appears: two that write the same file have two places."""
+    return path.with_name(f"{_head(path)}{os.getpid()}{PART}{path.suffix}")
+
+
+def _head(path: pathlib.Path) -> str:
+    return f".{path.stem[:40]}."  # a name must not become too long by what is added to it
+
+
+def _tidy(path: pathlib.Path) -> None:
+    """Removes what killed processes, or an enemy who knew our number, left at the parts of a file."""
+    head, own = _head(path), _part(path)
+    for left in path.parent.glob(f"{glob.escape(head)}*{PART}*"):
+        owner = re.fullmatch(rf"(\d{{1,9}}){PART}.*", left.name[len(head) :])
+        if left == own or owner and not _runs(int(owner[1])):
+            left.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except OSError as error:
+        return not isinstance(error, ProcessLookupError)  # another user's process may not be asked
+    return True
 
 
 def write(path: pathlib.Path, data: bytes) -> None:

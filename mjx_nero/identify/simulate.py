@@ -29,7 +29,7 @@ class RecordCfg:
     """
 
     seconds: Annotated[float, Bounds(0.0, 3600.0, above=True)] = 60.0
-    rate: Annotated[float, Bounds(0.0, 10_000.0, above=True)] = 200.0
+    rate: Annotated[float, Bounds(1.0, 10_000.0)] = 200.0
     noise: NonNegative = 0.0
     resolution: NonNegative = 0.0
     scatter: Annotated[float, Bounds(0.0, 100.0, above=True)] = 1.0

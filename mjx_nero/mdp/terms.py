@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import NonNegative, OneOf, Past, Positive, Share, Steps
+from mjx_nero.config.values import short
 from mjx_nero.mdp.curriculum import toward
 from mjx_nero.mdp.memory import Delay, History, delay
 from mjx_nero.types import LEVEL, Key, UserError, View
@@ -202,15 +203,32 @@ class Recall:
     def __init__(self, memory: Mapping[str, Any]):
         self.memory = dict(memory)
 
-    def __call__(self, name: str, term: Term, view: View) -> Any:
-        """Computes the term's value."""
+    def __call__(self, name: str, term: Term, view: View, number: bool = False) -> Any:
+        """Computes the term's value; whatever goes wrong in it is told with the term's name.
+
+        Args:
+            number: the value must be a single number.
+        """
         view = term.seen(view)
-        return self.through(name, term.made, view) if term.remembers else term(view)
+        try:
+            value = self.through(name, term.made, view) if term.remembers else term(view)
+        except Exception as error:
+            error.add_note(f"in the term {name}")
+            raise
+        return _shaped(name, value, 0) if number else value
 
     def through(self, name: str, step: Any, value: Any) -> Any:
         """Passes a value through anything that has a ``step`` and a memory."""
         self.memory[name], value = step.step(self.memory[name], value)
         return value
+
+
+def _shaped(name: str, value: Any, ndim: int) -> Any:
+    """Returns the value of a term if it is a number, or a vector."""
+    if getattr(value, "ndim", 0 if isinstance(value, int | float) else None) != ndim:
+        got = f"an array of shape {value.shape}" if hasattr(value, "shape") else short(value)
+        raise UserError(f"{name} must return {('a number', 'a vector')[ndim]} for one environment, got {got}")
+    return value
 
 
 def init(groups: Mapping[str, Mapping[str, Term]], key: Key, view: View) -> dict[str, Any]:
@@ -248,7 +266,7 @@ def rewards(
     out, level = {}, recall.memory.get(LEVEL)
     for name, term in terms.items():
         weight = curriculum[name](count, level, term.weight) if name in curriculum else term.weight
-        out[name] = recall(f"rewards.{name}", term, view) * weight * dt
+        out[name] = recall(f"rewards.{name}", term, view, number=True) * weight * dt
     return out
 
 
@@ -296,7 +314,7 @@ def _apart(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: 
 
 def _joined(values: dict[str, Array], terms: Mapping[str, ObservationTerm], key: Key | None) -> Array:
     """Concatenates all values to one vector; with a key, adds their noise."""
-    joined = jnp.concatenate(list(values.values()))
+    joined = jnp.concatenate([_shaped(f"the observation {name}", value, 1) for name, value in values.items()])
     if key is None:
         return joined
     # One draw for the whole group: many small draws would take longer than the terms themselves.
@@ -308,7 +326,7 @@ def terminations(terms: Mapping[str, DoneTerm], view: View, recall: Recall) -> t
     """Computes ``(terminated, truncated)``; a step that does both counts as terminated."""
     terminated = truncated = jnp.zeros((), bool)
     for name, term in terms.items():
-        hit = recall(f"terminations.{name}", term, view)
+        hit = recall(f"terminations.{name}", term, view, number=True)
         if term.time_out:
             truncated |= hit
         else:

@@ -10,6 +10,7 @@ import jax
 from mjx_nero import config
 from mjx_nero.config import bounds, flag
 from mjx_nero.config.bounds import Bounds, Count, NonNegative, OneOf, Seed, Whole
+from mjx_nero.envs import things
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
 from mjx_nero.tasks import registry
@@ -82,7 +83,7 @@ def resolve(
     Raises:
         UserError: a name or field is unknown, or a value has the wrong type.
     """
-    cfg = registry.env_cfg(env, preset, robot, **env_fields)
+    cfg = things.overridden(registry.env_cfg(env, preset, robot), env_fields)
     hyperparameters = config.override(learner_cfg(cfg, preset, learner), learner_fields)
     asked = Asked(robot, dict(env_fields), dict(learner_fields))
     return RunCfg(env, preset, cfg, hyperparameters, learner, asked, **rest)

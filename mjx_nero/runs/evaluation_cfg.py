@@ -47,7 +47,7 @@ class EvalCfg:
     control_fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if self.controller and (self.agent or self.policy):
+        if self.controller and (self.agent or self.policy) or self.policy and self.agent not in (None, "policy"):
             raise UserError("only one can play: pass --controller, --agent or --policy")
         if self.control_fields and (self.agent or self.policy):
             raise UserError("--control.* needs --controller")

@@ -54,7 +54,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
     meta = describe(run, learner)
     goes_on = run.restore is not None and run.restore.is_dir() and run.out in (None, run.restore)
     path = run.restore if goes_on else run.out
-    with signals.at_once(), run_folder.claim(path, run.env_name, goes_on or run.auto) as folder:
+    with run_folder.claim(path, run.env_name, goes_on or run.auto) as folder:
         source = _source(run, meta, say)
         tally = _tally(source) if source and goes_on else Tally()
         if over := _over(run, tally):

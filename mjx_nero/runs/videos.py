@@ -1,14 +1,15 @@
 """Videos of played episodes, as good as the machine draws in time."""
 
+import contextlib
 import dataclasses
+import itertools
 import math
 import pathlib
+import subprocess
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
 
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 
@@ -16,6 +17,7 @@ from mjx_nero import files
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
+_CRF = 25  # quality of a video, from 0 (lossless) to 51
 _ENOUGH_S = 30.0  # for drawing a video
 # Width, height, samples per pixel and edge of the shadow map, the best first: OpenGL in software takes 0.1 s or more per frame.
 _QUALITIES = ((1280, 720, 4, 4096), (960, 540, 0, 1024), (640, 360, 0, 1024))
@@ -100,15 +102,28 @@ def inset(frame: np.ndarray, pictures: Sequence[np.ndarray]) -> np.ndarray:
 def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) -> None:
     """Writes an MP4. The file appears whole or not at all.
 
+    Args:
+        images: uint8 [height, width, 3], at least one, with even height and width.
+
     Raises:
         UserError: the path cannot be written.
     """
-    with files.whole(path) as part, warnings.catch_warnings():  # the encoder is a child process, and JAX warns of every fork
-        warnings.simplefilter("ignore", RuntimeWarning)
-        writer: Any = imageio.get_writer(part, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2)
-        with writer:
-            for image in images:
-                writer.append_data(image)
+    images = iter(images)
+    first = next(images)
+    height, width = first.shape[:2]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6f}", "-i", "-"]
+    codec = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_CRF)]
+    pipe = subprocess.PIPE
+    with files.whole(path) as part:
+        argv = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *source, *codec, str(part)]
+        with subprocess.Popen(argv, stdin=pipe, stderr=pipe, start_new_session=True) as encoder:  # Ctrl-C is not for it
+            assert encoder.stdin
+            with contextlib.suppress(BrokenPipeError):  # the encoder has failed, and says why
+                for image in itertools.chain([first], images):
+                    encoder.stdin.write(np.ascontiguousarray(image).data)
+            said = encoder.communicate()[1].decode(errors="replace").splitlines()
+        if encoder.returncode:
+            raise OSError(said[-1].rpartition(": ")[2] if said else f"the encoder ended with status {encoder.returncode}")
 
 
 def _quality(

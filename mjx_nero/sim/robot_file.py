@@ -14,7 +14,7 @@ from mjx_nero.config.bounds import Bounds
 from mjx_nero.config.values import hint, hints, short
 from mjx_nero.config.values import read as read_value
 from mjx_nero.sim import model_file
-from mjx_nero.sim.robot import DriveCfg, GripperCfg, RobotCfg
+from mjx_nero.sim.robot import ASSETS, DriveCfg, GripperCfg, RobotCfg
 from mjx_nero.types import UserError
 
 NAME = "robot.yaml"
@@ -76,7 +76,6 @@ def read(folder: pathlib.Path) -> RobotCfg:
     if not arm.joints:
         raise UserError(f"{path}: arm names no joint")
     robot = dataclasses.replace(default, **fields, arm=arm, gripper=gripper, folder=str(folder))
-    _check(robot, path)
     spec = model(robot)
     try:
         compiled = spec.compile()
@@ -93,8 +92,13 @@ def read(folder: pathlib.Path) -> RobotCfg:
     return dataclasses.replace(robot, gripper=gripper)
 
 
-def _check(robot: RobotCfg, path: pathlib.Path) -> None:
+def _check(robot: RobotCfg) -> None:
     """Checks what the fields' types do not say."""
+    path = pathlib.Path(robot.folder, NAME) if robot.folder else f"robot {short(robot.name)}"
+    for name, drive in (("arm", robot.arm), ("gripper", robot.gripper)):
+        for field, value in vars(drive).items():
+            if isinstance(value, tuple) and len(value) != len(drive.joints):
+                raise UserError(f"{path}: {name}.{field} takes a value for each of {len(drive.joints)} joints, got {len(value)}")
     boxes = {name: getattr(robot, name) or () for name in ("workspace", "pick", "hold")}
     for number in (*robot.base_pos, *(end for box in boxes.values() for axis in box for end in axis)):
         if not abs(number) <= MAX_NUMBER:
@@ -109,6 +113,8 @@ def _check(robot: RobotCfg, path: pathlib.Path) -> None:
     for joint in robot.arm.joints:
         if joint in robot.gripper.joints:
             raise UserError(f"{path}: joint {joint!r} is in arm and in gripper: take it out of one")
+    if len(set(robot.joints)) < len(robot.joints):
+        raise UserError(f"{path}: arm and gripper take each joint once, got {', '.join(robot.joints)}")
     for name in (robot.name, robot.base_link, robot.ee_site, *robot.joints):
         if not 0 < len(name) <= model_file.MAX_WORD or not name.isprintable():
             raise UserError(f"{path}: {short(name)} is not a name: it is empty, long, or has control characters")
@@ -118,12 +124,18 @@ def model(robot: RobotCfg) -> mujoco.MjSpec:
     """Reads the robot's model.
 
     Raises:
-        UserError: the file is missing or damaged, or lacks a joint, site or body that the robot's config names.
+        UserError: the file is missing or damaged, or lacks a joint, site or body that the robot's config names, or the config
+            contradicts itself.
     """
+    _check(robot)
     if robot.mjcf:
         where, spec = f"the mjcf of {robot.name}", _parsed(robot)
     else:
         where = str(robot.xml)
+        if not robot.folder and not (pathlib.PurePath(robot.name).name == robot.name and robot.xml.is_file()):
+            raise UserError(
+                f"robot.name takes the name of a folder in {ASSETS}, got {short(robot.name)}: choose a robot by --robot"
+            )
         spec = model_file.read(robot.xml) if robot.folder else mujoco.MjSpec.from_file(where)
     for what, wanted, found in (
         ("joint", robot.joints, spec.joints),

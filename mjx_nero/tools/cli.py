@@ -20,6 +20,7 @@ from typing import Annotated, Any, NoReturn
 from mjx_nero import config
 from mjx_nero.config import bounds, docs, values
 from mjx_nero.errors import UserError, missing
+from mjx_nero.runs import signals
 
 LONGEST_NAME = 255  # bytes of a file name; the limit of all common file systems
 
@@ -103,6 +104,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         message = re.sub(r"^argument ([^\s:]+): (?=takes|must)", r"\1 ", message)  # our messages continue from the flag's name
+        message = re.sub(r"^argument [^\s:]+: (?=cannot write)", "", message)
         raise UserError(f"{message} (see --help)")
 
     def parse(
@@ -120,6 +122,7 @@ class Parser(argparse.ArgumentParser):
         if cfgs and {"-h", "--help"} & set(argv):
             others, _ = self.parse([word for word in argv if word not in ("-h", "--help")], prefixes)
             self.epilog = fields_help(cfgs(others))
+        self._refuse_empty(argv)
         args, rest = self.parse_known_args(argv)
         if hasattr(args, "load"):
             load_guests(args.load)
@@ -143,6 +146,18 @@ class Parser(argparse.ArgumentParser):
         for name in learners:
             if dotted[name] and name != learner:
                 self.error(f"--{name}.* is for --learner {name}, and this is {learner}")
+
+    def _refuse_empty(self, argv: Sequence[str]) -> None:
+        """Refuses ``--robot ""``, as a shell makes of ``--robot "$ROBOT"``: an unset variable must not mean the default.
+
+        Only a config's field may be empty (``--env.scene.objects.cube.file ""``).
+        """
+        for before, word in zip(("", *argv), argv, strict=False):
+            flag, equals, value = word.partition("=")
+            field = before.startswith("--") and "." in before
+            if not word and not field or equals and not value and flag in self._option_string_actions:
+                taker = self._option_string_actions.get(before)
+                self.error(f"{flag or (before if taker and taker.nargs != 0 else 'an argument')} got an empty value")
 
     def given(self, argv: Sequence[str]) -> set[str]:
         """Returns the names of the flags in ``argv``, as ``parse`` names them, without the dotted ones."""
@@ -204,12 +219,21 @@ def fields_help(cfgs: Mapping[str, Any]) -> str:
 
 
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
-    """Runs a program. A user's mistake ends in one line on stderr and exit status 2, Ctrl-C in status 130."""
-    try:
-        from mjx_nero.files import cache  # needs installed packages
+    """Runs a program.
 
-        cache.check_addresses()
-        main(sys.argv[1:])
+    A user's mistake ends in one line on stderr and exit status 2. Ctrl-C and the other ``signals.SIGNALS`` let the program clean
+    up, and end it with status 128 plus the signal's number.
+    """
+    _occupy_streams()
+    try:
+        with signals.at_once():
+            from mjx_nero.files import cache  # needs installed packages
+
+            cache.check_addresses()
+            try:
+                main(sys.argv[1:])
+            finally:
+                _flush()  # what is still unwritten may fail like everything before
         code = 0
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -220,7 +244,6 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
         print(f"error: {missing(error)}", file=sys.stderr)
         code = 2
     except BrokenPipeError:  # the reader of our output is gone, as in `... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except OSError as error:  # from a path that the user gave: a name too long, no permission, a full disk
         print(f"error: {UserError(str(error))}", file=sys.stderr)
@@ -229,16 +252,34 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
         if not interrupted(error):
             raise
         print("interrupted", file=sys.stderr, flush=True)
-        sys.stdout.flush()
         os._exit(
             getattr(error, "code", 130)
         )  # threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation
+    try:
+        _flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or else Python complains of unwritten output as it ends
     sys.exit(code)
 
 
+def _flush() -> None:
+    if sys.stdout:  # None: the caller has closed it
+        sys.stdout.flush()
+
+
+def _occupy_streams() -> None:
+    """Opens the standard streams that the caller has closed. A file would get their numbers, and the messages of C libraries."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+
+
 def interrupted(error: BaseException) -> bool:
-    """Returns whether an error is Ctrl-C. In a call to native physics, JAX raises its own error with ours in its text."""
-    return isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error)
+    """Returns whether an error is a signal's. In a call to native physics, JAX raises its own error with ours in its text."""
+    names = (KeyboardInterrupt.__name__, signals.Signalled.__name__)
+    return isinstance(error, KeyboardInterrupt) or any(name in str(error) for name in names)
 
 
 def setup_jax() -> None:
@@ -350,6 +391,22 @@ def path(*suffixes: str) -> Callable[[str], pathlib.Path]:
             raise argparse.ArgumentTypeError(f"takes a path with names of at most {LONGEST_NAME} bytes, got {values.short(text)}")
         if suffixes and found.suffix.lower() not in suffixes:
             raise argparse.ArgumentTypeError(f"takes a name that ends in {' or '.join(suffixes)}, got {values.short(text)}")
+        return found
+
+    return read
+
+
+def output(*suffixes: str) -> Callable[[str], pathlib.Path]:
+    """Makes an argparse type: the path of a file that the command will write, which is tried at once, before long work."""
+
+    def read(text: str) -> pathlib.Path:
+        found = path(*suffixes)(text)
+        from mjx_nero import files  # needs installed packages
+
+        try:
+            files.check_writable(found)
+        except UserError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
         return found
 
     return read

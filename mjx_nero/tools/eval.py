@@ -41,8 +41,6 @@ def main(argv: Sequence[str]) -> None:
         )
     if args.failures and not args.video:
         raise UserError("--failures selects the episodes of a video: pass --video FILE.mp4, too")
-    for path in filter(None, (args.video, args.json)):
-        files.check_writable(path)
     video = videos.VideoCfg(args.video_size, fps=args.video_fps, envs=args.video_envs)
     from mjx_nero.runs import evaluation  # with Brax and MJX, which help does without
 
@@ -80,10 +78,10 @@ def _parser() -> cli.Parser:
     parser.add_seed(1)
     parser.add_impl()
     parser.add_fields(EvalCfg)
-    parser.add_argument("--video", type=cli.path(".mp4"), help="write an MP4 of up to three episodes")
+    parser.add_argument("--video", type=cli.output(".mp4"), help="write an MP4 of up to three episodes")
     parser.add_argument("--failures", action="store_true", help="show only failed episodes in the video")
     parser.add_video()
-    parser.add_argument("--json", type=cli.path(".json"), help="write the result as JSON")
+    parser.add_argument("--json", type=cli.output(".json"), help="write the result as JSON")
     parser.add_argument("--view", action="store_true", help="play in a browser instead, until Ctrl-C (the extra view)")
     return parser
 

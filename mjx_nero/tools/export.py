@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_load()
     parser.add_argument("policy", help=f"policy file, or name of a bundled policy ({', '.join(bundled.names())})")
-    parser.add_argument("--out", type=cli.path(".onnx"), required=True, metavar="FILE", help="ONNX file to write")
+    parser.add_argument("--out", type=cli.output(".onnx"), required=True, metavar="FILE", help="ONNX file to write")
     parser.add_argument("--robot", help="folder of the imported robot that the policy was trained with")
     args, dotted = parser.parse(argv, prefixes=("env",))
     from mjx_nero.envs.env import ManipulationEnv  # with Brax and MJX, which help does without
@@ -32,7 +32,6 @@ def main(argv: Sequence[str]) -> None:
     from mjx_nero.learn import policy
 
     onnx_package = need("onnx", "onnx")
-    files.check_writable(args.out)
     cli.setup_jax()
     path = bundled.names().get(args.policy) or pathlib.Path(args.policy)
     meta = policy.load(path).meta

@@ -26,14 +26,12 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
-    parser.add_argument("--render", type=cli.path(".png"), metavar="FILE", help="write a PNG of the robot at home")
+    parser.add_argument("--render", type=cli.output(".png"), metavar="FILE", help="write a PNG of the robot at home")
     parser.add_argument(
-        "--cameras", type=cli.path(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
+        "--cameras", type=cli.output(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
     )
-    parser.add_argument("--json", type=cli.path(".json"), metavar="FILE", help="write everything as JSON, for programs")
+    parser.add_argument("--json", type=cli.output(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, dotted = parser.parse(argv, ("env",))
-    for path in filter(None, (args.render, args.cameras, args.json)):
-        files.check_writable(path)
     if args.object is not None:
         return _thing(args)
     if dotted["env"] and not args.cameras:

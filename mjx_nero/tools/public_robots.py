@@ -43,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--folder", type=cli.path(), required=True, help="folder that contains the repositories, each as OWNER+NAME"
     )
-    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of results; new ones are added to it")
-    parser.add_argument("--markdown", type=cli.path(".md"), help="write the tables of all results in the JSON file")
+    parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
+    parser.add_argument("--markdown", type=cli.output(".md"), help="write the tables of all results in the JSON file")
     parser.add_argument(
         "--robots", help="list of robots, or none to only write the table (default: all robots that the JSON file lacks)"
     )
@@ -53,7 +53,6 @@ def main(argv: Sequence[str]) -> None:
     )
     args, _ = parser.parse(argv)
     commits, robots = read(args.list)
-    files.check_writable(args.json)
     held = figures(args.json) if args.json.exists() else {}
     if args.robots == "none":
         names = []

@@ -48,9 +48,9 @@ def main(argv: Sequence[str]) -> None:
         ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_load()
-    parser.add_argument("--json", type=cli.path(".json"), required=True, help="file of results; new ones are added to it")
+    parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
     parser.add_argument(
-        "--markdown", type=cli.path(".md"), help="write all results in the JSON file as a page, one table per task"
+        "--markdown", type=cli.output(".md"), help="write all results in the JSON file as a page, one table per task"
     )
     parser.add_argument(
         "--what", help=f"list of {', '.join(WHATS)}, or none to only show the table (default: all)", default=",".join(WHATS)
@@ -65,7 +65,6 @@ def main(argv: Sequence[str]) -> None:
     )
     args, _ = parser.parse(argv)
     whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
-    files.check_writable(args.json)
     held = read(args.json)
     envs = cli.choices(args.envs, "env", registry.list_envs()) if args.envs else learnable()
     envs = [env for env in envs if args.preset in registry.list_presets(env)]

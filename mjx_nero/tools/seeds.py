@@ -15,7 +15,7 @@ from mjx_nero.config.bounds import NonNegative, Seed, Share, Whole
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson
-from mjx_nero.runs import compiled, signals, starts, training
+from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs import folder as run_folder
 from mjx_nero.runs.cfg import RunCfg, fit_machine
 from mjx_nero.runs.loop import Diverged, Tally
@@ -57,7 +57,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
     learner = compiled.make_learner(run)
     device_memory.check(learner)
     meta = training.describe(run, learner)
-    with signals.at_once(), run_folder.claim(run.out, run.env_name, goes_on=False) as folder:
+    with run_folder.claim(run.out, run.env_name, goes_on=False) as folder:
         homes = {seed: folder / f"seed_{seed}" for seed in seeds}
         for home in homes.values():
             if (home / run_folder.CONFIG).exists():

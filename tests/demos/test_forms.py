@@ -120,6 +120,19 @@ def test_folders_of_something_else_are_refused(form, tmp_path):
             pass
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_a_data_set_without_an_episode_does_not_stay(form, tmp_path):
+    """Nobody succeeded: the same folder is free for another agent, also if the process was killed then."""
+    with pytest.raises(UserError, match="nobody"), writer(tmp_path / "d", schema(), form):
+        raise UserError("nobody succeeded")
+    assert not (tmp_path / "d").exists()
+    (tmp_path / "d" / "meta").mkdir(parents=True)
+    (tmp_path / "d" / "meta" / "mjx_nero.json").write_text(json.dumps(schema().to_json()))  # what a killed one leaves
+    with writer(tmp_path / "d", schema(env="nero_stack"), form) as out:
+        out.put([episode(0)])
+    assert open_dataset(tmp_path / "d").schema.about["env"] == "nero_stack"
+
+
 @contextlib.contextmanager
 def full_disk(size: int):
     """No file grows beyond ``size`` bytes, as if the disk were full: the kernel refuses, however a library writes."""

@@ -15,7 +15,8 @@ __all__ = ["Bench", "Clock", "Ideal", "metadata"]
 
 def metadata(name, dt=0.02):
     """The part of a policy's metadata that is about its robot."""
-    told = {**description.robot(registry.robot(name)), "robot": name, "control_dt": dt, "command": {}, "objects": {}}
+    task = {"env": "reach", "preset": "default", "observations": [], "command": {}, "objects": {}}
+    told = {**description.robot(registry.robot(name)), "robot": name, "control_dt": dt, **task}
     return json.loads(json.dumps(told))
 
 

@@ -40,7 +40,28 @@ FLAGS = {
     "video of no kind": f"{EVAL} --video v.zzz",
     "1e12 episodes": f"{EVAL} --episodes 1e12",
     "half an episode": f"{EVAL} --episodes 0.5",
+    "a field called as an argument of a function": f"{TRAIN} --env.robot none",
+    "another one": f"{TRAIN} --env.preset default",
+    "robot of another folder": f"{EVAL} --env.robot.name ../../../etc",
+    "robot without a name": f"{EVAL} --env.robot.name=",
+    "fewer joints than gains": f"{EVAL} --env.robot.arm.joints (joint1,)",
+    "a joint twice": f"{EVAL} --env.robot.gripper.joints (joint1,joint2)",
+    "no way down": f"{EVAL} --env.robot.down (0,0,0,0)",
+    "a policy and another agent": f"{EVAL} --policy p --agent zero",
 }
+EMPTY = (
+    *(f"train --env nero_reach --{flag}" for flag in ("robot", "object", "learner", "restore", "seeds", "out")),
+    *(f"eval --env nero_reach --{flag}" for flag in ("policy", "controller", "impl", "json")),
+    *("inspect", "export --out p.onnx", "demos --env nero_reach --task"),
+)
+
+
+@pytest.mark.parametrize("start", EMPTY)
+def test_an_empty_value_is_not_the_default(refuse, start):
+    """A shell makes one of a variable that is not set: --robot "$ROBOT"."""
+    assert "got an empty value" in refuse(lambda folder: [*start.split(), ""])
+    if start.startswith(("train", "eval")):
+        assert "got an empty value" in refuse(lambda folder: f"{start}=".split())
 
 
 @pytest.mark.parametrize("name", FLAGS)

@@ -1,7 +1,9 @@
 """Videos: as good as the machine draws within half a minute, unless flags say otherwise; several robots in one picture."""
 
 import os
+import resource
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -9,7 +11,7 @@ from scipy import ndimage
 import mjx_nero
 from mjx_nero.runs import videos
 from mjx_nero.sim.render import Renderer
-from mjx_nero.types import Scenery
+from mjx_nero.types import Scenery, UserError
 
 SCENERY = Scenery(np.zeros((150, 3, 3)), np.zeros((150, 3, 4)))
 QPOS, DT = np.zeros((150, 3, 1)), 0.02  # three episodes of 3 s: 225 pictures at 25 a second
@@ -80,3 +82,19 @@ def test_robots_side_by_side_in_one_picture():
         )
     cubes, count = ndimage.label((picture[:, :, 0] > 120) & (picture[:, :, 1:].max(axis=2) < 0.6 * picture[:, :, 0]))
     assert count == 4 and np.bincount(cubes.flat)[1:].min() > 20
+
+
+def test_a_video_is_whole_or_not_there(tmp_path):
+    """The encoder, a process of its own, fails in its last moment: it keeps the first pictures until then."""
+    pictures, path = np.random.default_rng(0).integers(0, 255, (3, 90, 160, 3), np.uint8), tmp_path / "a.mp4"
+    videos.write_video(path, pictures, 25.0)
+    before = path.read_bytes()
+    assert imageio.imread(path).shape == (3, 90, 160, 3)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # as a full disk
+    try:
+        with pytest.raises(UserError, match="cannot write .*a.mp4: the encoder ended"):
+            videos.write_video(path, pictures, 25.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

@@ -705,3 +705,30 @@ def test_any_of_several_terms_ends_the_episode():
 def test_wrong_parameters_are_refused_when_the_term_is_made(make, message):
     with pytest.raises(UserError, match=f"^{message}$"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("value", "got"),
+    [(jnp.zeros(3), "an array of shape \\(3,\\)"), (None, "None"), ("much", "'much'"), (jnp.zeros((1, 1)), "\\(1, 1\\)")],
+)
+def test_what_a_term_must_return(value, got):
+    """The message names the term: an array would be broadcast, or fail far from here."""
+    recall = terms.Recall({})
+    mine = terms.RewardTerm(lambda seen: value, weight=1.0)
+    with pytest.raises(UserError, match=f"rewards.mine must return a number for one environment, got .*{got}"):
+        terms.rewards({"mine": mine}, {}, view(), jnp.array(0), 0.02, recall)
+    done = terms.DoneTerm(lambda seen: value)
+    with pytest.raises(UserError, match=f"terminations.mine must return a number for one environment, got .*{got}"):
+        terms.terminations({"mine": done}, view(), recall)
+
+
+def test_what_an_observation_must_return():
+    group = terms.ObservationGroup({"mine": terms.ObservationTerm(lambda seen: jnp.zeros((2, 2)))}, corruption=False)
+    with pytest.raises(UserError, match=r"the observation mine must return a vector .*, got an array of shape \(2, 2\)"):
+        terms.observe({"state": group}, view(), view(), KEY, terms.Recall({}))
+
+
+def test_an_error_within_a_term_names_it():
+    with pytest.raises(ZeroDivisionError) as error:
+        terms.rewards({"mine": terms.RewardTerm(lambda seen: 1 / 0, weight=1.0)}, {}, view(), jnp.array(0), 0.02, RECALL)
+    assert error.value.__notes__ == ["in the term rewards.mine"]

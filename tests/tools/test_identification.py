@@ -211,6 +211,12 @@ def test_the_commands_write_and_refuse_in_one_line(tmp_path, capsys):
     for argv, message in (
         (["record", "--robot", "nero", "--out", str(out), "--seconds", "3"], "the movement takes at least 6 s, got 3"),
         (["record", "--robot", "nero", "--out", str(out), "--dt", "0.5"], "dt takes a physics step from 0.0001 to 0.02 s"),
+        (["record", "--robot", "nero", "--out", str(out), "--rate", "0.1"], "--rate must be at least 1"),
+        (["record", "--robot", "nero", "--out", str(out), "--port", "can0"], "--port: only for --arm, pass it, too"),
+        (
+            ["record", "--robot", "nero", "--out", str(out), "--arm", "nero", "--emulate", "--noise", "1e-4"],
+            "--noise: only for a simulated arm, leave out --arm",
+        ),
         (["identify", str(out), "--robot", "nero"], "needs exactly one column target.joint1"),
         (["identify", str(tmp_path / "none.csv"), "--robot", "nero"], "there is no file"),
     ):

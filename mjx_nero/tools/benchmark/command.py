@@ -57,7 +57,8 @@ def main(argv: Sequence[str]) -> None:
     args.learner = args.learner or registry.env_cfg(args.env, args.preset, args.robot).learner
     parser.only(dotted, learners.names(), args.learner)
     whats = cli.choices(args.what, "what", tuple(WHATS))
-    _check_files(args.json, args.plot, whats)
+    if args.plot and not set(whats) & set(plot.PLOTTED):
+        raise UserError(f"--plot draws only {', '.join(plot.PLOTTED)}: name one of them in --what")
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     head = {"env": args.env, "preset": args.preset, **({"robot": _without_folders(args.robot)} if args.robot else {})}
@@ -134,10 +135,10 @@ def _parser() -> cli.Parser:
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
     parser.add_argument(
         "--json",
-        type=cli.path(".json"),
+        type=cli.output(".json"),
         help="write the rows, the machine and all versions as JSON; repeating the command measures only the missing seeds",
     )
-    parser.add_argument("--plot", type=cli.path(".png"), help="picture (PNG) of rates and memory over the number of environments")
+    parser.add_argument("--plot", type=cli.output(".png"), help="picture of rates and memory over the number of environments")
     return parser
 
 
@@ -160,13 +161,6 @@ def begin() -> None:
     impl, sizes = resolve_impl(args.impl), args.num_envs or [0]
     args.learner = args.learner or cfg.learner
     start.begin(spawned, imported, jobs.run_of(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
-
-
-def _check_files(rows: pathlib.Path | None, picture: pathlib.Path | None, whats: list[str]) -> None:
-    if picture and not set(whats) & set(plot.PLOTTED):
-        raise UserError(f"--plot draws only {', '.join(plot.PLOTTED)}: name one of them in --what")
-    for path in filter(None, (rows, picture)):
-        files.check_writable(path)
 
 
 def _sizes(values: str) -> list[int]:

@@ -34,13 +34,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--log", type=cli.path(".csv"), action="append", metavar="FILE", help=_LOG)
     parser.add_argument("--inspect", type=cli.path(), metavar="DIR", help="show the contents of a data set")
     parser.add_argument(
-        "--sheet", type=cli.path(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
+        "--sheet", type=cli.output(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
     )
     parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="replay an episode of a data set in simulation")
     parser.add_argument(
         "--episode", type=cli.number(int), default=0, help="with --replay: index of the episode, from 0 (default: %(default)s)"
     )
-    parser.add_argument("--video", type=cli.path(".mp4"), help="with --replay: write a video of the episode")
+    parser.add_argument("--video", type=cli.output(".mp4"), help="with --replay: write a video of the episode")
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
     asked = [name for name in ("out", "inspect", "replay") if getattr(args, name)]
     if len(asked) != 1:

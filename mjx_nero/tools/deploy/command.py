@@ -30,8 +30,6 @@ def main(argv: Sequence[str]) -> None:
     arms.check(parser, args)
     if args.check and args.dry_run:
         parser.error("--check moves the arm, and --dry-run does not: pass one of them")
-    for path in filter(None, (args.log, args.check)):
-        files.check_writable(path)
     try:
         with arms.missing():
             ended = _run(args)
@@ -71,8 +69,8 @@ def _parser() -> cli.Parser:
     add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line in joint space")
     add("--dry-run", action="store_true", help="read the arm and show what would be sent, but send nothing")
     text = "instead of running the policy, move each joint a little, ask what you saw, and write offsets and delay"
-    add("--check", type=cli.path(".yaml", ".yml"), metavar="FILE", help=text)
-    add("--log", type=cli.path(".csv"), help="write a table of everything read and sent, which identify reads")
+    add("--check", type=cli.output(".yaml", ".yml"), metavar="FILE", help=text)
+    add("--log", type=cli.output(".csv"), help="write a table of everything read and sent, which identify reads")
     add("--alive", type=cli.path(), metavar="FILE", help="hold unless this file is touched at least every half second")
     arms.add_limits(parser)
     return parser
@@ -96,6 +94,7 @@ def _brain(args: argparse.Namespace) -> Any:
         raise UserError(f"{args.policy} is not a policy written by export: {error}") from None
     setup.check(brain.metadata)
     drivers.check(args.arm, brain.metadata)
+    brain.warm()
     return brain
 
 
@@ -123,7 +122,6 @@ def _run(args: argparse.Namespace) -> bool:
         spec, delay = arms.spec(args, metadata, options, args.log, note)
         remote = Remote(spec)
         stack.callback(remote.close)
-        brain.warm()
         remote.ready()
         stop = stack.enter_context(operator(args.alive))
         stack.enter_context(urgent())

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import config, files
+from mjx_nero import config
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
@@ -19,6 +19,8 @@ from mjx_nero.tools.deploy import FAULT, arms
 from mjx_nero.tools.identification.report import save, save_plot, table
 
 _DT = 0.005
+_ARM = {"port", "gripper", "calibration", "emulate", "identified", "speed", "table", "workspace", "apart", "hottest"}
+_SIMULATED = {"noise", "resolution", "scatter", "offset", "delay", "seed", "rate", "dt"}
 
 
 def record_main(argv: Sequence[str]) -> None:
@@ -34,7 +36,7 @@ def record_main(argv: Sequence[str]) -> None:
     arms.add_limits(parser)
     parser.add_argument(
         "--out",
-        type=cli.path(".csv"),
+        type=cli.output(".csv"),
         required=True,
         help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
@@ -45,7 +47,9 @@ def record_main(argv: Sequence[str]) -> None:
             f"--{field.name}", type=kind, default=field.default, help=f"{about[field.name]} (default: %(default)s)"
         )
     args, _ = parser.parse(argv)
-    files.check_writable(args.out)
+    if wrong := parser.given(argv) & (_SIMULATED if args.arm else _ARM):
+        flags = ", ".join(f"--{name}" for name in sorted(wrong))
+        parser.error(f"{flags}: only for {'a simulated arm, leave out --arm' if args.arm else '--arm, pass it, too'}")
     if args.arm:
         _record_arm(parser, args)
         return
@@ -85,12 +89,10 @@ def identify_main(argv: Sequence[str]) -> None:
     )
     _add_robot(parser)
     parser.add_argument(
-        "--out", type=cli.path(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
+        "--out", type=cli.output(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
     )
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
+    parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
     args, _ = parser.parse(argv)
-    for path in filter(None, (args.out, args.plot)):
-        files.check_writable(path)
     plant = Plant(registry.robot(args.robot), args.dt)
     joints = plant.robot.arm.joints
     log = logs.read(args.log, joints)

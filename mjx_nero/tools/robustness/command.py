@@ -33,14 +33,12 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--only", action="append", default=[], metavar="TEXT", help="only parameters whose names contain this text; repeatable"
     )
-    parser.add_argument("--json", type=cli.path(".json"), help="write the results as JSON")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="plot the curves to this file")
+    parser.add_argument("--json", type=cli.output(".json"), help="write the results as JSON")
+    parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="plot the curves to this file")
     parser.add_argument(
         "--beside", type=cli.path(".json"), help="with --plot: results of another policy (from --json) to plot as well"
     )
     args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
-    for path in filter(None, (args.json, args.plot)):
-        files.check_writable(path)
     if args.beside and not args.plot:
         raise UserError("--beside adds curves to the plot: pass --plot, too")
     other = read(args.beside) if args.beside else None

@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import files
 from mjx_nero.runs import console
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks import registry
@@ -20,8 +19,8 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_load()
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
-    parser.add_argument("--out", type=cli.path(".yaml", ".yml"), help="write the gains as YAML, for import-urdf --gains")
-    parser.add_argument("--plot", type=cli.path(".png", ".pdf", ".svg"), help="write a picture of the step responses")
+    parser.add_argument("--out", type=cli.output(".yaml", ".yml"), help="write the gains as YAML, for import-urdf --gains")
+    parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the step responses")
     parser.add_argument(
         "--step",
         type=cli.positive_float,
@@ -37,8 +36,6 @@ def main(argv: Sequence[str]) -> None:
         "--gravity-compensation", action=argparse.BooleanOptionalAction, help="override the robot's gravity compensation"
     )
     args, _ = parser.parse(argv)
-    for path in filter(None, (args.out, args.plot)):
-        files.check_writable(path)
     robot = registry.robot(args.robot)
     if args.gravity_compensation is not None:
         robot = dataclasses.replace(robot, gravity_compensation=args.gravity_compensation)
