@@ -9,7 +9,7 @@ import mjx_nero
 from mjx_nero.deploy.executor import PARTS, Executor, Joints
 from mjx_nero.mdp import actions
 from mjx_nero.mdp.terms import Term
-from mjx_nero.tasks import registry
+from mjx_nero.tasks import registry, seeing
 
 STEPS = 60
 
@@ -123,6 +123,8 @@ def test_an_unknown_type_is_said():
 def test_every_environment_describes_its_actions(env_name):
     anyone = {} if registry.robot_of(env_name) else {"robot": "piper"}
     for preset in registry.list_presets(env_name):
+        if preset in seeing.PRESETS[1:]:
+            continue  # acts as the first of them
         env = mjx_nero.make(env_name, preset=preset, impl="native", **anyone)
         low, high = env.actions.bounds()
         assert low.shape == high.shape == (env.action_size,) and (low < high).all()
