@@ -6,6 +6,7 @@ import itertools
 import pathlib
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -137,7 +138,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     if count > MAX_LOOSE:
         raise UserError(f"is {count:,} disconnected pieces, not a solid: at most {MAX_LOOSE} are cut")
     if count <= MAX_PARTS and mesh.is_volume:
-        each = mesh.submesh([np.flatnonzero(labels[mesh.faces[:, 0]] == k) for k in range(count)])
+        each: Any = mesh.submesh([np.flatnonzero(labels[mesh.faces[:, 0]] == k) for k in range(count)])
         hulls = [_hull(np.asarray(piece.vertices)) for piece in each]
         if all(piece.volume > CONVEX * hull.volume for piece, hull in zip(each, hulls, strict=True)):
             return [np.asarray(hull.vertices) for hull in hulls]
