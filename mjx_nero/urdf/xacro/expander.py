@@ -28,8 +28,7 @@ _XML_NAME = re.compile(r"[A-Za-z_][\w.-]*")
 
 def is_xacro(root: etree._Element) -> bool:
     """True if the document needs xacro."""
-    elements = (e for e in root.iter() if isinstance(e.tag, str))
-    return any(_own(e) or e.prefix == "xacro" or e.tag.startswith("xacro:") for e in elements) or _declared(root)
+    return any(_own(e) for e in root.iter() if isinstance(e.tag, str)) or _declared(root)
 
 
 def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: Mapping[str, str], notes: Notes) -> etree._Element:
@@ -64,8 +63,15 @@ def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: M
 
 def _own(element: etree._Element) -> str:
     """Name of a xacro element; empty for others."""
-    uri, brace, name = str(element.tag).removeprefix("{").partition("}")
-    return name if brace and uri in URIS else ""
+    return _unprefixed(str(element.tag), element)
+
+
+def _unprefixed(name: str, element: etree._Element) -> str:
+    """A name of xacro's without its prefix; empty for others. What address ``xacro:`` stands for does not matter, as in xacro."""
+    uri, brace, plain = name.removeprefix("{").partition("}")
+    if brace:
+        return plain if uri in URIS or uri == element.nsmap.get("xacro") else ""
+    return name.removeprefix("xacro:") if name.startswith("xacro:") else ""
 
 
 def _declared(root: etree._Element) -> bool:
@@ -121,8 +127,6 @@ class _Expander(Surroundings):
             name, tag = _own(element), str(element.tag)
             if name:
                 self._rules.get(name, self._call)(element, target, scope)
-            elif element.prefix == "xacro" or tag.startswith("xacro:"):
-                raise Fault(f'the prefix xacro stands for something else here: declare xmlns:xacro="{URIS[0]}"')
             elif ":" in tag and not tag.startswith("{"):
                 self.left_out.add(f"<{tag[:60]}> (its prefix is not declared)")
             else:
@@ -152,7 +156,7 @@ class _Expander(Surroundings):
 
     def _attributes(self, element: etree._Element, out: etree._Element, scope: Scope) -> None:
         for key, text in element.attrib.items():
-            if not key.startswith(tuple(f"{{{uri}}}" for uri in URIS)) and (key.startswith("{") or ":" not in key):
+            if not _unprefixed(key, element) and (key.startswith("{") or ":" not in key):
                 self._set(out, key, scope.string(text))
 
     def _set(self, out: etree._Element, key: str, value: str) -> None:
@@ -198,7 +202,7 @@ class _Expander(Surroundings):
         self._set(target, _plain_name(name), scope.string(_needed(element, "value")))
 
     def _named_element(self, element: etree._Element, target: etree._Element, scope: Scope) -> None:
-        name = next((text for key, text in element.attrib.items() if key in (f"{{{uri}}}name" for uri in URIS)), None)
+        name = next((text for key, text in element.attrib.items() if _unprefixed(key, element) == "name"), None)
         if name is None:
             raise Fault("has no xacro:name")
         self._copy(element, _plain_name(scope.string(name)), target, scope)
