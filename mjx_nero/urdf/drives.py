@@ -97,7 +97,7 @@ def rows(
     """Returns stiffness, damping, effort and speed of every driven joint: as given, or else by these rules.
 
     Effort and speed are the URDF's limits, and speed is at most ``SPEED``. An effort of 1 that all joints share, or that hardly
-    moves its joint, counts as missing.
+    moves its joint or cannot hold the cube, counts as missing.
 
     An arm drive has the natural frequency ``FREQUENCY`` at the greatest inertia that the joint moves. It is stiffer if the
     joint's damping would make it creep, or its friction would stop it more than ``STUCK`` away, and softer if it would reach full
@@ -117,7 +117,8 @@ def rows(
         load = _load(joint, parts, inertia, rotors)
         finger = joint.name in hand.joints
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
-        row = _finger(joint, load, lever, force, unsaid, notes) if finger else _arm(joint, load, unsaid, notes)
+        weak = joint.effort == PLACEHOLDER and PLACEHOLDER - load.friction < HOLD * cube * lever
+        row = _finger(joint, load, lever, force, unsaid or weak, notes) if finger else _arm(joint, load, unsaid, notes)
         row["damping"] = max(critical_damping(row["stiffness"], load.inertia, DT) - load.damping, 0.0)
         if joint.name in given:
             row |= given[joint.name]
@@ -153,7 +154,9 @@ def _finger(joint: Joint, load: _Load, lever: float, force: float, unsaid: bool,
     """Computes stiffness, effort and speed of a finger's drive that grips with at most ``force`` [N] at its ``lever`` [m]."""
     wanted = FORCE / 3 * lever + load.friction if unsaid or not joint.effort else joint.effort
     effort = min(wanted, force * lever + load.friction)
-    if joint.effort and joint.effort > effort:
+    if unsaid and joint.effort:
+        notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is a placeholder: now {effort:.3g}")
+    elif joint.effort and joint.effort > effort:
         notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
     speed = min(joint.velocity or USUAL, SPEED)
     if (spare := effort - load.friction) > 0 and load.damping * speed > spare:

@@ -77,6 +77,8 @@ def import_urdf(
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
+    if roots.elsewhere:
+        notes.add("repaired", "robot", tree.name, roots.told())
     check_lengths(tree, looks.spans, units)
     whole = filled(tree, looks, notes)
     tree, grips, fork = fingers.choose(whole, looks.of, gripper, notes)

@@ -202,8 +202,30 @@ def test_arguments_are_given(tmp_path):
     with pytest.raises(UserError, match=r"robot.xacro, line 1, <link .*argument 'q' has no value: pass --arg q:=VALUE"):
         expanded(tmp_path, text)
     assert expanded(tmp_path, document('<link name="$(arg z)"/>'), {"z": "e"}).find("link").get("name") == "e"  # not declared
-    with pytest.raises(UserError, match="--arg pp: .* has no such argument .did you mean 'p'.*it has p, q"):
+    with pytest.raises(UserError, match="--arg pp: .* has no such argument .did you mean 'p'.*it has HOME, p, q"):
         expanded(tmp_path, text, {"q": "1", "pp": "1"})
+
+
+def test_environment_variables_are_arguments(tmp_path):
+    text = document('<xacro:if value="$(optenv HAS_ARM false)"><link name="$(env SIDE)"><xacro:if value="$(optenv KIND)"><a/></xacro:if></link></xacro:if>')
+    assert expanded(tmp_path, text).find("link") is None
+    link = expanded(tmp_path, text, {"HAS_ARM": "true", "SIDE": "left", "KIND": "1"}).find("link")
+    assert link.get("name") == "left" and link.find("a") is not None
+    with pytest.raises(UserError, match="env SIDE.*: pass --arg SIDE:=VALUE"):
+        expanded(tmp_path, text, {"HAS_ARM": "true"})
+
+
+def test_old_files_do_without_the_prefix(tmp_path):
+    """As xacro's first version had it; a macro that a file defines with the prefix is called with it."""
+    text = document(
+        '<property name="size" value="2"/><macro name="wheel" params="side *place"><link name="${side}_${size}"/>',
+        '<if value="${size &gt; 1}"><insert_block name="place"/></if></macro>',
+        '<wheel side="left"><joint name="j"/></wheel><xacro:wheel side="right"><joint name="k"/></xacro:wheel>',
+        '<xacro:macro name="cylinder"><link name="no"/></xacro:macro><geometry><cylinder length="1"/></geometry>',
+    )
+    out = expanded(tmp_path, text)
+    assert [element.get("name") for element in out if element.tag != "geometry"] == ["left_2", "j", "right_2", "k"]
+    assert out.find("geometry/cylinder").get("length") == "1"
 
 
 def test_packages(tmp_path):
@@ -234,6 +256,15 @@ def test_left_out_with_a_note(tmp_path):
     assert [e.tag for e in out] == ["gazebo", "link"] and not len(out[0])
     note = notes[0].text
     assert "gazebo_plugins" in note and "sensor:camera" in note and "arm_ros2_control" in note
+
+
+def test_a_link_of_what_was_left_out_is_missed_with_its_file(tmp_path):
+    include = '<xacro:include filename="$(find realsense2_description)/urdf/d435.urdf.xacro"/>'
+    camera = '<xacro:sensor_d435 parent="base"/><link name="lens"/>'
+    joint = '<joint name="on" type="fixed"><parent link="camera_link"/><child link="lens"/></joint>'
+    path = make.write(tmp_path, document(include, LINK, camera, joint), "robot.urdf.xacro")
+    with pytest.raises(UserError, match="joint 'on' names link 'camera_link', which is not there.*left out: .*realsense2_desc"):
+        import_urdf(path, tmp_path / "out")
 
 
 @pytest.mark.parametrize("tag", ["ros2_control", "gazebo", "transmission"])

@@ -841,6 +841,9 @@ def test_fingers_overcome_their_joints_own_friction(tmp_path):
     assert rough.effort[0] == pytest.approx(free.effort[0] + 8, rel=1e-4) and not weak(report)
     report, _ = grips("stuck", 'friction="12" damping="0"')
     assert len(weak(report)) == 1 and "grips with 0 N" in weak(report)[0]
+    report, unsaid = grips("unsaid", 'friction="1" damping="0"', effort=1.0)  # cannot even move them: a placeholder
+    assert unsaid.effort[0] == pytest.approx(free.effort[0] + 2, rel=1e-4) and not weak(report)
+    assert any("effort 1 is a placeholder" in note for note in report.notes.of("joint", "f1"))
     report, slow = grips("slow", 'friction="0" damping="100"')
     assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) and slow.speed[0] < free.speed[0]
     assert any("its own damping" in note for note in report.notes.of("joint", "f1"))
