@@ -103,8 +103,8 @@ def check_lengths(tree: Tree, spans: Spans, units: Units) -> None:
     far = [j for j in tree.joints.values() if j.type == "prismatic" and _slide(j) > MOST]
     if far and units.scale is None and _reach(tree) - sum(map(_slide, far)) <= MOST:
         joint = far[0]
-        text = f"joint {joint.name!r} slides by up to {_slide(joint):.3g} m, as a base that drives does"
-        raise UserError(f"{tree.name}: {text}: hold it still with --fix {joint.name}=0, or correct its limits, which are in metres")
+        text = f"joint {joint.name!r} slides by up to {_slide(joint):.3g} m, as a base that drives does: hold it still with"
+        raise UserError(f"{tree.name}: {text} --fix {joint.name}=0, or correct its limits, which are in metres")
     (file, scale), span = max(spans.items(), key=lambda item: item[1], default=(("", ()), 0.0))
     reach = _reach(tree)
     if units.scale is None and not _possible(tree, reach, span):

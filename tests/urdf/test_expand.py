@@ -207,7 +207,8 @@ def test_arguments_are_given(tmp_path):
 
 
 def test_environment_variables_are_arguments(tmp_path):
-    text = document('<xacro:if value="$(optenv HAS_ARM false)"><link name="$(env SIDE)"><xacro:if value="$(optenv KIND)"><a/></xacro:if></link></xacro:if>')
+    link = '<link name="$(env SIDE)"><xacro:if value="$(optenv KIND)"><a/></xacro:if></link>'
+    text = document('<xacro:if value="$(optenv HAS_ARM false)">', link, "</xacro:if>")
     assert expanded(tmp_path, text).find("link") is None
     link = expanded(tmp_path, text, {"HAS_ARM": "true", "SIDE": "left", "KIND": "1"}).find("link")
     assert link.get("name") == "left" and link.find("a") is not None
