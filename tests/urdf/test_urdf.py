@@ -428,6 +428,21 @@ def test_an_effort_of_one_is_a_placeholder(tmp_path):
     assert light.robot.arm.effort == (1.0,)
 
 
+def test_an_effort_that_cannot_hold_the_arm_is_none(tmp_path):
+    """2 kg half a metre away: 9.81 N m when it lies; 9 N m cannot be its motor's, 11 N m may be."""
+
+    def drive(name, effort):
+        limit = f'lower="-3" upper="3" effort="{effort}" velocity="1"'
+        link = make.link("l", '<inertial><origin xyz="0 0 0.5"/><mass value="2"/></inertial>')
+        text = make.robot(make.link("base", make.inertial()), link, make.joint("j", "base", "l", axis="0 1 0", limit=limit))
+        report = imported(tmp_path / name, text)[1]
+        return report.robot.arm, [n for n in report.notes.of("joint", "j") if "cannot hold its own links, up to 9.8" in n]
+
+    (weak, told), (strong, silent) = drive("weak", 9), drive("strong", 11)
+    assert told and weak.effort[0] == pytest.approx(weak.stiffness[0] / 2, rel=1e-3) and weak.effort[0] > 50
+    assert not silent and strong.effort == (11.0,)
+
+
 def test_an_inertia_of_one_is_a_placeholder(tmp_path):
     """1 kg m2 for a kilogram within a few centimetres, as exporters write it; what a motor's rotor adds to a link stays."""
 
