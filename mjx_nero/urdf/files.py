@@ -35,7 +35,8 @@ class Roots:
     parent folder, if there is none and the URDF lies in ``urdf``, ``robots`` or ``xacro``); the given ``packages``; and packages
     that the URDF names, if ``NAME/package.xml`` lies beside it or beside a folder above.
 
-    Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name.
+    Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name. A file whose folder
+    is not here is taken from the own folders, at a tail of its path (``elsewhere``).
 
     Args:
         urdf: path of the URDF.
