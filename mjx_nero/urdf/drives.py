@@ -105,14 +105,16 @@ def rows(
     joint's damping would make it creep, or its friction would stop it more than ``STUCK`` away, and softer if it would reach full
     effort within ``STRETCH``.
 
-    A finger's drive gives full effort at ``SQUEEZE``. On top of the joints' friction it gives at most ``FORCE`` at its end, and
-    at most ``PRESS`` per kilogram of the cube it can lift; less than ``HOLD`` per kilogram gets a warning.
+    A finger's drive gives full effort at ``SQUEEZE``, or at the cube if friction would leave too little there. On top of the
+    joints' friction it gives at most ``FORCE`` at its end, and at most ``PRESS`` per kilogram of the cube it can lift; less than
+    ``HOLD`` per kilogram gets a warning.
 
     Damping adds what the joints lack to critical, also at the package's longest physics step.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
-    cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad, hand.closed) ** 3
+    edge = grasp.edge(hand.gap, hand.pad, hand.closed)
+    cube = grasp.DENSITY * edge**3
     force = min(FORCE, PRESS * cube) if cube else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
     for joint in driven:
@@ -121,6 +123,9 @@ def rows(
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
         weak = joint.effort == PLACEHOLDER and PLACEHOLDER - load.friction < HOLD * cube * lever
         row = _finger(joint, load, lever, force, unsaid or weak, notes) if finger else _arm(joint, load, unsaid, notes)
+        at_cube = edge / 2 / lever  # [rad, m] a finger's way from the cube to closed
+        if finger and cube and row["stiffness"] * at_cube - load.friction < HOLD * cube * lever < row["effort"] - load.friction:
+            row["stiffness"] = max(row["stiffness"], row["effort"] / at_cube)
         row["damping"] = max(critical_damping(row["stiffness"], load.inertia, DT) - load.damping, 0.0)
         if joint.name in given:
             row |= given[joint.name]

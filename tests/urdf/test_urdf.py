@@ -838,8 +838,8 @@ def test_fingers_too_weak_to_hold_are_a_warning(tmp_path, type, axis, effort, gr
 def test_fingers_overcome_their_joints_own_friction(tmp_path):
     """Dry friction of both fingers comes on top of what they grip with; damping says how fast they can be."""
 
-    def grips(name, losses, effort=20.0):
-        row = {"type": "prismatic", "xyz": "0 0 0.2", "limit": f'lower="0" upper="0.04" effort="{effort}" velocity="1"'}
+    def grips(name, losses, effort=20.0, upper=0.04):
+        row = {"type": "prismatic", "xyz": "0 0 0.2", "limit": f'lower="0" upper="{upper}" effort="{effort}" velocity="1"'}
         inner = f"<dynamics {losses}/>"
         joints = (
             make.joint("f1", "l3", "left", axis="0 1 0", inner=inner, **row),
@@ -859,6 +859,9 @@ def test_fingers_overcome_their_joints_own_friction(tmp_path):
     report, unsaid = grips("unsaid", 'friction="1" damping="0"', effort=1.0)  # cannot even move them: a placeholder
     assert unsaid.effort[0] == pytest.approx(free.effort[0] + 2, rel=1e-4) and not weak(report)
     assert any("effort 1 is a placeholder" in note for note in report.notes.of("joint", "f1"))
+    report, small = grips("small", 'friction="1" damping="0"', upper=0.012)  # 2 N of friction are most of a small hand's effort
+    edge = grasp.edge(report.robot.opening, report.robot.pad, report.robot.closed)
+    assert small.stiffness[0] * edge / 2 == pytest.approx(small.effort[0], rel=1e-3) and edge < 0.02
     report, slow = grips("slow", 'friction="0" damping="100"')
     assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) and slow.speed[0] < free.speed[0]
     assert any("its own damping" in note for note in report.notes.of("joint", "f1"))
