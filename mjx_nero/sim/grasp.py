@@ -55,16 +55,16 @@ def lowest(pad: Pad) -> float:
 
 
 def beyond(robot: RobotCfg, gap: float) -> float:
-    """Distance of the pads' middle beyond the grasp point along the approach, when they are ``gap`` apart [m].
+    """Distance of the pads' middle beyond the place of a gripped cube along the approach, when they are ``gap`` apart [m].
 
-    0 if long pads reach back over the grasp point. A round object must be between the pads' middles, or it rolls over an edge.
+    0 if long pads reach back over that place. A round object must be between the pads' middles, or it rolls over an edge.
     """
     hand = _Hand(robot)
     hand.move(hand.share(gap))
     site = hand.data.site(robot.ee_site)
     approach = _in_hand(robot, (0.0, 0.0, -1.0))
     centres = [hand.data.geom(i).xpos for i in hand.pads]
-    off = (np.mean(centres, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) if centres else np.zeros(3)
+    off = (np.mean(centres, axis=0) - site.xpos) @ site.xmat.reshape(3, 3) - robot.grip if centres else np.zeros(3)
     return round(max(0.0, float(off @ approach)), 4)
 
 

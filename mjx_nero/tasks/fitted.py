@@ -81,8 +81,9 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.FollowTargetSetup:
 
 
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.LiftSetup], EnvCfg]) -> EnvCfg:
-    setup = lift_setup(robot)
-    return factory(_ready(robot), setup)
+    setup, ready = lift_setup(robot), _ready(robot)
+    cfg = factory(ready, setup)
+    return dataclasses.replace(cfg, episode_length_s=round(cfg.episode_length_s + _late(ready), 2))
 
 
 def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:
@@ -98,11 +99,15 @@ def _ready(robot: RobotCfg) -> RobotCfg:
     return grasp.opened(robot, OPEN * edge) if grasp.closing_time(robot, edge) > SLOW else robot
 
 
+def _late(robot: RobotCfg) -> float:
+    """Extra time that slow fingers need to close on the cube [s]."""
+    return max(0.0, round(grasp.closing_time(robot, grasp.cube_for(robot).size[0]) - SLOW, 2))
+
+
 def _pick_place(robot: RobotCfg) -> EnvCfg:
     """Uses inverse kinematics, since RMPflow needs files for the robot. Slow fingers get extra time to close."""
     robot = _even(_ready(robot))
-    setup = pick_place_setup(robot)
-    late = max(0.0, round(grasp.closing_time(robot, grasp.cube_for(robot).size[0]) - SLOW, 2))
+    setup, late = pick_place_setup(robot), _late(robot)
     cfg = pick_place.default(robot, dataclasses.replace(setup, episode_length_s=round(setup.episode_length_s + 2 * late, 2)))
     fields = {**cfg.controllers["pick_place"], "end_effector_offset": regions.of(robot).offset, "motion": "ik", "wait": late}
     return dataclasses.replace(cfg, controllers={"pick_place": {**fields, **regions.ik(robot, "ik.")}})

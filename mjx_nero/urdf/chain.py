@@ -1,6 +1,7 @@
 """Selects the arm's joints. A robot with more (a second arm, a head, wheels) is reduced to the one arm that its user names."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,7 +11,9 @@ from mjx_nero.types import UserError
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint, Tree, below, bodies, body_of
 
+MOST_CHOICES = 4
 HAND = 4  # most driven joints of a branch, if only fingers leave the base
+SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realsense|vision|_ft(_|$)", re.IGNORECASE)
 FINGERS = 3  # least driven joints in series that make a branch an arm, not a finger
 
 
@@ -88,7 +91,8 @@ def _check(tree: Tree) -> None:
     spare = [name for name in spare if name not in arms]
     if len(limbs) == 1 and not spare:
         return
-    choices = ", ".join(f"--chain {one.base}:{_named(parts, one.end)}" for one in limbs[:4])
+    longest = sorted(limbs, key=lambda one: -len(one.joints))[:MOST_CHOICES]  # arms have more joints than legs
+    choices = ", ".join(f"--chain {one.base}:{_named(parts, one.end)}" for one in longest)
     more = f"{len(limbs)} arms" if len(limbs) > 1 else "an arm"
     more += f", and {len(spare)} joint{'s' * (len(spare) > 1)} beside {'them' if len(limbs) > 1 else 'it'}" if spare else ""
     rest = f" ({', '.join(spare[:4])}{', ...' * (len(spare) > 4)})" if spare else ""
@@ -126,12 +130,14 @@ def _limbs(parts: dict[str, Body]) -> list[Limb]:
             walk(here if len(long) > 1 else base, branch.name, passed + own)
 
     walk(next(iter(parts)), next(iter(parts)), ())
-    return out
+    turning = {b.joint.name for b in parts.values() if b.joint and b.joint.type == "continuous"}
+    return [one for one in out if set(one.joints) - turning] or out  # a caster turns about three endless axes
 
 
 def _named(parts: dict[str, Body], end: str) -> str:
-    """Returns the last link of a body, the name by which users know an arm's end."""
-    return list(parts[end].links)[-1]
+    """Returns the last link of a body, the name by which users know an arm's end; not a sensor's, if there is another."""
+    links = list(parts[end].links)
+    return ([n for n in links if not SENSORS.search(n)] or links)[-1]
 
 
 def _outside(tree: Tree, chain: str) -> list[str]:

@@ -55,17 +55,19 @@ def load_gains(path: pathlib.Path, joints: Mapping[str, Any]) -> Rows:
     return out
 
 
-def carried(model: mujoco.MjModel) -> dict[str, float]:
-    """Greatest inertia that each joint moves over 64 random poses, without rotors [kg m2, kg]."""
+def carried(model: mujoco.MjModel) -> tuple[dict[str, float], dict[str, float]]:
+    """Greatest inertia [kg m2, kg] and weight [N m, N] that each joint moves over 64 random poses, without rotors."""
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
     model.dof_armature[:] = 0.0
-    full, most = np.zeros((model.nv, model.nv)), np.zeros(model.nv)
+    full, most, weight = np.zeros((model.nv, model.nv)), np.zeros(model.nv), np.zeros(model.nv)
     for _ in range(64):
         data.qpos[:] = rng.uniform(model.jnt_range[:, 0], model.jnt_range[:, 1])
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, full)
         most = np.maximum(most, np.diag(full))
-    return {model.joint(i).name: float(most[model.jnt_dofadr[i]]) for i in range(model.njnt)}
+        weight = np.maximum(weight, np.abs(data.qfrc_bias))
+    places = {model.joint(i).name: model.jnt_dofadr[i] for i in range(model.njnt)}
+    return {n: float(most[k]) for n, k in places.items()}, {n: float(weight[k]) for n, k in places.items()}
 
 
 def armature(joint: Joint, inertia: float, lever: float | None) -> float:
@@ -75,7 +77,7 @@ def armature(joint: Joint, inertia: float, lever: float | None) -> float:
     wrists. A gripper joint gets ``FINGER`` at the end of the fingers.
 
     Args:
-        inertia: result of ``carried``.
+        inertia: greatest inertia that it moves, of ``carried``.
         lever: distance from a gripper joint's axis to the finger's end [m]; None for other joints.
     """
     if joint.type == "prismatic":
@@ -88,7 +90,7 @@ def armature(joint: Joint, inertia: float, lever: float | None) -> float:
 def rows(
     parts: Mapping[str, Body],
     hand: Hand,
-    inertia: Mapping[str, float],
+    moved: tuple[Mapping[str, float], Mapping[str, float]],
     rotors: Mapping[str, float],
     levers: Mapping[str, float],
     given: Rows,
@@ -96,28 +98,34 @@ def rows(
 ) -> Rows:
     """Returns stiffness, damping, effort and speed of every driven joint: as given, or else by these rules.
 
-    Effort and speed are the URDF's limits, and speed is at most ``SPEED``. An effort of 1 that all joints share, or that hardly
-    moves its joint, counts as missing.
+    Effort and speed are the URDF's limits, and speed is at most ``SPEED``. An effort that cannot hold the arm's own weight counts
+    as missing; so does one of 1 that all joints share, or that hardly moves its joint or cannot hold the cube.
 
     An arm drive has the natural frequency ``FREQUENCY`` at the greatest inertia that the joint moves. It is stiffer if the
     joint's damping would make it creep, or its friction would stop it more than ``STUCK`` away, and softer if it would reach full
     effort within ``STRETCH``.
 
-    A finger's drive gives full effort at ``SQUEEZE``. On top of the joints' friction it gives at most ``FORCE`` at its end, and
-    at most ``PRESS`` per kilogram of the cube it can lift; less than ``HOLD`` per kilogram gets a warning.
+    A finger's drive gives full effort at ``SQUEEZE``, or at the cube if friction would leave too little there. On top of the
+    joints' friction it gives at most ``FORCE`` at its end, and at most ``PRESS`` per kilogram of the cube it can lift; less than
+    ``HOLD`` per kilogram gets a warning.
 
     Damping adds what the joints lack to critical, also at the package's longest physics step.
     """
     out: Rows = {}
     driven = [b.joint for b in parts.values() if b.joint and not b.joint.mimic]
-    cube = grasp.DENSITY * grasp.edge(hand.gap, hand.pad, hand.closed) ** 3
+    edge = grasp.edge(hand.gap, hand.pad, hand.closed)
+    cube = grasp.DENSITY * edge**3
     force = min(FORCE, PRESS * cube) if cube else FORCE
     unsaid = len(driven) > 1 and all(joint.effort == PLACEHOLDER for joint in driven)
     for joint in driven:
-        load = _load(joint, parts, inertia, rotors)
+        load = _load(joint, parts, moved, rotors)
         finger = joint.name in hand.joints
         lever = 1.0 if joint.type == "prismatic" else levers.get(joint.name, 0.1)
-        row = _finger(joint, load, lever, force, unsaid, notes) if finger else _arm(joint, load, unsaid, notes)
+        weak = joint.effort == PLACEHOLDER and PLACEHOLDER - load.friction < HOLD * cube * lever
+        row = _finger(joint, load, lever, force, unsaid or weak, notes) if finger else _arm(joint, load, unsaid, notes)
+        at_cube = edge / 2 / lever  # [rad, m] a finger's way from the cube to closed
+        if finger and cube and row["stiffness"] * at_cube - load.friction < HOLD * cube * lever < row["effort"] - load.friction:
+            row["stiffness"] = max(row["stiffness"], row["effort"] / at_cube)
         row["damping"] = max(critical_damping(row["stiffness"], load.inertia, DT) - load.damping, 0.0)
         if joint.name in given:
             row |= given[joint.name]
@@ -132,20 +140,25 @@ def rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Load:
-    """Inertia [kg m2, kg], damping [N m s/rad, N s/m] and dry friction [N m, N] of a joint and its followers."""
+    """Inertia [kg m2, kg], weight [N m, N], damping [N m s/rad, N s/m] and dry friction [N m, N] of a joint and its followers."""
 
     inertia: float
+    weight: float
     damping: float
     friction: float
 
 
-def _load(joint: Joint, parts: Mapping[str, Body], inertia: Mapping[str, float], rotors: Mapping[str, float]) -> _Load:
+def _load(
+    joint: Joint, parts: Mapping[str, Body], moved: tuple[Mapping[str, float], Mapping[str, float]], rotors: Mapping[str, float]
+) -> _Load:
+    inertia, weight = moved
     followers = [b.joint for b in parts.values() if b.joint and b.joint.mimic and b.joint.mimic[0] == joint.name]
-    moved = [(joint, 1.0), *((j, j.mimic[1]) for j in followers if j.mimic)]
+    ratios = [(joint, 1.0), *((j, j.mimic[1]) for j in followers if j.mimic)]
     return _Load(
-        inertia=float(sum(ratio**2 * (inertia[j.name] + rotors[j.name]) for j, ratio in moved)),
-        damping=float(sum(ratio**2 * j.damping for j, ratio in moved)),
-        friction=float(sum(abs(ratio) * j.friction for j, ratio in moved)),
+        inertia=float(sum(ratio**2 * (inertia[j.name] + rotors[j.name]) for j, ratio in ratios)),
+        weight=weight[joint.name],
+        damping=float(sum(ratio**2 * j.damping for j, ratio in ratios)),
+        friction=float(sum(abs(ratio) * j.friction for j, ratio in ratios)),
     )
 
 
@@ -153,7 +166,9 @@ def _finger(joint: Joint, load: _Load, lever: float, force: float, unsaid: bool,
     """Computes stiffness, effort and speed of a finger's drive that grips with at most ``force`` [N] at its ``lever`` [m]."""
     wanted = FORCE / 3 * lever + load.friction if unsaid or not joint.effort else joint.effort
     effort = min(wanted, force * lever + load.friction)
-    if joint.effort and joint.effort > effort:
+    if unsaid and joint.effort:
+        notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is a placeholder: now {effort:.3g}")
+    elif joint.effort and joint.effort > effort:
         notes.add("repaired", "joint", joint.name, f"effort {joint.effort:g} is more than fingers take: now {effort:.3g}")
     speed = min(joint.velocity or USUAL, SPEED)
     if (spare := effort - load.friction) > 0 and load.damping * speed > spare:
@@ -167,8 +182,10 @@ def _arm(joint: Joint, load: _Load, unsaid: bool, notes: Notes) -> dict[str, flo
     stiffness = max(FREQUENCY**2 * load.inertia, FREQUENCY / 2 * load.damping, load.friction / STUCK)
     stiffness = min(stiffness, MAX_NUMBER)  # the bound of robot.yaml
     effort = joint.effort and min(joint.effort, MAX_NUMBER)
-    if effort is None or (effort == PLACEHOLDER and (unsaid or effort / load.inertia < 2.0)):
-        kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} is a placeholder: now ")
+    heavy = effort is not None and effort < load.weight
+    if effort is None or heavy or (effort == PLACEHOLDER and (unsaid or effort / load.inertia < 2.0)):
+        what = "is a placeholder" if effort == PLACEHOLDER else f"cannot hold its own links, up to {load.weight:.3g}"
+        kind, why = ("guessed", "") if effort is None else ("repaired", f"effort {effort:g} {what}: now ")
         effort = stiffness * 0.5
         notes.add(kind, "joint", joint.name, f"{why}effort {effort:.3g}, the drive's at half a radian or metre")
     elif effort / load.inertia < 2.0:

@@ -35,7 +35,8 @@ class Roots:
     parent folder, if there is none and the URDF lies in ``urdf``, ``robots`` or ``xacro``); the given ``packages``; and packages
     that the URDF names, if ``NAME/package.xml`` lies beside it or beside a folder above.
 
-    Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name.
+    Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name. A file whose folder
+    is not here is taken from the own folders, at a tail of its path (``elsewhere``).
 
     Args:
         urdf: path of the URDF.
@@ -60,6 +61,7 @@ class Roots:
         elif self.here.name in _PARTS and len(self._above) > 1:
             self._own.append(self.here.parent)
         self.folders = [*self._own, *self.packages.values()]
+        self.elsewhere: dict[str, pathlib.Path] = {}  # files of folders that are not here, and what was taken instead
 
     def find(self, name: str, base: pathlib.Path | None = None) -> pathlib.Path:
         """Finds the file that a URDF calls ``name``.
@@ -75,7 +77,7 @@ class Roots:
         scheme = re.split(r"[/:]+", scheme)[-1]  # file://$(find NAME)/... is file://package://NAME/...
         if "\0" in rest or not rest.strip("/ "):
             raise Missing("names no file")
-        lacking = ""
+        lacking, place = "", None
         if scheme in ("package", "model"):
             package, _, rest = rest.partition("/")
             tries = [(place, rest.lstrip("/")) for place in self._places(package)]
@@ -88,7 +90,8 @@ class Roots:
         else:
             raise Missing(f"{scheme}:// is not fetched")
         refused = None
-        for place, rest in dict.fromkeys(tries):
+        tails = self._tails(rest) if place is None else ()  # a package that is here lacks the file
+        for place, rest in dict.fromkeys([*tries, *tails]):
             for text in dict.fromkeys((rest, urllib.parse.unquote(rest))):  # as it is written, then with %20 as a space
                 try:
                     path = self._inside(place / text, name)
@@ -96,6 +99,8 @@ class Roots:
                     refused = error
                     continue
                 if path is not None and os.path.isdir(place):
+                    if (place, rest) not in tries:
+                        self.elsewhere[name] = path
                     return path
         raise refused or Absent(f"there is no such file{lacking}")
 
@@ -132,6 +137,24 @@ class Roots:
             if part not in _PARTS:  # a folder below share/ is a package; elsewhere a name like meshes proves nothing
                 for place in self._places(part, plain=parts[i - 1 : i] == ["share"]):
                     yield place, "/".join(parts[i + 1 :])
+
+    def _tails(self, path: str) -> Iterator[tuple[pathlib.Path, str]]:
+        """Yields where a file of an unknown folder may lie: at a tail of its path in the own folders, the longest first.
+
+        A tail has a folder, as a mere name like ``base.stl`` proves nothing.
+        """
+        parts = [part for part in path.split("/") if part][-_DEPTH:]
+        for i in range(len(parts) - 1 if ".." not in parts else 0):
+            for own in self._own:
+                yield own, "/".join(parts[i:])
+
+    def told(self) -> str:
+        """Says which files were taken from elsewhere; empty if none were."""
+        if not self.elsewhere:
+            return ""
+        name, path = next(iter(self.elsewhere.items()))
+        more = f" and {len(self.elsewhere) - 1} more files" if len(self.elsewhere) > 1 else ""
+        return f"{name!r}{more}: not where the name says, so taken from {path.parent} (--package names another folder)"
 
     @functools.cached_property
     def _named(self) -> list[tuple[str, pathlib.Path]]:

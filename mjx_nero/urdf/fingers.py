@@ -15,7 +15,7 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.swing import Meeting, Swing, endless, limits, surface
 from mjx_nero.urdf.tree import Body, Pose, Tree, Vec, below, bodies, poses
 
-_NAMES = re.compile(r"grip|finger|jaw|hand|knuckle|claw", re.IGNORECASE)
+_NAMES = re.compile(r"grip|grasp|fi?nge?r|jaw|hand|knuckle|claw|clamp|pinch|tong", re.IGNORECASE)
 MOST_JOINTS = 4  # greatest number of driven joints of a finger
 JAW = 2.8  # [rad] greatest opening of a single jaw; a joint that turns further is a wrist
 STILL = 2e-3  # [m] a joint grips if it changes a distance between fingers by more

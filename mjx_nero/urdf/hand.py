@@ -11,6 +11,7 @@ from mjx_nero import config
 from mjx_nero.sim import grasp
 from mjx_nero.types import UserError
 from mjx_nero.urdf import fingers, pads, primitives
+from mjx_nero.urdf.chain import SENSORS
 from mjx_nero.urdf.fingers import Grip, Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
@@ -25,7 +26,6 @@ _TOOLS = (  # tool names of an arm without gripper, the best first
     re.compile(r"(^|[_/])ee(_|$)|(^|[_/])eef(_|$)|end_?effector|grasp", re.IGNORECASE),
     re.compile(r"flange", re.IGNORECASE),
 )
-_SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realsense|vision|_ft(_|$)", re.IGNORECASE)
 NEAR = 0.06  # [m] a named frame this near to where the fingers meet is their grasp point; the flange's is farther away
 TOOL_AXIS = 50.0  # [degrees] the working axis of a tool's frame is the one within this of where the fingers point
 ON_AXIS = 5e-3  # [m] the last joint turns a tool this near to its axis, and carries others around
@@ -358,7 +358,7 @@ def _tool(parts: dict[str, Body]) -> str:
     Without a telling name, it is a link on the last joint's axis, where flanges are.
     """
     last = parts[max(parts, key=lambda n: depth(parts, n))]
-    links = [n for n in last.links if not _SENSORS.search(n)] or list(last.links)
+    links = [n for n in last.links if not SENSORS.search(n)] or list(last.links)
     for pattern in _TOOLS:
         found = [n for n in links if pattern.search(n)]
         if found:
@@ -375,7 +375,7 @@ def _named(parts: dict[str, Body], link: str, at: Vec) -> str | None:
     away = {
         n: float(np.linalg.norm(frame[:3, 3] - centre))
         for n, frame in body.links.items()
-        if _TIPS.search(n) and not _SENSORS.search(n)
+        if _TIPS.search(n) and not SENSORS.search(n)
     }
     nearest = min(away, key=away.__getitem__, default=None)
     return nearest if nearest is not None and away[nearest] < NEAR else None

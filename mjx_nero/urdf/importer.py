@@ -77,6 +77,8 @@ def import_urdf(
     read_mass = sum(link.mass.mass for link in tree.links.values())
     tree = chain_of.selected(tree, chain, fix or {}, notes)
     looks = Looks(tree, bodies(tree), meshes.Meshes(roots), notes)
+    if roots.elsewhere:
+        notes.add("repaired", "robot", tree.name, roots.told())
     check_lengths(tree, looks.spans, units)
     whole = filled(tree, looks, notes)
     tree, grips, fork = fingers.choose(whole, looks.of, gripper, notes)
@@ -173,7 +175,7 @@ def _drives(made: _Model, gains: pathlib.Path | None, notes: Notes) -> tuple[dic
     bare = made.xml(dict.fromkeys(made.tree.links, []), dict.fromkeys(made.joints, 0.0))
     moved = drives.carried(_compiled(bare))
     levers = _levers(made.parts, made.hand)
-    rotors = {n: drives.armature(j, moved[n], levers.get(n)) for n, j in made.joints.items()}
+    rotors = {n: drives.armature(j, moved[0][n], levers.get(n)) for n, j in made.joints.items()}
     for name, value in rotors.items():
         notes.add("guessed", "joint", name, f"rotor inertia (armature) {value:.3g}: URDFs have none")
     driven = {n: j for n, j in made.joints.items() if not j.mimic}

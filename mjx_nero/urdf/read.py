@@ -76,7 +76,8 @@ def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
     if not links:
         raise UserError("the URDF has no links")
     joints = [_joint(j, rename, notes) for j in robot.joints]
-    order, root = _ordered(links, joints)
+    left_out = "".join(f" ({note.text})" for note in notes if note.text.startswith("left out: "))  # it may have had a link
+    order, root = _ordered(links, joints, left_out)
     colours = {m.name: _rgba(m) for m in robot.materials}
     read = {rename["link"][link.name]: link for link in robot.links}
     parsed = {name: _link(name, read[name], colours, notes) for name in [root, *(j.child for j in order)]}
@@ -117,13 +118,14 @@ def _free_names(kind: str, names: list[str], notes: Notes) -> dict[str, str]:
     return out
 
 
-def _ordered(links: list[str], joints: list[Joint]) -> tuple[list[Joint], str]:
+def _ordered(links: list[str], joints: list[Joint], left_out: str) -> tuple[list[Joint], str]:
     """Orders joints, parents first, and finds the root link."""
     parent_of: dict[str, Joint] = {}
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in links:
-                raise UserError(f"joint {joint.name!r} names link {link!r}, which is not there{config.hint(link, links)}")
+                lack = f"joint {joint.name!r} names link {link!r}, which is not there{config.hint(link, links)}"
+                raise UserError(lack + left_out)
         if joint.child in parent_of:
             raise UserError(
                 f"link {joint.child!r} hangs on two joints, {parent_of[joint.child].name!r} and {joint.name!r}: "

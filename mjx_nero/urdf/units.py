@@ -10,7 +10,7 @@ import yourdfpy
 from mjx_nero.config.bounds import Positive
 from mjx_nero.types import UserError
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Tree
+from mjx_nero.urdf.tree import Joint, Tree
 
 MAX_TURNS = 4  # a hinge's limits beyond this look like degrees
 MAX_SPAN = 10.0  # [m] a mesh with its link's origin that spans more than this, and ...
@@ -100,6 +100,11 @@ def check_lengths(tree: Tree, spans: Spans, units: Units) -> None:
     Raises:
         UserError: its arm is longer than ``MOST`` or shorter than ``LEAST``, or its largest mesh looks to be in millimetres.
     """
+    far = [j for j in tree.joints.values() if j.type == "prismatic" and _slide(j) > MOST]
+    if far and units.scale is None and _reach(tree) - sum(map(_slide, far)) <= MOST:
+        joint = far[0]
+        text = f"joint {joint.name!r} slides by up to {_slide(joint):.3g} m, as a base that drives does: hold it still with"
+        raise UserError(f"{tree.name}: {text} --fix {joint.name}=0, or correct its limits, which are in metres")
     (file, scale), span = max(spans.items(), key=lambda item: item[1], default=(("", ()), 0.0))
     reach = _reach(tree)
     if units.scale is None and not _possible(tree, reach, span):
@@ -128,6 +133,9 @@ def _reach(tree: Tree) -> float:
     """Greatest distance along the joints from the base to a link, with slides extended [m]."""
     far = {tree.root: 0.0}
     for joint in tree.joints.values():
-        slide = max(abs(joint.lower), abs(joint.upper)) if joint.type == "prismatic" else 0.0
-        far[joint.child] = far[joint.parent] + float(np.linalg.norm(joint.origin[:3, 3])) + slide
+        far[joint.child] = far[joint.parent] + float(np.linalg.norm(joint.origin[:3, 3])) + _slide(joint)
     return max(far.values())
+
+
+def _slide(joint: Joint) -> float:
+    return max(abs(joint.lower), abs(joint.upper)) if joint.type == "prismatic" else 0.0

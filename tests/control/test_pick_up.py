@@ -82,6 +82,14 @@ def test_how_far_beyond_the_grasp_point_the_pads_are_by_hand():
     assert grasp.beyond(COBOTTA_PRO_900, 0.06) == 0
 
 
+def test_pads_are_where_they_are_though_the_grasp_points_frame_is_farther_back():
+    """An imported hand's frame may lie centimetres behind its pads: ``grip`` says so, and nothing is beyond that."""
+    half, back = (dataclasses.replace(NERO, grip=(0.0, 0.0, way)) for way in (0.0038, 0.0058))
+    assert grasp.beyond(half, 0.04) == pytest.approx(0.002) and grasp.beyond(back, 0.04) == 0
+    at = PickUp(back, 0.02, dataclasses.replace(CFG, beyond=grasp.beyond(back, 0.04)))._pick(seen(0), jnp.array(0.3))
+    np.testing.assert_allclose(at, [0.5, 0.1, 0.05 + 0.0058], atol=1e-6)
+
+
 def test_a_jaw_that_turns_goes_beside_a_small_object_as_it_goes_beside_the_cube():
     """The fixed face stays where it is, so the pads' middle moves by half of what the gap does, and a little as the jaw turns."""
     cube = grasp.cube_for(SO_ARM100).size[0] + 2 * grasp.BESIDE

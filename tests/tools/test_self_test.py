@@ -13,6 +13,7 @@ from mjx_nero.control.pick_place import PHASES
 from mjx_nero.errors import UserError
 from mjx_nero.sim import robot_file, touch
 from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.tools import motion
 from mjx_nero.tools.self_test import checks, result
 
 LIST = (40, 30, 10, 20, 30, 80, 30, 20, 30, 10)  # control steps of the phases
@@ -84,6 +85,15 @@ def test_gripper_that_stops(robot):
     assert checks._gripper(robot) == ""
     with pytest.raises(UserError, match="dt"):
         checks._gripper(dataclasses.replace(robot, max_step=1e-12))
+
+
+def test_less_than_half_a_millimetre_of_a_fingers_way_is_no_fault(robot, monkeypatch):
+    def said(end):
+        moves = [motion.Move("left", 0.01, 0.0, end, time=None, fastest=0.1, saturation=0.0)]
+        monkeypatch.setattr(motion, "gripper_moves", lambda robot, sim: moves)
+        return checks._gripper(robot)
+
+    assert said(0.0004) == "" and said(0.0006).startswith("the gripper stops at 0.0006 of 0 ")
 
 
 def test_home_that_touches(robot):

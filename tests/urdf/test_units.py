@@ -74,6 +74,15 @@ def test_a_crane_is_read_as_it_is_by_scale_1(tmp_path):
     assert model(tmp_path, text, units=Units(scale=1.0)).body("link3").pos[2] == pytest.approx(7.0)
 
 
+def test_a_base_that_drives_is_named(tmp_path):
+    """Its slide has placeholders for limits, which are no lengths in millimetres."""
+    foot = make.joint("drive", "floor", "base", "prismatic", limit='lower="-99999" upper="99999" effort="9" velocity="1"')
+    text = arm(tmp_path).replace("</robot>", make.link("floor", make.inertial()) + foot + "</robot>")
+    with pytest.raises(UserError, match="'drive' slides by up to 1e.05 m.*--fix drive=0"):
+        model(tmp_path, text)
+    import_urdf(make.write(tmp_path / "in", text), tmp_path / "out", fix={"drive": 0.0})
+
+
 def test_meshes_alone(tmp_path):
     with pytest.raises(UserError, match="--mesh-scale 0.001"):
         model(tmp_path, arm(tmp_path, 1000.0))

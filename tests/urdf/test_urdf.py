@@ -428,6 +428,21 @@ def test_an_effort_of_one_is_a_placeholder(tmp_path):
     assert light.robot.arm.effort == (1.0,)
 
 
+def test_an_effort_that_cannot_hold_the_arm_is_none(tmp_path):
+    """2 kg half a metre away: 9.81 N m when it lies; 9 N m cannot be its motor's, 11 N m may be."""
+
+    def drive(name, effort):
+        limit = f'lower="-3" upper="3" effort="{effort}" velocity="1"'
+        link = make.link("l", '<inertial><origin xyz="0 0 0.5"/><mass value="2"/></inertial>')
+        text = make.robot(make.link("base", make.inertial()), link, make.joint("j", "base", "l", axis="0 1 0", limit=limit))
+        report = imported(tmp_path / name, text)[1]
+        return report.robot.arm, [n for n in report.notes.of("joint", "j") if "cannot hold its own links, up to 9.8" in n]
+
+    (weak, told), (strong, silent) = drive("weak", 9), drive("strong", 11)
+    assert told and weak.effort[0] == pytest.approx(weak.stiffness[0] / 2, rel=1e-3) and weak.effort[0] > 50
+    assert not silent and strong.effort == (11.0,)
+
+
 def test_an_inertia_of_one_is_a_placeholder(tmp_path):
     """1 kg m2 for a kilogram within a few centimetres, as exporters write it; what a motor's rotor adds to a link stays."""
 
@@ -823,8 +838,8 @@ def test_fingers_too_weak_to_hold_are_a_warning(tmp_path, type, axis, effort, gr
 def test_fingers_overcome_their_joints_own_friction(tmp_path):
     """Dry friction of both fingers comes on top of what they grip with; damping says how fast they can be."""
 
-    def grips(name, losses, effort=20.0):
-        row = {"type": "prismatic", "xyz": "0 0 0.2", "limit": f'lower="0" upper="0.04" effort="{effort}" velocity="1"'}
+    def grips(name, losses, effort=20.0, upper=0.04):
+        row = {"type": "prismatic", "xyz": "0 0 0.2", "limit": f'lower="0" upper="{upper}" effort="{effort}" velocity="1"'}
         inner = f"<dynamics {losses}/>"
         joints = (
             make.joint("f1", "l3", "left", axis="0 1 0", inner=inner, **row),
@@ -841,6 +856,12 @@ def test_fingers_overcome_their_joints_own_friction(tmp_path):
     assert rough.effort[0] == pytest.approx(free.effort[0] + 8, rel=1e-4) and not weak(report)
     report, _ = grips("stuck", 'friction="12" damping="0"')
     assert len(weak(report)) == 1 and "grips with 0 N" in weak(report)[0]
+    report, unsaid = grips("unsaid", 'friction="1" damping="0"', effort=1.0)  # cannot even move them: a placeholder
+    assert unsaid.effort[0] == pytest.approx(free.effort[0] + 2, rel=1e-4) and not weak(report)
+    assert any("effort 1 is a placeholder" in note for note in report.notes.of("joint", "f1"))
+    report, small = grips("small", 'friction="1" damping="0"', upper=0.012)  # 2 N of friction are most of a small hand's effort
+    edge = grasp.edge(report.robot.opening, report.robot.pad, report.robot.closed)
+    assert small.stiffness[0] * edge / 2 == pytest.approx(small.effort[0], rel=1e-3) and edge < 0.02
     report, slow = grips("slow", 'friction="0" damping="100"')
     assert slow.speed[0] == pytest.approx(free.effort[0] / 200, rel=1e-4) and slow.speed[0] < free.speed[0]
     assert any("its own damping" in note for note in report.notes.of("joint", "f1"))

@@ -444,8 +444,13 @@ def test_packages_that_are_none(tmp_path):
         ("pkg/urdf", ["pkg/s/m.stl"], "C:\\no\\pkg\\s\\m.stl", "pkg/s/m.stl"),
         ("a/b", ["pkg/m.stl", "pkg/package.xml:pkg"], "/home/no/pkg/m.stl", "pkg/m.stl"),
         ("other", ["other/pkg/m.stl"], "file:///home/no/share/pkg/m.stl", "other/pkg/m.stl"),
-        ("other", ["other/meshes/m.stl", "other/m.stl"], "/home/no/pkg/meshes/m.stl", UserError),
-        ("other/urdf", ["other/urdf/m.stl"], "/home/no/pkg/urdf/m.stl", UserError),
+        ("other", ["other/m.stl", "other/pkg/n.stl"], "/home/no/pkg/m.stl", UserError),
+        # in the own folders, at the longest tail of the path with a folder
+        ("other", ["other/meshes/m.stl", "other/m.stl"], "/home/no/pkg/meshes/m.stl", "other/meshes/m.stl"),
+        ("other/urdf", ["other/a/b/m.stl", "other/b/m.stl"], "package://pkg/c/a/b/m.stl", "other/a/b/m.stl"),
+        ("other/urdf", ["other/meshes/m.stl"], "meshes/m.stl", "other/meshes/m.stl"),
+        ("other", ["other/meshes/m.stl"], "../meshes/m.stl", UserError),
+        ("other", ["secret/b/m.stl", "other/b>secret/b"], "package://pkg/b/m.stl", UserError),
         ("pkg", ["secret/m.stl", "pkg/n.stl"], "/home/no/pkg/../secret/m.stl", UserError),
         ("pkg", ["secret/m.stl", "pkg/m.stl>secret/m.stl"], "/home/no/pkg/m.stl", UserError),
         ("other", ["secret/m.stl", "other/pkg>secret"], "package://pkg/m.stl", UserError),
@@ -471,6 +476,15 @@ def test_what_is_a_package(tmp_path, urdf, there, name, found):
             roots.find(name)
     else:
         assert roots.find(name) == tmp_path / found
+
+
+def test_meshes_taken_from_elsewhere_are_said(tmp_path):
+    make.box(tmp_path / "arm" / "meshes" / "m.stl", (-0.02, -0.02, 0), (0.02, 0.02, 0.1))
+    text = make.arm(3).replace("</robot>", make.link("tip", make.mesh("package://gone/x/meshes/m.stl")) + "</robot>")
+    text = text.replace("</robot>", make.joint("t", "l3", "tip", "fixed") + "</robot>")
+    report = import_urdf(make.write(tmp_path / "arm" / "urdf", text), tmp_path / "out")
+    assert any("meshes/m.stl': not where the name says, so taken from" in n.text for n in report.notes if n.kind == "repaired")
+    assert not any("mesh" in text for text in report.warnings)
 
 
 @pytest.mark.parametrize("package", ["", ".", "..", "a" * 5000])

@@ -112,11 +112,13 @@ def test_last_link_is_no_camera(tmp_path):
     assert model.site("ee").bodyid[0] == model.body("link6").id and not model.site("ee").pos.any()
 
 
-@pytest.mark.parametrize(("end", "gripper"), [("1.2", ("roll",)), ("3.4", ())])
-def test_a_hand_that_turns_at_the_wrist_is_no_jaw(tmp_path, end, gripper):
+@pytest.mark.parametrize(
+    ("name", "end", "gripper"), [("hand_flange", "1.2", ("roll",)), ("hand_flange", "3.4", ()), ("link_fngr", "1.2", ("roll",))]
+)
+def test_a_hand_that_turns_at_the_wrist_is_no_jaw(tmp_path, name, end, gripper):
     limit = f'lower="-{end}" upper="{end}" effort="5" velocity="1"'
-    hand = make.link("hand_flange", make.inertial(0.1), make.shape('<box size="0.05 0.05 0.02"/>'))
-    _, report = imported(tmp_path, base(), *six(), hand, make.joint("roll", "link6", "hand_flange", xyz="0 0 0.08", limit=limit))
+    hand = make.link(name, make.inertial(0.1), make.shape('<box size="0.05 0.05 0.02"/>'))
+    _, report = imported(tmp_path, base(), *six(), hand, make.joint("roll", "link6", name, xyz="0 0 0.08", limit=limit))
     assert report.robot.gripper.joints == gripper and len(report.robot.arm.joints) == 7 - len(gripper)
 
 
@@ -204,6 +206,23 @@ def test_two_arms_are_a_choice(tmp_path):
     model, report = imported(tmp_path, *parts, chain="base:l_link6")
     assert report.robot.arm.joints == tuple(f"l_a{i}" for i in range(1, 7)) and report.robot.gripper.joints == ("l_left",)
     assert model.njnt == 8 and report.mass == pytest.approx(report.mass_read)  # the rest is there, and still
+
+
+def test_legs_and_casters_are_no_choice_before_an_arm(tmp_path):
+    """A dog with four legs and an arm, whose last frame is a camera's; two casters turn about three endless axes each."""
+    turn = {"type": "continuous", "limit": 'effort="5" velocity="2"'}
+    parts = [base()]
+    for tag in ("a_", "b_", "c_", "d_"):
+        links = [make.link(f"{tag}{i}", make.inertial()) for i in (1, 2, 3)]
+        chain = [("base", f"{tag}1"), (f"{tag}1", f"{tag}2"), (f"{tag}2", f"{tag}3")]
+        parts += [*links, *(make.joint(f"{tag}j{child[-1]}", parent, child, xyz="0 0 -0.1") for parent, child in chain)]
+    for tag in ("e_", "f_"):
+        links = [make.link(f"{tag}{i}", make.inertial()) for i in (1, 2, 3)]
+        chain = [("base", f"{tag}1"), (f"{tag}1", f"{tag}2"), (f"{tag}2", f"{tag}3")]
+        parts += [*links, *(make.joint(f"{tag}j{child[-1]}", parent, child, **turn) for parent, child in chain)]
+    eye = make.link("hand_camera_frame"), make.joint("eye", "link6", "hand_camera_frame", "fixed", xyz="0 0.05 0")
+    with pytest.raises(UserError, match="it has 5 arms, and 6 joints beside them .*Choose --chain base:link6, --chain base:a_3"):
+        imported(tmp_path, *parts, *six(), *eye)
 
 
 def test_fix_holds_joints_where_told(tmp_path):

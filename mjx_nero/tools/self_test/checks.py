@@ -34,6 +34,7 @@ DEEP = 0.005  # [m] overlap that is ignored, because shapes may be wider than th
 FULL = 0.5  # share of a movement at the effort limit from which on that limit is why it ends early
 SLOW = 0.5  # [s] a drive that lags more than this does not arrive in time
 AWAY = 0.01  # [m] a hand farther from its place at the end of a phase has not arrived; a cube that moved more was pushed
+LEFT = 5e-4  # [rad, m] what dry friction may leave of the fingers' way: 1% of a small hand's is less
 EMPTY = 0.02  # share of the fingers' travel: fingers closer to closed hold nothing
 REACHED = 0.01  # [m]
 SETTLED, LONGEST = 3.0, 30.0  # [s] waiting time after the set-point has arrived; maximum time of a try
@@ -70,7 +71,7 @@ def _gripper(robot: RobotCfg) -> str:
     sim = SimCfg().finer(robot.max_step)
     bounds.check(sim)
     for move in motion.gripper_moves(robot, sim):
-        if move.time is not None:
+        if move.time is not None or abs(move.end - move.target) < LEFT:
             continue
         why = "look at the range, the speed and the gains of its joint"
         if move.saturation > FULL:

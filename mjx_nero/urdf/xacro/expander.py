@@ -20,16 +20,20 @@ URIS = ("http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro", "http://wi
 _MAX_INCLUDES = 20  # nested files
 _MAX_DEPTH = 100  # nested elements, macros and files, all together
 _YAML_BYTES = 20  # a byte of YAML costs as much as this many of XML
-# Files about simulators or a real robot's drives, which an import does not need.
-_EXTRAS = re.compile(r"gazebo|ign(ition)?_|isaac|ros_?2?_?control|transmission|simulat|hardware", re.IGNORECASE)
+# Files about simulators, a real robot's drives or its sensors, which an import does not need.
+_EXTRAS = re.compile(
+    r"gazebo|ign(ition)?_|isaac|ros_?2?_?control|transmission|simulat|hardware"
+    r"|camera|sensor|lidar|laser|imu\b|realsense|kinect|d4\d5",
+    re.IGNORECASE,
+)
+_BARE = {"if", "include", "insert_block", "macro", "property", "unless"}  # had no prefix in xacro's first version
 _UNUSED = ("gazebo", "ros2_control", "transmission")  # elements about the same
 _XML_NAME = re.compile(r"[A-Za-z_][\w.-]*")
 
 
 def is_xacro(root: etree._Element) -> bool:
     """True if the document needs xacro."""
-    elements = (e for e in root.iter() if isinstance(e.tag, str))
-    return any(_own(e) or e.prefix == "xacro" or e.tag.startswith("xacro:") for e in elements) or _declared(root)
+    return any(_unprefixed(str(e.tag), e) for e in root.iter() if isinstance(e.tag, str)) or _declared(root)
 
 
 def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: Mapping[str, str], notes: Notes) -> etree._Element:
@@ -63,9 +67,17 @@ def expand(root: etree._Element, path: pathlib.Path, roots: files.Roots, args: M
 
 
 def _own(element: etree._Element) -> str:
-    """Name of a xacro element; empty for others."""
-    uri, brace, name = str(element.tag).removeprefix("{").partition("}")
-    return name if brace and uri in URIS else ""
+    """Name of a xacro element, which old files write without the prefix; empty for others."""
+    tag = str(element.tag)
+    return tag if tag in _BARE else _unprefixed(tag, element)
+
+
+def _unprefixed(name: str, element: etree._Element) -> str:
+    """A name of xacro's without its prefix; empty for others. What address ``xacro:`` stands for does not matter, as in xacro."""
+    uri, brace, plain = name.removeprefix("{").partition("}")
+    if brace:
+        return plain if uri in URIS or uri == element.nsmap.get("xacro") else ""
+    return name.removeprefix("xacro:") if name.startswith("xacro:") else ""
 
 
 def _declared(root: etree._Element) -> bool:
@@ -80,6 +92,7 @@ class _Expander(Surroundings):
         super().__init__(path, args, own)
         self.left_out: set[str] = set()
         self.macros: dict[str, None] = {}  # names, in order
+        self._bare: set[str] = set()  # macros that old files call without the prefix, as they define them
         self._roots = roots
         self._depth = 0
         self._documents: dict[pathlib.Path, etree._Element] = {}
@@ -121,8 +134,8 @@ class _Expander(Surroundings):
             name, tag = _own(element), str(element.tag)
             if name:
                 self._rules.get(name, self._call)(element, target, scope)
-            elif element.prefix == "xacro" or tag.startswith("xacro:"):
-                raise Fault(f'the prefix xacro stands for something else here: declare xmlns:xacro="{URIS[0]}"')
+            elif tag in self._bare:
+                self._call(element, target, scope, tag)
             elif ":" in tag and not tag.startswith("{"):
                 self.left_out.add(f"<{tag[:60]}> (its prefix is not declared)")
             else:
@@ -152,7 +165,7 @@ class _Expander(Surroundings):
 
     def _attributes(self, element: etree._Element, out: etree._Element, scope: Scope) -> None:
         for key, text in element.attrib.items():
-            if not key.startswith(tuple(f"{{{uri}}}" for uri in URIS)) and (key.startswith("{") or ":" not in key):
+            if not _unprefixed(key, element) and (key.startswith("{") or ":" not in key):
                 self._set(out, key, scope.string(text))
 
     def _set(self, out: etree._Element, key: str, value: str) -> None:
@@ -198,7 +211,7 @@ class _Expander(Surroundings):
         self._set(target, _plain_name(name), scope.string(_needed(element, "value")))
 
     def _named_element(self, element: etree._Element, target: etree._Element, scope: Scope) -> None:
-        name = next((text for key, text in element.attrib.items() if key in (f"{{{uri}}}name" for uri in URIS)), None)
+        name = next((text for key, text in element.attrib.items() if _unprefixed(key, element) == "name"), None)
         if name is None:
             raise Fault("has no xacro:name")
         self._copy(element, _plain_name(scope.string(name)), target, scope)
@@ -302,6 +315,8 @@ class _Expander(Surroundings):
             raise Fault(f"{name[:60]!r} cannot be a macro's name")
         scope.macros[name] = Macro(name, parameters(element.get("params", "")), element)
         self.macros[name] = None
+        if element.tag == "macro":
+            self._bare.add(name)
 
     def _dynamic_call(self, element: etree._Element, target: etree._Element, scope: Scope) -> None:
         self._call(element, target, scope, scope.string(_needed(element, "macro")))

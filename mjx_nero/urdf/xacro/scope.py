@@ -142,10 +142,10 @@ class Scope(Namespace):
                 return self._arg(name)
             case ["find", package]:
                 return f"package://{package}"
-            case ["optenv", _, *default]:
-                return " ".join(default)  # a file need not know what is set on its reader's machine
+            case ["optenv", name, *default]:
+                return self._variable(name, " ".join(default))
             case ["env", name]:
-                raise Fault(f"$(env {name}): variables of this machine are not given to files: write its value instead")
+                return self._variable(name)
             case ["dirname"]:
                 return str(self.around.folder)
             case ["cwd"]:
@@ -162,13 +162,21 @@ class Scope(Namespace):
             raise Fault(f"argument {name!r} has no value: pass --arg {name}:=VALUE")
         return self.around.args[name]
 
+    def _variable(self, name: str, default: str | None = None) -> str:
+        """An environment variable: from --arg, as a file need not know what is set on its reader's machine."""
+        self.around.asked.add(name)
+        value = self.around.args.get(name, default)
+        if value is None:
+            raise Fault(f"$(env {name}): variables of this machine are not given to files: pass --arg {name}:=VALUE")
+        return value
+
     def _for_eval(self, name: str) -> Any:
         """Names in ``$(eval ...)``: arguments, and few functions."""
         own: dict[str, Callable[..., Any]] = {
             "arg": lambda argument: literal(self._arg(str(argument))),
             "dirname": lambda: str(self.around.folder),
             "find": lambda package: f"package://{package}",
-            "optenv": lambda variable, default="": default,
+            "optenv": lambda variable, default="": self._variable(str(variable), str(default)),
         }
         if name in own:
             return Function(own[name])
