@@ -7,7 +7,7 @@ import pytest
 
 from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.config import bounds
-from mjx_nero.envs.task import CALM, SHOWN, CurriculumCfg, EnvCfg
+from mjx_nero.envs.task import CALM, PRECISE, SHOWN, CurriculumCfg, EnvCfg
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import PRESETS
 from mjx_nero.mdp import actions
@@ -397,7 +397,7 @@ def test_runner_settings_are_the_recipe():
 
 
 def test_one_learner_is_for_all_tasks_and_arms():
-    """But for how long it takes, velocities, a bar held still, what an expert shows, and presets of recipes."""
+    """But for how long it takes, velocities, what bears no noise, what an expert shows, and presets of recipes."""
     for env in registry.list_envs():
         cfg = registry.env_cfg(env, registry.list_presets(env)[0], registry.robot_of(env) or "nero")
         moves = any(bounds.unwrapped(term.func) is actions.JointVelocity for term in cfg.actions.values())
@@ -405,8 +405,9 @@ def test_one_learner_is_for_all_tasks_and_arms():
         taught |= env.endswith(("insert_peg", "hang_ring", "reorient", "handover"))
         shown = taught and not env.endswith("pick_place")
         calm = SHOWN if shown else CALM if moves else {}
-        still = {"min_std": 0.05} if env.endswith("handover") else {}  # the bar is to rest at the goal
-        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == {**calm, **still}, env
+        if env.endswith(("hang_ring", "handover")):
+            calm = PRECISE
+        assert {k: v for k, v in cfg.training.items() if k != "num_timesteps"} == calm, env
     assert registry.env_cfg("nero_reach", "isaac").training["num_epochs"] == 8
 
 

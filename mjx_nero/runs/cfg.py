@@ -72,18 +72,20 @@ def resolve(
     robot: str | None,
     env_fields: Mapping[str, Any],
     learner_fields: Mapping[str, Any],
-    learner: str = "ppo",
+    learner: str = "",
     **rest: Any,
 ) -> RunCfg:
     """Builds a run's config from names and dotted fields.
 
     Args:
         robot: robot instead of the environment's own, by name or folder.
+        learner: name of the learner; empty: the task's own.
 
     Raises:
         UserError: a name or field is unknown, or a value has the wrong type.
     """
     cfg = things.overridden(registry.env_cfg(env, preset, robot), env_fields)
+    learner = learner or cfg.learner
     hyperparameters = config.override(learner_cfg(cfg, preset, learner), learner_fields)
     asked = Asked(robot, dict(env_fields), dict(learner_fields))
     return RunCfg(env, preset, cfg, hyperparameters, learner, asked, **rest)

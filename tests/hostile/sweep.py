@@ -29,6 +29,9 @@ WORDS = {  # reader -> what to put in place of its numbers
 GOOD: dict[str, Callable[[], bytes]] = {  # where the fuzzer's last file has hardly a number, or is none that is taken
     "gains": lambda: b"joint1: {stiffness: 10.0, damping: 1.0, effort: 5.0, speed: 1.0}\nfinger: {stiffness: 10, damping: 1}\n",
     "yaml": lambda: b"a: 1\nb: [2.5, -3e-2, {c: 0.1}]\nd: 7\n",
+    "public_robots": lambda: (
+        b'repositories: {a/b1: "12"}\nrobots: {arm 3: {repository: a/b1, file: 4/arm5.urdf, packages: [c6]}}\n'
+    ),
     "policy": lambda: (fuzz.ASSETS / "policies" / "nero_reach.safetensors").read_bytes(),
 }
 

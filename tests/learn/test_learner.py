@@ -127,7 +127,7 @@ def test_names_of_learners(search, call):
     with pytest.raises(UserError, match="there is already a learner 'search': choose another name"):
         learner.KINDS.add("search", learner.find("search"))
     with pytest.raises(
-        UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, clone, distill, search"
+        UserError, match=r"unknown learner 'pop' \(did you mean 'ppo'\?\): choose one of ppo, clone, distill, pixels, search"
     ):
         learner.find("pop")
     code, _, err = call("train", "--learner", "search", "--ppo.num_epochs", 3)

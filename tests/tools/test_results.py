@@ -5,6 +5,7 @@ import pathlib
 
 import pytest
 
+from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import results
 from mjx_nero.tools.benchmark import learning
@@ -106,7 +107,7 @@ def test_seeds_are_kept_one_by_one(call, tmp_path, monkeypatch):
     [
         (("--json", "r.json", "--envs", "nope"), "unknown env nope: choose from"),
         (("--json", "r.json", "--what", "x"), "unknown what x: choose from learning, policies"),
-        (("--json", "r.json", "--envs", "nero_stack", "--preset", "rgb"), "none of these environments has the preset 'rgb'"),
+        (("--json", "r.json", "--envs", "nero_reach", "--preset", "rgb"), "none of these environments has the preset 'rgb'"),
         (("--json", "bad.json"), "bad.json holds no results: name another file"),
         ((), "--json"),
     ],
@@ -115,3 +116,8 @@ def test_mistakes(call, tmp_path, flags, said):
     (tmp_path / "bad.json").write_text('{"a": 3}')
     code, _, err = call("mjx_nero", "results", *flags)
     assert code == 2 and said in err and not (tmp_path / "r.json").exists()
+
+
+def test_what_sees_is_taught_by_its_own_learner():
+    assert run_cfg.resolve("nero_lift", "rgb", None, {}, {}).learner == "distill"
+    assert run_cfg.resolve("nero_lift", "default", None, {}, {}).learner == "ppo"
