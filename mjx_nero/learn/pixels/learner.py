@@ -72,8 +72,7 @@ class Learner(ppo.Learner):
             return {"params": {_LOG_STD: log_std}, "student": init_variables(self.student, self.sizes, key)}
 
         def act(statistics: Any, policy: dict[str, Any], obs: Observation) -> tuple[jax.Array, jax.Array]:
-            mean, _ = apply(self.student, (statistics, policy["student"]), obs)
-            return mean, jnp.broadcast_to(jnp.exp(policy["params"][_LOG_STD]), mean.shape)
+            return _with_std(policy, apply(self.student, (statistics, policy["student"]), obs)[0])
 
         critic = feed_forward.make_value_network(
             {TOLD: self.sizes[TOLD]},
@@ -92,8 +91,8 @@ class Learner(ppo.Learner):
         self, params: losses.PPONetworkParams, normalizer: Any, batch: ppo.Batch, key: Key
     ) -> tuple[Float[Array, ""], ppo.Metrics]:
         """Adds ``truth_cost`` times the error of the predicted positions to PPO's loss."""
-        total, metrics = super().loss(params, normalizer, batch, key)
-        _, where = apply(self.student, (normalizer, params.policy["student"]), batch.obs)
+        mean, where = apply(self.student, (normalizer, params.policy["student"]), batch.obs)
+        total, metrics = self.loss_of(_with_std(params.policy, mean), params, normalizer, batch, key)
         truth_loss, seen_error = away(where, batch.obs[TRUTH], normalizer)
         return total + self.cfg.truth_cost * truth_loss, {**metrics, "truth_loss": truth_loss, "seen_error": seen_error}
 
@@ -145,6 +144,11 @@ class Learner(ppo.Learner):
         return 2.0 * (device_memory.size(state) - own), own / cfg.num_envs + 1.1 * cfg.unroll_length * step + max(
             rollout, updated
         )
+
+
+def _with_std(policy: dict[str, Any], mean: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the parameters of the action distribution."""
+    return mean, jnp.broadcast_to(jnp.exp(policy["params"][_LOG_STD]), mean.shape)
 
 
 def _part(normalizer: Any, names: tuple[str, ...]) -> Any:

@@ -308,10 +308,20 @@ class Learner(learner.Learner):
     def loss(
         self, params: losses.PPONetworkParams, normalizer: running_statistics.RunningStatisticsState, batch: Batch, key: Key
     ) -> tuple[Float[Array, ""], Metrics]:
-        """Computes the clipped surrogate, value loss and entropy bonus. Schulman et al. 2017; value clipping as in RSL-RL."""
+        """Computes the loss and its metrics on a minibatch."""
+        logits = self.networks.policy_network.apply(normalizer, params.policy, batch.obs)
+        return self.loss_of(logits, params, normalizer, batch, key)
+
+    def loss_of(
+        self, logits: Any, params: losses.PPONetworkParams, normalizer: Any, batch: Batch, key: Key
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """Computes the clipped surrogate, value loss and entropy bonus. Schulman et al. 2017; value clipping as in RSL-RL.
+
+        Args:
+            logits: the policy's output on the minibatch.
+        """
         cfg, nets = self.cfg, self.networks
         dist = nets.parametric_action_distribution
-        logits = nets.policy_network.apply(normalizer, params.policy, batch.obs)
         value = nets.value_network.apply(normalizer, params.value, batch.obs)
 
         centred = batch.advantages - self._mean(jnp.mean(batch.advantages))
