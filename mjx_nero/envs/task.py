@@ -93,8 +93,15 @@ CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
 # The policy starts as a clone of the task's scripted expert. At first only its critic learns.
 SHOWN = {**CALM, "imitation": 1.0, "critic_first": 20}
 # For tasks that bear no noise: little of it, nothing that pays for it, and more demonstrations, which last.
-PRECISE = {**SHOWN, "min_std": 0.05, "max_std": 0.1, "entropy_cost": 0.0, "demonstrations": 256}
-PRECISE |= {"imitation": 20.0, "imitation_lasts": True}
+PRECISE = {
+    **SHOWN,
+    "min_std": 0.05,
+    "max_std": 0.1,
+    "entropy_cost": 0.0,
+    "demonstrations": 256,
+    "imitation": 20.0,
+    "imitation_lasts": True,
+}
 
 
 def drive_targets() -> dict[str, Term]:

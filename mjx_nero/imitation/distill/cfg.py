@@ -7,8 +7,6 @@ from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
 from mjx_nero.config.values import hints, read
 from mjx_nero.learn.pixels.cfg import StudentCfg
 
-ENVS = (32, 4096)  # numbers of environments for a CPU and a GPU
-
 
 @dataclasses.dataclass(frozen=True)
 class DistillCfg:

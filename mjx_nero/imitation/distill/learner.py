@@ -26,10 +26,11 @@ from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
 from mjx_nero.imitation.distill import teachers
-from mjx_nero.imitation.distill.cfg import ENVS, PRESETS, DistillCfg
+from mjx_nero.imitation.distill.cfg import PRESETS, DistillCfg
 from mjx_nero.learn import device_memory, learner
 from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.learn.pixels import graph
+from mjx_nero.learn.pixels.cfg import ENVS
 from mjx_nero.learn.pixels.networks import SEEN, SENSED, TRUTH, Student, apply, away, from_meta, init_params, seen_bytes
 from mjx_nero.types import Bank, Key, Shown
 

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
 from mjx_nero.config.values import hints, read, short
-from mjx_nero.envs.task import EnvCfg
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
 from mjx_nero.learn.learner import DEMONSTRATIONS
@@ -145,8 +144,3 @@ PRESETS = {  # by preset of the environment
         network=NetworkCfg(output_scale=1.0, max_observation=0.0),
     ),
 }
-
-
-def learner_cfg(cfg: EnvCfg, preset: str) -> PpoCfg:
-    """Returns the hyperparameters of a preset, with the task's own."""
-    return config.override(PRESETS.get(preset, PpoCfg()), cfg.training)

@@ -51,8 +51,10 @@ class School:
             episodes, successes = episodes - sums["sum/visited"], successes - sums["sum/visited_success"]
         slow = jnp.where(episodes > 0, _SLOW, 0.0)
         rate = self.success + slow * (successes / jnp.maximum(episodes, 1.0) - self.success)
-        fails = jnp.where(self.weight > 0, 1.0 - rate, 0.0)
-        weight = fails if self.lasts else jnp.minimum(self.weight, jnp.maximum(0.0, 1.0 - 2.0 * rate))
+        if self.lasts:
+            weight = jnp.where(self.weight > 0, 1.0 - rate, 0.0)
+        else:
+            weight = jnp.minimum(self.weight, jnp.maximum(0.0, 1.0 - 2.0 * rate))
         return School(self.shown, weight, rate, self.lasts)
 
     def waits(self, iteration: Int[Array, ""], cfg: PpoCfg) -> Bool[Array, ""]:
@@ -94,9 +96,8 @@ def cloned(
         updates, memory = adam.update(grads, memory)
         return (optax.apply_updates(policy, updates), memory), None
 
-    (policy, _), _ = jax.lax.scan(
-        step, (params.policy, adam.init(params.policy)), jax.random.split(key, int(PASSES * len(shown.action) / BATCH))
-    )
+    updates = int(PASSES * len(shown.action) / BATCH)
+    (policy, _), _ = jax.lax.scan(step, (params.policy, adam.init(params.policy)), jax.random.split(key, updates))
     layers = dict(policy["params"])
     if "std_logparam" in layers:
         layers["std_logparam"] = jax.tree.map(lambda x: jnp.full_like(x, jnp.log(STILL)), layers["std_logparam"])
