@@ -9,7 +9,6 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-import imageio_ffmpeg
 import mujoco
 import numpy as np
 
@@ -108,6 +107,8 @@ def write_video(path: pathlib.Path, images: Iterable[np.ndarray], fps: float) ->
     Raises:
         UserError: the path cannot be written.
     """
+    import imageio_ffmpeg  # needed only where a video is written
+
     images = iter(images)
     first = next(images)
     height, width = first.shape[:2]
