@@ -68,6 +68,11 @@ def same(a, b) -> None:
         np.testing.assert_array_equal(x, y)
 
 
+def near(a, b) -> None:
+    """Two programs' results: equal but for rounding."""
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6), a, b)
+
+
 def differ(a, b) -> bool:
     return any((np.asarray(x) != np.asarray(y)).any() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
@@ -371,6 +376,23 @@ def resumes(run, state, template, path):
     same(again, whole)
     same(again_metrics, metrics)
     assert int(again.iteration) == 2 * int(half.iteration) > 0
+
+
+def test_a_mean_policy_is_played_and_the_newest_one_learns(learner, run, fresh):
+    averaging = Learner(learner.env, dataclasses.replace(SMALL, averaging=0.75))
+    begun = jax.jit(averaging.init)(KEY)
+    same(begun.acting, begun.params.policy)
+    same(begun.replace(acting=None), fresh)
+    learnt, newest = jax.jit(averaging.run, static_argnums=1)(begun, 3), [run(fresh, n)[0].params for n in (1, 2, 3)]
+    near(learnt[0].acting, newest[-1].policy)
+    near(learnt[0].params.value, newest[-1].value)
+    mean = fresh.params.policy
+    for params in newest:
+        mean = jax.tree.map(lambda past, new: 0.75 * past + 0.25 * new, mean, params.policy)
+    near(learnt[0].params.policy, mean)
+    assert differ(learnt[0].params.policy, learnt[0].acting)
+    given = averaging.with_policy(begun, averaging.policy(learnt[0]))
+    same(given.acting, learnt[0].params.policy)
 
 
 def test_a_saved_run_goes_on_bit_for_bit(learner, run, fresh, tmp_path):

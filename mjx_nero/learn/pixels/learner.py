@@ -123,7 +123,7 @@ class Learner(ppo.Learner):
         )
         least = jnp.full_like(state.params.policy["params"][_LOG_STD], jnp.log(self.cfg.min_std or self.cfg.network.init_std))
         policy = {"params": {_LOG_STD: least}, "student": variables}
-        return dataclasses.replace(state, normalizer=normalizer, params=state.params.replace(policy=policy))
+        return self._averaging(dataclasses.replace(state, normalizer=normalizer, params=state.params.replace(policy=policy)))
 
     def act(self, params: tuple, obs: Observation) -> jax.Array:
         """Computes the student's action."""

@@ -106,6 +106,7 @@ class PpoCfg:
     critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which an imitating policy waits for its critic
     min_std: NonNegative = 0.2  # minimum standard deviation of actions, so that exploration lasts; 0: none
     max_std: NonNegative = 1.0  # maximum standard deviation, since noise costs nothing where targets saturate; 0: none
+    averaging: Annotated[float, Bounds(0.0, 0.9999)] = 0.0  # share of the past in the mean policy, which is played; 0: no mean
     value_loss: NonNegative = 1.0  # weight of the critic's loss
     max_grad_norm: Positive = 1.0  # maximum norm of the gradient
     reward_scaling: Positive = 1.0  # factor of rewards

@@ -70,11 +70,12 @@ class TrainState:
     iteration: Int[Array, ""]
     returns: running_statistics.RunningStatisticsState  # statistics of all returns so far: the critic's unit
     school: imitation.School | None = None  # an expert's demonstrations; None: nothing is imitated
+    acting: Any = None  # the newest policy, which learns, if ``params`` holds a running mean of it (``PpoCfg.averaging``)
 
 
 _HERE: Any = PartitionSpec()
 _SPREAD: Any = PartitionSpec(_AXIS)
-_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE, _HERE)
+_SPECS = TrainState(_HERE, _HERE, _HERE, _SPREAD, _HERE, _HERE, _HERE, _HERE, _HERE)
 
 
 @struct.dataclass
@@ -161,6 +162,7 @@ class Learner(learner.Learner):
         opt_state = self._optimizer.init(params)
         returns = running_statistics.init_state(specs.Array((), jnp.dtype("float32")), std_eps=jnp.float32(1e-6))
         state = TrainState(normalizer, params, opt_state, env_state, key, jnp.zeros((), jnp.int32), returns, school)
+        state = self._averaging(state)
         # ``run`` returns weakly typed leaves as strong ones, so whatever takes the state would be compiled twice.
         return jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
 
@@ -185,6 +187,14 @@ class Learner(learner.Learner):
         """Returns normalizer and network parameters from the first device, for programs that run only there."""
         params = super().policy(state)
         return jax.tree.map(lambda x: x.addressable_data(0), params) if self._axis else params
+
+    def with_policy(self, state: TrainState, params: tuple) -> TrainState:
+        """Returns a new state that starts from a policy."""
+        return self._averaging(super().with_policy(state, params))
+
+    def _averaging(self, state: TrainState) -> TrainState:
+        """Returns a new state whose policy is also the first one of the mean."""
+        return dataclasses.replace(state, acting=jax.tree.map(jnp.copy, state.params.policy)) if self.cfg.averaging else state
 
     def slower(self, state: TrainState) -> TrainState:
         """Returns the state with a tenth of the learning rate, and other random draws."""
@@ -239,6 +249,9 @@ class Learner(learner.Learner):
         key, k_roll, k_update = jax.random.split(state.key, 3)
         if self._axis:
             k_roll = jax.random.fold_in(k_roll, jax.lax.axis_index(self._axis))
+        played = state.params.policy
+        if self.cfg.averaging:
+            state = dataclasses.replace(state, params=state.params.replace(policy=state.acting))
         env_state, batch, sums = self.rollout(state, k_roll)
         with self._networks_precision():
             params, opt_state, metrics = self._update(state, batch, k_update)
@@ -250,7 +263,11 @@ class Learner(learner.Learner):
             returns = running_statistics.update(returns, raw, pmap_axis_name=self._axis)
         sums = jax.lax.psum(sums, self._axis) if self._axis else sums
         school = state.school and state.school.after(sums)
-        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns, school)
+        acting = None
+        if self.cfg.averaging:
+            acting = params.policy
+            params = params.replace(policy=optax.incremental_update(acting, played, 1 - self.cfg.averaging))
+        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns, school, acting)
         return state, {**sums, **metrics}
 
     def _networks_precision(self):
