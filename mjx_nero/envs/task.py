@@ -92,9 +92,11 @@ def stays_on_table(scene: SceneCfg, **object: str) -> dict[str, DoneTerm]:
 CALM = {"network.init_std": 0.5, "max_std": 0.5, "change_cost": 0.03}
 # The policy starts as a clone of the task's scripted expert. At first only its critic learns.
 SHOWN = {**CALM, "imitation": 1.0, "critic_first": 20}
-# For tasks that bear no noise: little of it, nothing that pays for it, and more demonstrations, which last.
+# For tasks that bear no noise: little of it, nothing that pays for it, and more demonstrations, which last. Single policies still
+# come and go in them, so the mean of the newest ones is played.
 PRECISE = {
     **SHOWN,
+    "averaging": 0.95,
     "min_std": 0.05,
     "max_std": 0.1,
     "entropy_cost": 0.0,

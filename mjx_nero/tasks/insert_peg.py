@@ -7,7 +7,7 @@ square, or round with a rounded end.
 import functools
 import math
 
-from mjx_nero.envs.task import EnvCfg, Presets
+from mjx_nero.envs.task import PRECISE, CurriculumCfg, EnvCfg, Presets
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -57,7 +57,7 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
     grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), LONG + ABOVE, object="peg", turns=(task.fold,))
     put = {**grip, "foot": LONG / 2, "over": DEEP + OVER, "top": DEEP, "turns": task.fold, "reach": 0.002}
     put |= {"press": PRESS, "done": DONE, "away": AWAY}
-    return task.cfg({"put_in": put})
+    return task.cfg({"put_in": put}, training={**PRECISE, "max_std": 0.15}, curriculum=CurriculumCfg())
 
 
 PRESETS: Presets = {
