@@ -13,8 +13,7 @@ from mjx_nero.tools import results
 # Nobody has trained these by the default command.
 ARMS = ("nero", "cobotta", "piper", "so100", "so101")
 MISSING = {
-    *(f"{arm}_hang_ring" for arm in ARMS if arm not in ("nero", "cobotta")),
-    *(f"{arm}_insert_peg" for arm in ARMS if arm != "cobotta"),
+    *(f"{arm}_{task}" for arm in ("piper", "so100", "so101") for task in ("hang_ring", "insert_peg")),
     *(f"{arm}_{task}" for arm in ("piper", "so100", "so101") for task in ("open_door", "turn_knob")),
     *(f"{arm}_{task}" for arm in ("so100", "so101") for task in ("open_drawer", "lift_any")),
     "piper_reach_obstacles",
