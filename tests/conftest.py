@@ -17,7 +17,7 @@ pytest.register_assert_rewrite("model_checks")  # a helper's assertions show the
 
 # Annotations are checked whenever a function of the package is called or traced; the hook has to precede the import. Left out:
 # ``types``, ``learn.ppo`` and some of ``control``, whose pytrees are annotated for one environment, while ``jax.vmap`` also makes
-# them with a batch axis; and ``sim.physics.mujoco_warp``, of whose functions Warp reads the annotations.
+# them with a batch axis; and ``sim.physics.warp.mujoco_warp``, of whose functions Warp reads the annotations.
 _CHECKED = (
     "config",
     "math",

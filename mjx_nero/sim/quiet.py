@@ -3,8 +3,8 @@ before Brax.
 
 These packages are seldom or never needed, and take longer to import than MJX and ``Env`` themselves:
 
-- Warp, with all of MuJoCo Warp, is for MJX's own wrapper of it. Nothing here uses that wrapper: ``physics.mujoco_warp`` calls
-  MuJoCo Warp itself. The wrapper works if Warp is imported before this package.
+- Warp, with all of MuJoCo Warp, is for MJX's own wrapper of it. Nothing here uses that wrapper: ``physics.warp`` calls MuJoCo
+  Warp itself. The wrapper works if Warp is imported before this package.
 - trimesh and SciPy's geometry are for the convex hulls of collision meshes.
 - Brax's own environments and engines stand beside ``Env``: in its package, and in its module for the class after it.
 

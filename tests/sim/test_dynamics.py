@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_nero import make
-from mjx_nero.sim.physics import dynamics, kernels, newton
+from mjx_nero.sim.physics.warp import dynamics, kernels, newton
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks import registry
 from mjx_nero.types import Sim
@@ -112,7 +112,7 @@ def test_a_step_is_mujocos(links):
 
 def test_fields_may_differ_from_environment_to_environment():
     """Two environments, one with all masses, dampings and gains doubled: each moves as its own model."""
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     names = ("body_mass", "body_inertia", "dof_damping", "actuator_gainprm", "actuator_biasprm")
     heavy = mujoco.MjModel.from_xml_string(KINDS.format(links=""))

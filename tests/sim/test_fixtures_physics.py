@@ -146,8 +146,8 @@ def test_a_fixture_moves_alike_on_mjx(model, where):
 @pytest.mark.parametrize("solver", ["newton", "mujoco_warp"])
 def test_a_fixture_moves_alike_on_warp(model, where, solver):
     pytest.importorskip("warp")
-    from mjx_nero.sim.physics import dynamics
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp import dynamics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     assert dynamics.missing(model) == []
     cfg = SimCfg(dt=CFG.dt, decimation=CFG.decimation, iterations=30, solver=solver)

@@ -79,7 +79,7 @@ def test_the_inertia_of_the_hand_is_felt(native):
 @pytest.mark.slow
 def test_warp_agrees(model, native):
     pytest.importorskip("warp")
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     _, found = play(WarpPhysics(model, CFG))
     _statics(found)

@@ -46,7 +46,7 @@ KINDS = """
 def test_accelerations_are_mujocos(cone, jacobian):
     from mujoco.mjx.third_party import mujoco_warp
 
-    from mjx_nero.sim.physics import newton
+    from mjx_nero.sim.physics.warp import newton
 
     model = mujoco.MjModel.from_xml_string(KINDS.format(cone=cone, jacobian=jacobian))
     reference, n = mujoco.MjData(model), 8
@@ -89,7 +89,7 @@ def test_accelerations_are_mujocos(cone, jacobian):
 @pytest.mark.slow
 def test_a_control_step_is_mujocos_while_cubes_are_held():
     """From states of the shipped policy, cubes in the grip or on the table, in single precision."""
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     n = 8
     env = make("nero_lift", impl="native", num_envs=n, corruption=False)
@@ -131,7 +131,7 @@ def test_the_engines_own_solver_steps_alike(name):
 
     On the GPU where there is one, else on the CPU.
     """
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     n = 8
     env = make(name, impl="native", num_envs=n)
@@ -160,7 +160,7 @@ def test_the_engines_own_solver_steps_alike(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in registry.list_envs() if registry.robot_of(name)])
 def test_no_environment_of_the_package_is_too_large(name):
-    from mjx_nero.sim.physics import newton
+    from mjx_nero.sim.physics.warp import newton
 
     env = make(name, impl="native", num_envs=1)
     nv = env.physics_model.nv

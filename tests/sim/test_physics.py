@@ -341,7 +341,7 @@ def test_backend_is_made_when_first_stepped():
 
 def test_warp_physics_is_made_without_a_change_of_device(env, monkeypatch):
     """Warp's device is the process's: another thread may be loading kernels, which a change would send to the wrong one."""
-    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
 
     def refuse(device):
         raise AssertionError(f"changed to {device}")
@@ -352,7 +352,7 @@ def test_warp_physics_is_made_without_a_change_of_device(env, monkeypatch):
 
 def test_nothing_of_warp_is_loaded_while_jax_traces(env, monkeypatch):
     """Another thread may be adding kernels to the module that would be loaded."""
-    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
     made, loads = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim), []
     sim = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
     monkeypatch.setattr(warp.Module, "load", lambda module, *args: loads.append(module.name))
@@ -362,7 +362,7 @@ def test_nothing_of_warp_is_loaded_while_jax_traces(env, monkeypatch):
 
 def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
     """A run of four devices on two machines: two are here."""
-    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.mujoco_warp")
+    warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
     made = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
     made.footprint()  # makes what it counts, before devices are not what they are
     monkeypatch.setattr(warp, "get_cuda_devices", lambda: [types.SimpleNamespace(free_memory=free) for free in (5e9, 3e9, 1e9)])

@@ -208,7 +208,7 @@ def gripped():
 def test_warp_gives_the_same_physics_to_drawn_worlds(worlds, gripped):
     """Tolerances as in test_newton."""
     pytest.importorskip("warp")
-    from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+    from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
     plain, sim, ctrl = gripped
     sim = sim.replace(fields=drawn(worlds, 8))

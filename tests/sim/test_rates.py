@@ -12,7 +12,7 @@ from mjx_nero.mdp import images
 from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.cameras import opengl
-from mjx_nero.sim.physics import kernels
+from mjx_nero.sim.physics.warp import kernels
 from mjx_nero.tasks import registry
 
 STEPS, EVERY = 7, 3

@@ -133,7 +133,7 @@ def test_backends_agree(backend, model, worlds, native):
     shared otherwise."""
     if backend == "warp":
         pytest.importorskip("warp")
-        from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+        from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 
         sim, forces = step(WarpPhysics(model, CFG, FIELDS), *worlds, times=25)
     else:

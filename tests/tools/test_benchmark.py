@@ -14,7 +14,7 @@ import pytest
 
 import mjx_nero
 from mjx_nero.runs import compiled
-from mjx_nero.sim.physics.mujoco_warp import WarpPhysics
+from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics
 from mjx_nero.tools.benchmark import command, drawing, learning, machine, plot, throughput
 from mjx_nero.tools.benchmark.program import Program, spread, warp_mb
 

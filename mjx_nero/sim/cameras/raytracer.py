@@ -1,7 +1,7 @@
 """MuJoCo Warp's ray tracer: all worlds at once, on an NVIDIA GPU, or on the CPU for tests and small numbers.
 
-As in ``physics.mujoco_warp``, the arrays stay in Warp: one CUDA graph computes the poses and draws, JAX copies positions in and
-pictures out. The function is pure, so pictures that are not used are not drawn.
+As in ``physics.warp``, the arrays stay in Warp: one CUDA graph computes the poses and draws, JAX copies positions in and pictures
+out. The function is pure, so pictures that are not used are not drawn.
 """
 
 import functools
@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool
 from mjx_nero.sim.cameras import Drawer
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
 from mjx_nero.sim.fields import nominal
-from mjx_nero.sim.physics import kernels, possible
-from mjx_nero.sim.physics.mujoco_warp import world_fields
+from mjx_nero.sim.physics import possible
+from mjx_nero.sim.physics.warp import kernels
+from mjx_nero.sim.physics.warp.mujoco_warp import world_fields
 from mjx_nero.types import Picture
 
 _SEEN = [0, 1, 2]  # geom groups, as MuJoCo's renderer shows them
@@ -76,7 +77,7 @@ class RayTracer(Drawer):
         """Makes the JAX function that draws. ``sometimes``: it also takes which worlds are due, and draws all of them or none."""
         import warp as wp
 
-        # As in ``physics.mujoco_warp``: XLA calls this function on the stream that it computes on.
+        # As in ``physics.warp``: XLA calls this function on the stream that it computes on.
         def draw(given, rgb_out, depth_out, segmentation_out):
             data, drawn, seen, run, _ = self._get(given.shape[0])
             nq = data.qpos.shape[1]

@@ -1,6 +1,7 @@
 """Physics backends: each computes one control step of a batch of environments.
 
-A backend is one module with one class; ``make_physics`` picks it by name. All backends give the terms the same ``types.Sim``.
+A backend is one module or folder with one class; ``make_physics`` picks it by name. All backends give the terms the same
+``types.Sim``.
 """
 
 import contextlib
@@ -74,7 +75,7 @@ BACKENDS: Registry[Make] = Registry(
     "physics",
     {
         "auto": lambda *args: BACKENDS[resolve_impl("auto")](*args),
-        "warp": _own("mujoco_warp", "WarpPhysics"),
+        "warp": _own("warp.mujoco_warp", "WarpPhysics"),
         "jax": _own("mjx", "JaxPhysics"),
         "native": _own("native", "NativePhysics"),
     },

@@ -1,4 +1,4 @@
-"""MJX-JAX: physics as a JAX program, for any accelerator. Only this module and ``mujoco_warp`` call MJX."""
+"""MJX-JAX: physics as a JAX program, for any accelerator. Only this module and ``warp`` call MJX."""
 
 import copy
 import dataclasses

@@ -15,7 +15,7 @@ from typing import Any
 
 import mujoco
 
-from mjx_nero.sim.physics import kernels
+from mjx_nero.sim.physics.warp import kernels
 
 _SHARED_BYTES = 48 * 1024  # shared memory of a block, on every GPU that Warp supports
 _DOFS = 64  # one bit each

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_nero.sim import readings
 from mjx_nero.sim.forces import FINGERS, WRIST
-from mjx_nero.sim.physics import kernels
+from mjx_nero.sim.physics.warp import kernels
 from mjx_nero.sim.readings import Reading
 
 Work = Callable[[], None]

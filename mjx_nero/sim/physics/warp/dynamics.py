@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.physics import kernels
+from mjx_nero.sim.physics.warp import kernels
 
 # Fields of MuJoCo Warp's model and data that the sources read and write.
 _MODEL = "body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp jnt_pos jnt_axis jnt_stiffness"

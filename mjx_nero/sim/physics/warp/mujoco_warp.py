@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.sim import readings
-from mjx_nero.sim.physics import Footprint, Physics, dynamics, kernels, newton, possible, sensing
+from mjx_nero.sim.physics import Footprint, Physics, possible
+from mjx_nero.sim.physics.warp import dynamics, kernels, newton, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 

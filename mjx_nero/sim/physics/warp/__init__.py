@@ -1,0 +1,1 @@
+"""Physics on an NVIDIA GPU: MuJoCo Warp, with the package's own kernels where they are faster."""
