@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.placing import AWAY
 from mjx_nero.envs.regions import Regions
 from mjx_nero.envs.task import SHOWN, EnvCfg, SuccessCfg, nearer, velocity_actions
+from mjx_nero.envs.things.placing import AWAY
 from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp

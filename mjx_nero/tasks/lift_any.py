@@ -8,7 +8,6 @@ import dataclasses
 import functools
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.envs.task import (
     CALM,
     Budget,
@@ -22,6 +21,7 @@ from mjx_nero.envs.task import (
     stays_on_table,
     velocity_actions,
 )
+from mjx_nero.envs.things.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import commands, metrics, observations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, solids

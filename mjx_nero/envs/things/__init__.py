@@ -8,9 +8,9 @@ import numpy as np
 
 from mjx_nero import config
 from mjx_nero.config import bounds
-from mjx_nero.envs import placing
-from mjx_nero.envs.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
+from mjx_nero.envs.things import placing
+from mjx_nero.envs.things.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import randomization, success
 from mjx_nero.mdp.terms import ONCE, Term
 from mjx_nero.sim import contacts

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from mjx_nero.config import bounds
-from mjx_nero.envs.gripping import LIFTED, NEAR, expert
 from mjx_nero.envs.task import EnvCfg
+from mjx_nero.envs.things.gripping import LIFTED, NEAR, expert
 from mjx_nero.mdp import towers
 from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.scene import ObjectCfg
