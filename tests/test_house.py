@@ -1,12 +1,19 @@
-"""The house by numbers: rooms, levels, arrows and the lengths of functions, counted in the source."""
+"""The house by numbers: rooms, levels, arrows, the core and the lengths of functions, counted in the source.
+
+``python tests/test_house.py`` prints the lines of the core, room by room.
+"""
 
 import ast
 import pathlib
+import re
+import tomllib
 from collections.abc import Iterator, Mapping
 
 import pytest
 
-PACKAGE = pathlib.Path(__file__).parents[1] / "mjx_nero"
+ROOT = pathlib.Path(__file__).parents[1]
+PACKAGE = ROOT / "mjx_nero"
+CORE, MOST_OF_CORE = ("config", "files", "mdp", "sim", "envs", "learn"), 12_000  # besides the modules directly in the package
 MOST_ROOMS, MOST_LEVELS, MOST_LINES = 20, 9, 60
 LONG = "# Long: "  # on the line before a longer function, with the reason
 
@@ -47,6 +54,23 @@ def levels(found: Mapping[str, list[pathlib.Path]], pairs: set[tuple[str, str]])
     return level
 
 
+def core(package: pathlib.Path = PACKAGE) -> dict[str, int]:
+    """Lines of the core by room, without its wings: those that the contract ``wings`` of import-linter protects."""
+    contracts = tomllib.loads((package.parent / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    wings = [name for each in contracts if each["id"] == "wings" for name in each["protected_modules"]]
+    within = {"the ground": sorted(package.glob("*.py")), **{room: sorted((package / room).rglob("*.py")) for room in CORE}}
+    return {
+        room: sum(len(path.read_text().splitlines()) for path in paths if not any(_in(path, wing, package) for wing in wings))
+        for room, paths in within.items()
+    }
+
+
+def _in(path: pathlib.Path, module: str, package: pathlib.Path) -> bool:
+    """True if a file is the module or lies in the package of that dotted name."""
+    own = path.relative_to(package.parent).with_suffix("").parts
+    return list(own[: module.count(".") + 1]) == module.split(".")
+
+
 def long_functions(path: pathlib.Path) -> list[str]:
     """Functions of more than ``MOST_LINES`` lines that no reason stands above."""
     text = path.read_text()
@@ -66,6 +90,13 @@ def test_rooms_and_levels():
     assert len(found) <= MOST_ROOMS, sorted(found)
     assert max(level.values()) <= MOST_LEVELS, level
     assert level["errors"] == 1 and level["mdp"] < level["sim"] < level["envs"] < level["learn"] < level["tools"]
+
+
+def test_the_core_is_small_and_says_so():
+    lines = sum(core().values())
+    assert lines <= MOST_OF_CORE
+    said = re.search(r"The core has ([\d,]+) lines", (ROOT / "docs/concepts/house.md").read_text())
+    assert said and abs(int(said[1].replace(",", "")) - lines) <= 250, lines
 
 
 def test_functions_fit_a_screen():
@@ -101,6 +132,17 @@ def test_the_count_counts(house):
         levels(found, pairs | {("ground", "top")})
 
 
+def test_the_core_is_counted_without_its_wings(house):
+    wings = '[[tool.importlinter.contracts]]\nid = "wings"\nprotected_modules = ["small.sim.far", "small.mdp.one"]\n'
+    (house.parent / "pyproject.toml").write_text(wings)
+    for path, lines in (("sim/near.py", 3), ("sim/far/__init__.py", 5), ("sim/far_too.py", 7), ("mdp/one.py", 11)):
+        (house / path).parent.mkdir(parents=True, exist_ok=True)
+        (house / path).write_text("x = 1\n" * lines)
+    found = core(house)
+    assert found["sim"] == 3 + 7 and not found["mdp"]
+    assert found["the ground"] == 4  # of the face, the top and the package itself
+
+
 def test_long_functions_are_found(tmp_path):
     path, body = tmp_path / "a.py", "    x = 1\n" * MOST_LINES
     path.write_text(f"def long():\n{body}")
@@ -109,3 +151,9 @@ def test_long_functions_are_found(tmp_path):
     assert not long_functions(path)
     path.write_text(f"def short():\n{body[: -len('    x = 1') - 1]}")
     assert not long_functions(path)
+
+
+if __name__ == "__main__":
+    for name, count in (counted := core()).items():
+        print(f"{name:12}{count:7,}")
+    print(f"{'the core':12}{sum(counted.values()):7,}")

@@ -16,6 +16,7 @@ from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.solids import kept_grasps
+from mjx_nero.sim.solids.grasps import Hand
 from mjx_nero.types import UserError, View
 
 _GAPS = 9  # number of gaps for which the place of the pads' middle is computed
@@ -43,6 +44,16 @@ class GraspThingMemory(PickUpMemory):
     middle: Float[Array, "3"]  # middle of the pads, in the thing's frame [m]
 
 
+def hand_of(robot: RobotCfg) -> Hand:
+    """The hand of a robot, for finding grasps of meshes.
+
+    Raises:
+        UserError: the robot has no gripper, or its opening is unknown.
+    """
+    grasp.cube_for(robot)
+    return Hand(robot.opening, robot.closed, robot.pad, grasp.lowest(robot.pad))
+
+
 class GraspThing(PickUp):
     """``PickUp`` for things of any shape: tables of grasps replace headings and turns.
 
@@ -59,7 +70,7 @@ class GraspThing(PickUp):
         super().__init__(robot, dt, cfg)
         if not cfg.files:
             raise UserError("grasp_thing needs files (control.files): those of the meshes to pick up")
-        table = kept_grasps.table(cfg.files, cfg.scale, grasp.hand(robot))
+        table = kept_grasps.table(cfg.files, cfg.scale, hand_of(robot))
         self._ups, self._middles, self._across, self._gaps, self._costs = (np.asarray(x, np.float32) for x in table)
         formulas = grasp.formulas(robot)
         self._positions = formulas[1] if formulas else None

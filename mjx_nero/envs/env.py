@@ -25,11 +25,9 @@ from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import events, terms
 from mjx_nero.mdp.actions import Chain, Drives
 from mjx_nero.mdp.curriculum import toward
-from mjx_nero.mdp.images import Lens
 from mjx_nero.mdp.success import Hold
 from mjx_nero.sim import cameras, linkage, readings, scene, team
-from mjx_nero.sim.cameras.cfg import CameraCfg
-from mjx_nero.sim.cameras.look import Look
+from mjx_nero.sim.cameras import CameraCfg, Look
 from mjx_nero.sim.fields import Fields, Randomization
 from mjx_nero.sim.physics import Footprint, Physics, make_physics, resolve_impl
 from mjx_nero.types import (
@@ -333,7 +331,7 @@ class ManipulationEnv(Env):
     def _due(self, carry: Carry) -> dict[str, Bool[Array, ""]]:
         """Says for each camera whose sensor skips pictures whether it reads the current one. Empty: none skips any."""
         lenses = {f"sensors.{name}": term.made for name, term in self.cfg.sensors.items()}
-        rare = {name: lens for name, lens in lenses.items() if isinstance(lens, Lens) and lens.every > 1}
+        rare = {name: lens for name, lens in lenses.items() if getattr(lens, "every", 1) > 1}
         return {lens.camera: lens.due(carry.memory[name]) for name, lens in rare.items()}
 
     @_precise

@@ -8,7 +8,7 @@ from mjx_nero import config
 from mjx_nero.config import bounds
 from mjx_nero.config.bounds import Count, NonNegative, Positive, Range, Share, Steps
 from mjx_nero.envs import old_names
-from mjx_nero.mdp import actions, curriculum, events, fixtures, observations, success, terminations
+from mjx_nero.mdp import actions, curriculum, events, observations, success, terminations
 from mjx_nero.mdp.terms import (
     ROBOT,
     CommandTerm,
@@ -288,11 +288,6 @@ class EnvCfg:
     def current(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Translates fields of version 0.5.0 to their present names: see ``envs.old_names``."""
         return old_names.current(fields, self.observations, self.curriculum.weights)
-
-    @property
-    def goal_is_tied(self) -> bool:
-        """True if an event places a fixture by the goal. A start that keeps one of them must keep the other."""
-        return any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in self.events.values())
 
     def uncorrupted(self) -> "EnvCfg":
         """Returns the task without observation noise, for measuring policies."""

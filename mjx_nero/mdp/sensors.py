@@ -2,6 +2,9 @@
 
 They apply in the task's order, before the observation terms, so all terms of a group see the same errors. An error in an object's
 position, for example, changes its distances from gripper and goal as well.
+
+A sensor with a ``camera`` may read only ``every`` so many of its pictures; ``due(memory)`` then says whether it reads the current
+one (``images.Lens``).
 """
 
 import dataclasses

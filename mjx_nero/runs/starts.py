@@ -20,11 +20,13 @@ import numpy as np
 from jaxtyping import Array
 
 from mjx_nero import config, control
+from mjx_nero.config import bounds
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg, EnvCfg, compensated
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import DEMONSTRATIONS, ROWS, Learner
+from mjx_nero.mdp import fixtures
 from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
@@ -185,12 +187,17 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
     (state, *_), (starts, distance, grasped, alive, shown) = played
     won = (state.metrics["success"] > 0) & (alive[-1] > 0)
     return (
-        Bank(starts, (distance < distance[0] / 2) | env.cfg.goal_is_tied),
+        Bank(starts, (distance < distance[0] / 2) | _goal_is_tied(env.cfg)),
         shown,
         grasped,
         won,
         state.info["carry"].memory[_HOLD],
     )
+
+
+def _goal_is_tied(cfg: EnvCfg) -> bool:
+    """True if an event places a fixture by the goal. A start that keeps one of them must keep the other."""
+    return any(bounds.unwrapped(event.func) is fixtures.stand_at_goal for event in cfg.events.values())
 
 
 def way(states: Bank, grasped: np.ndarray, won: np.ndarray, hold: np.ndarray, coming: int, past: int, whole: bool = True) -> Way:

@@ -101,7 +101,7 @@ class Randomization:
         """Draws the fields of one world; empty without terms. ``level``: see ``types.LEVEL``.
 
         Args:
-            given: fields that differ for another reason, such as an object's shape (``objects.bank``).
+            given: fields that differ for another reason, such as an object's shape (``meshes.bank``).
         """
         given = given or {}
         drawn = self._draws(jax.random.split(key, self._count) if self._count else (), given)

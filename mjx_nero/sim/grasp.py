@@ -11,7 +11,6 @@ import numpy as np
 from mjx_nero.sim import linkage
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, cube, robot_model
-from mjx_nero.sim.solids.grasps import Hand
 from mjx_nero.types import UserError
 
 SHARE, MOST = 0.4, 0.6  # of the opening: a cube's edge, and the longest edge that leaves room to miss the middle
@@ -176,16 +175,6 @@ def pads(model: mujoco.MjModel | mujoco.MjSpec) -> list[str]:
     """Lists the names of the shapes that grip."""
     geoms = model.geoms if isinstance(model, mujoco.MjSpec) else map(model.geom, range(model.ngeom))
     return [geom.name for geom in geoms if "pad" in geom.name]
-
-
-def hand(robot: RobotCfg) -> Hand:
-    """The hand of a robot, for finding grasps of meshes.
-
-    Raises:
-        UserError: the robot has no gripper, or its opening is unknown.
-    """
-    cube_for(robot)
-    return Hand(robot.opening, robot.closed, robot.pad, lowest(robot.pad))
 
 
 class _Hand:

@@ -10,12 +10,12 @@ import numpy as np
 
 from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, OneOf, Positive
-from mjx_nero.sim import drawn, fixtures, forces, obstacles, team, touch
-from mjx_nero.sim.cameras import cfg as cameras
-from mjx_nero.sim.cameras import textures
+from mjx_nero.sim import fixtures, forces, obstacles, team, touch
+from mjx_nero.sim.cameras import drawn
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.sim.fixtures import FixtureCfg, Fixtures
-from mjx_nero.sim.objects import bank, free
+from mjx_nero.sim.meshes import bank
+from mjx_nero.sim.objects import free
 from mjx_nero.sim.objects.cfg import ObjectCfg
 from mjx_nero.sim.objects.cfg import cube as cube
 from mjx_nero.sim.obstacles import ObstacleCfg, Obstacles
@@ -122,7 +122,7 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     team.add(spec, scene.robots, whole)
     spec.modelname = f"{robot.name}_scene"
     if not visuals:
-        spec.discard_visual()  # before meshes are added that no geom has yet (``objects.bank``), which it would drop as well
+        spec.discard_visual()  # before meshes are added that no geom has yet (``meshes.bank``), which it would drop as well
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -150,9 +150,6 @@ def build(robot: RobotCfg, scene: SceneCfg, sim: SimCfg, visuals: bool = True, f
     forces.add(spec, robot, scene.sensors)
     if visuals:
         drawn.add(spec, scene, goal, robot)
-        cameras.add(spec, scene.cameras)
-        drawn.add_props(spec, scene, robot)
-        textures.add(spec, scene.photographs, scene.patterns)
     # Fixtures stand elsewhere in each world, so their parent has to remain a body.
     ends = all(spec.site(each.ee_site) is not None for each in every.values())
     spec.compiler.fusestatic = fuse and ends and not scene.fixtures

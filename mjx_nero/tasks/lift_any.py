@@ -26,7 +26,7 @@ from mjx_nero.mdp import commands, metrics, observations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, solids
 from mjx_nero.sim import scene as scenes
-from mjx_nero.sim.objects import events as thing_events
+from mjx_nero.sim.meshes import events as thing_events
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.tasks.lift import carrying

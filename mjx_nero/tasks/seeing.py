@@ -13,8 +13,7 @@ from mjx_nero.envs import regions
 from mjx_nero.envs.task import Budget, EnvCfg, Presets
 from mjx_nero.mdp import images, looks, observations
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm, Term
-from mjx_nero.sim import drawn
-from mjx_nero.sim.cameras import places
+from mjx_nero.sim.cameras import drawn, places
 from mjx_nero.sim.robot import Box, RobotCfg
 from mjx_nero.types import UserError
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from mjx_nero import UserError, control, env_cfg, make
+from mjx_nero.control import grasp_thing
 from mjx_nero.envs import things, wrappers
 from mjx_nero.learn.ppo import learner as ppo
 from mjx_nero.mdp import observations, rewards
 from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.runs import evaluation
-from mjx_nero.sim import grasp, scene, solids
-from mjx_nero.sim.objects import bank, events
-from mjx_nero.sim.objects import body as bodies
+from mjx_nero.sim import scene, solids
+from mjx_nero.sim.meshes import bank, events
+from mjx_nero.sim.meshes import body as bodies
 from mjx_nero.sim.physics.mjx import JaxPhysics
 from mjx_nero.sim.solids import grasps, rests, shapes
 from mjx_nero.tasks import lift_any, registry
@@ -200,7 +201,7 @@ def test_grasps_of_a_bar(tmp_path):
 @pytest.mark.parametrize("robot", ["nero", "cobotta_pro_900"])
 def test_hands_can_grasp_every_object(robot):
     """In nearly every way in which it rests: the lines of the best grasps meet its parts on both sides."""
-    hand = grasp.hand(registry.robot(robot))
+    hand = grasp_thing.hand_of(registry.robot(robot))
     for name in ("mug", "wrench"):
         solid = solids.find(name)
         for quat in solid.rest_quat[:2]:

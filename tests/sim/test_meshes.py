@@ -16,7 +16,7 @@ import trimesh
 from mjx_nero import UserError
 from mjx_nero.files import cache
 from mjx_nero.sim import scene, solids
-from mjx_nero.sim.objects import body as bodies
+from mjx_nero.sim.meshes import body as bodies
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.sim.solids import making, rests, solid, store
 from mjx_nero.tasks import registry

@@ -14,7 +14,7 @@ from mjx_nero.envs.things.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import randomization, success
 from mjx_nero.mdp.terms import ONCE, Term
 from mjx_nero.sim import contacts
-from mjx_nero.sim.objects import body, events
+from mjx_nero.sim.meshes import body, events
 from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.sim.solids import rests
 from mjx_nero.types import UserError

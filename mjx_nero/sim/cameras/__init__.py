@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float
 
-from mjx_nero.sim.cameras.cfg import CameraCfg
+from mjx_nero.sim.cameras.cfg import CameraCfg as CameraCfg
+from mjx_nero.sim.cameras.look import Look as Look
 from mjx_nero.sim.cameras.look import rows
 from mjx_nero.sim.fields import nominal
 from mjx_nero.types import Picture, Scenery

@@ -7,9 +7,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero.config.bounds import NonNegative, OneOf, Positive
-from mjx_nero.sim import quats
-from mjx_nero.sim.solids import store
-from mjx_nero.sim.solids.solid import Solid
+from mjx_nero.sim import quats, solids
 
 # Shape -> MuJoCo's type, and what ``ObjectCfg.size`` says of it.
 SHAPES = {
@@ -38,7 +36,7 @@ class ObjectCfg:
         rgba: colour.
         file: for a ``mesh``: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name.
             The mesh is cut into convex parts; its origin is its centre of mass.
-        bank: further files; in each episode the object has one of all these shapes (``sim.objects.bank``).
+        bank: further files; in each episode the object has one of all these shapes (``sim.meshes.bank``).
         scale: factor of a mesh's lengths.
         density: density of a mesh [kg/m3], which gives its mass; 0: that of its ``object.yaml``, or else 500.
     """
@@ -57,9 +55,9 @@ class ObjectCfg:
     density: NonNegative = 0.0
 
     @property
-    def solids(self) -> list[Solid]:
+    def solids(self) -> list[solids.Solid]:
         """The shapes of a mesh, at its scale."""
-        return [store.find(file).scaled(self.scale) for file in (self.file, *self.bank)]
+        return [solids.find(file).scaled(self.scale) for file in (self.file, *self.bank)]
 
     @property
     def masses(self) -> list[float]:

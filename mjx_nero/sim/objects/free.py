@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.config import bounds
-from mjx_nero.sim.objects import body as mesh_body
+from mjx_nero.sim.meshes import body as mesh_body
 from mjx_nero.sim.objects.cfg import SHAPES, ObjectCfg, as_geom, side
 from mjx_nero.sim.parts import Fields, Part
-from mjx_nero.sim.solids import shapes
 from mjx_nero.types import LOOK, SHAPE, TARGET, Appearance, Carry, ObjectView, ShapeView, Sim, Start, UserError, View
 
 # Contact bits: objects meet the table by bit 1, robots by bit 2, and one another by bit 4. Robot geoms have no type, so they
@@ -116,7 +115,7 @@ class Objects(Part):
         self._at = {name: int(model.joint(name).qposadr[0]) for name in objects}
         self._dofs = {name: int(model.joint(name).dofadr[0]) for name in objects}
         self._qpos0 = np.array(model.qpos0, np.float32)
-        self._shapes = {name: _shapes(item) for name, item in objects.items() if item.shape == "mesh"}
+        self._shapes = {name: mesh_body.shapes_of(item.solids) for name, item in objects.items() if item.shape == "mesh"}
 
     @property
     def seen(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -188,10 +187,3 @@ class Objects(Part):
         if name in self._targets:
             rgba = jnp.where(carry.memory[TARGET] == self._targets.index(name), jnp.array(COMMANDED), rgba)
         return Appearance(size, rgba)
-
-
-def _shapes(item: ObjectCfg) -> tuple[np.ndarray, ...]:
-    """The shapes of a mesh, [shapes, ...]: points, middle, edges and code, as in ``ShapeView``."""
-    boxes = np.stack([shapes.box(solid) for solid in item.solids])
-    points, codes = (np.stack([make(solid) for solid in item.solids]) for make in (shapes.points, shapes.code))
-    return tuple(x.astype(np.float32) for x in (points, boxes[:, 0], boxes[:, 1], codes))

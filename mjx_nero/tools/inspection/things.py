@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_nero.runs import console
 from mjx_nero.sim import render, solids
-from mjx_nero.sim.objects import body as bodies
+from mjx_nero.sim.meshes import body as bodies
 from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.sim.solids import rests
 from mjx_nero.types import UserError

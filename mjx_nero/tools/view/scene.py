@@ -15,7 +15,7 @@ from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.session import Frame, Session, free_joints
 
 HIDDEN = 3  # first of the hidden geom groups, which are collision shapes
-SHAPE = "/drawn/"  # part of the name of a geom that draws one of an object's possible shapes (``sim.objects.body``)
+SHAPE = "/drawn/"  # part of the name of a geom that draws one of an object's possible shapes (``sim.meshes.body``)
 APART = 1.5  # minimum distance between environments [m]
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.objects import body as bodies
+from mjx_nero.sim.meshes import body as bodies
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import SHAPE, Carry, Sim, Start, View

@@ -1,4 +1,4 @@
-"""Everything in a scene that is only drawn: table top, floor, goal marker, lights, people's cameras, distractors."""
+"""Everything in a scene that is only drawn: table top, floor, goal marker, lights, cameras, distractors, textures."""
 
 from typing import TYPE_CHECKING
 
@@ -7,7 +7,8 @@ import numpy as np
 
 from mjx_nero.sim import quats
 from mjx_nero.sim.cameras import cfg as cameras
-from mjx_nero.sim.objects import body as mesh_body
+from mjx_nero.sim.cameras import textures
+from mjx_nero.sim.meshes import body as mesh_body
 from mjx_nero.sim.objects.cfg import as_geom
 from mjx_nero.sim.robot import RobotCfg
 
@@ -18,7 +19,19 @@ _HANGS = 0.5  # cosine of a base's tilt, beyond which the robot hangs from a pla
 
 
 def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
-    """Adds what people see of a scene; ``goal`` is the body of its marker."""
+    """Adds what is only drawn of a scene, for people and for the task's cameras; ``goal`` is the body of the goal's marker.
+
+    Raises:
+        UserError: the scene lacks a camera's link, or its photographs cannot be read.
+    """
+    _add_stage(spec, scene, goal, robot)
+    cameras.add(spec, scene.cameras)
+    _add_props(spec, scene, robot)
+    textures.add(spec, scene.photographs, scene.patterns)
+
+
+def _add_stage(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
+    """Adds what people see."""
     hidden = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
     box, half = mujoco.mjtGeom.mjGEOM_BOX, scene.goal_edge / 2
     shape, extent = (box, [half] * 3) if scene.goal == "cube" else (mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0])
@@ -67,7 +80,7 @@ def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
     spec.stat.center, spec.stat.extent = target, far
 
 
-def add_props(spec: mujoco.MjSpec, scene: "SceneCfg", robot: RobotCfg) -> None:
+def _add_props(spec: mujoco.MjSpec, scene: "SceneCfg", robot: RobotCfg) -> None:
     """Adds distractors and backdrop, on a movable body: MuJoCo Warp assumes that others never move."""
     if not (scene.distractors or scene.backdrop):
         return

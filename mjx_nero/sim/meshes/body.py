@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_nero.sim.solids import shapes
 from mjx_nero.sim.solids.solid import Solid
 from mjx_nero.types import UserError
 
@@ -91,6 +92,13 @@ def draw(spec: mujoco.MjSpec, body: Any, name: str, shape: int, solid: Solid) ->
         look = {"material": material.name, "rgba": [1.0, 1.0, 1.0, rgba[3]]}
     geom = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2, **look}
     body.add_geom(name=drawn_name(name, shape), type=_MESH, meshname=mesh.name, **geom)
+
+
+def shapes_of(solids: list[Solid]) -> tuple[np.ndarray, ...]:
+    """What terms see of each shape, [shapes, ...]: points, middle, edges and code, as in ``ShapeView``."""
+    boxes = np.stack([shapes.box(solid) for solid in solids])
+    points, codes = (np.stack([make(solid) for solid in solids]) for make in (shapes.points, shapes.code))
+    return tuple(x.astype(np.float32) for x in (points, boxes[:, 0], boxes[:, 1], codes))
 
 
 def checked(name: str, solids: list[Solid], scale: float) -> None:
