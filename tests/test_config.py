@@ -7,12 +7,13 @@ import pytest
 
 from mjx_nero import UserError, config, control, env_cfg, list_envs, list_presets, list_robots, make
 from mjx_nero.config import bounds
-from mjx_nero.envs.task import CALM, PRECISE, SHOWN, CurriculumCfg, EnvCfg
+from mjx_nero.envs.task import CurriculumCfg, EnvCfg
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import PRESETS
 from mjx_nero.mdp import actions
 from mjx_nero.tasks import registry
 from mjx_nero.tasks.arms.nero import NERO
+from mjx_nero.tasks.usual import CALM, PRECISE, SHOWN
 
 
 @dataclasses.dataclass(frozen=True)

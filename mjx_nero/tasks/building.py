@@ -7,13 +7,14 @@ from typing import Any
 
 from mjx_nero.envs import regions
 from mjx_nero.envs.regions import Regions
-from mjx_nero.envs.task import SHOWN, EnvCfg, SuccessCfg, nearer, velocity_actions
+from mjx_nero.envs.task import EnvCfg, SuccessCfg
 from mjx_nero.envs.things.placing import AWAY
 from mjx_nero.mdp import actions, metrics, rewards, terminations, towers
 from mjx_nero.mdp.terms import DoneTerm, MetricTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks.usual import SHOWN, nearer, velocity_actions
 from mjx_nero.types import UserError
 
 STILL = 0.005  # [m/s]

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import SHOWN, Budget, EnvCfg, Presets, arm_state, object_at_goal, observed, velocity_actions
+from mjx_nero.envs.task import Budget, EnvCfg, Presets
 from mjx_nero.mdp import commands, events, metrics, observations, randomization, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, ObservationTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.tasks.lift import carrying
+from mjx_nero.tasks.usual import SHOWN, arm_state, object_at_goal, observed, velocity_actions
 from mjx_nero.types import TARGET
 
 SIZES = (0.75, 1.15)  # range of the factor of an object's lengths

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_nero.config.bounds import PositiveRange, Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import CALM, Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, velocity_actions
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, SuccessCfg
 from mjx_nero.mdp import commands, fixtures, observations, randomization, rewards, terminations
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
@@ -20,6 +20,7 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
+from mjx_nero.tasks.usual import CALM, arm_state, velocity_actions
 
 OPEN = 0.06  # [m] greatest opening of the hand: handles are less than 2 cm wide
 NEAR = 0.04  # [m] distance from the grasp point within which the handle counts as in the hand

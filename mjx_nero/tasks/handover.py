@@ -7,24 +7,14 @@ import functools
 from collections.abc import Callable
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import (
-    PRECISE,
-    Budget,
-    CurriculumCfg,
-    EnvCfg,
-    Presets,
-    SuccessCfg,
-    arm_state,
-    nearer,
-    on_table,
-    stays_on_table,
-)
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg
 from mjx_nero.mdp import actions, commands, events, handover, metrics, observations, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, Groups, MetricTerm, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import contacts
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks.facing import ALONG, BAR, SIDE, TAKER, YAW, Pair, pair
+from mjx_nero.tasks.usual import PRECISE, arm_state, nearer, on_table, stays_on_table
 
 THERE, STILL = 0.03, 0.05  # [m, m/s] tolerances at the goal
 CLASH = 0.09  # [m] distance of the grasp points below which the hands, 7 cm wide each way, would collide

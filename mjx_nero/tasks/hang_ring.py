@@ -1,6 +1,6 @@
 """Hang ring: pick a ring up from the table, and hang it over the post of a stand. For any robot with a gripper."""
 
-from mjx_nero.envs.task import PRECISE, EnvCfg, Presets
+from mjx_nero.envs.task import EnvCfg, Presets
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -8,6 +8,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks import lift_any, putting
 from mjx_nero.tasks.putting import Putting
+from mjx_nero.tasks.usual import PRECISE
 
 THICK, WALL = 0.018, 0.015  # [m] thickness of the ring and of its wall (assets/objects/make.py)
 TIP = 0.038  # [m] height of the post's tip over the bars on which the ring ends up (assets/fixtures/stand)

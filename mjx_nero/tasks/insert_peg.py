@@ -7,7 +7,7 @@ square, or round with a rounded end.
 import functools
 import math
 
-from mjx_nero.envs.task import PRECISE, CurriculumCfg, EnvCfg, Presets
+from mjx_nero.envs.task import CurriculumCfg, EnvCfg, Presets
 from mjx_nero.sim import grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.fixtures import FixtureCfg
@@ -15,6 +15,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks import putting
 from mjx_nero.tasks.putting import Putting
+from mjx_nero.tasks.usual import PRECISE
 
 HOLE, DEEP = 0.026, 0.025  # [m] width and depth of the hole (assets/fixtures/make.py)
 LONG = 0.065  # [m] length of the peg

@@ -7,19 +7,7 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import (
-    SHOWN,
-    CurriculumCfg,
-    EnvCfg,
-    Presets,
-    arm_state,
-    joint_actions,
-    nearer,
-    on_table,
-    stays_on_table,
-    step_weights,
-    velocity_actions,
-)
+from mjx_nero.envs.task import CurriculumCfg, EnvCfg, Presets, joint_actions
 from mjx_nero.mdp import commands, metrics, observations, rewards, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, groups
 from mjx_nero.sim import grasp
@@ -27,6 +15,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks import sim2real as sim2reals
+from mjx_nero.tasks.usual import SHOWN, arm_state, nearer, on_table, stays_on_table, step_weights, velocity_actions
 
 SPEED = 0.4  # [m/s] of the script's hand: 5 s are short for arms with slow joints
 OVER = 0.02  # [m] height over the cube from which the script's hand comes down

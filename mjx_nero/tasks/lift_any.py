@@ -8,19 +8,7 @@ import dataclasses
 import functools
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import (
-    CALM,
-    Budget,
-    CurriculumCfg,
-    EnvCfg,
-    Presets,
-    arm_state,
-    object_at_goal,
-    observed,
-    on_table,
-    stays_on_table,
-    velocity_actions,
-)
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, Presets
 from mjx_nero.envs.things.gripping import GRIP, LIFTED, NEAR, expert
 from mjx_nero.mdp import commands, metrics, observations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term
@@ -30,6 +18,7 @@ from mjx_nero.sim.meshes import events as thing_events
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
 from mjx_nero.tasks.lift import carrying
+from mjx_nero.tasks.usual import CALM, arm_state, object_at_goal, observed, on_table, stays_on_table, velocity_actions
 
 THING = "thing"
 HELD_OUT = ("l_bracket", "bowl", "screwdriver")

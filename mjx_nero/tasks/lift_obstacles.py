@@ -8,11 +8,12 @@ import functools
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import SHOWN, Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, velocity_actions
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg
 from mjx_nero.mdp import curriculum, metrics, rewards, success
 from mjx_nero.mdp.terms import ONCE, MetricTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.tasks import lift, reach_obstacles
+from mjx_nero.tasks.usual import SHOWN, velocity_actions
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

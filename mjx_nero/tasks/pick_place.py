@@ -4,11 +4,12 @@ import dataclasses
 import functools
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets, on_table, stays_on_table
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, drive_targets
 from mjx_nero.mdp import commands, metrics, observations, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
+from mjx_nero.tasks.usual import on_table, stays_on_table
 
 
 @dataclasses.dataclass(frozen=True)

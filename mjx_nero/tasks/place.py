@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
+from mjx_nero.envs.task import Budget, EnvCfg, Presets
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, Term, groups
 from mjx_nero.sim import grasp
@@ -13,6 +13,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks.building import Tower
+from mjx_nero.tasks.usual import arm_state
 
 TURN = (-math.pi / 6, math.pi / 6)  # [rad] heading of the box at the start and at the goal
 STILL = (0.0, 0.0)

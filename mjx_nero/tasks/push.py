@@ -4,13 +4,14 @@ import dataclasses
 import math
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, arm_state, joint_actions, observed, on_table, stays_on_table
+from mjx_nero.envs.task import Budget, EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import contacts, grasp
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObjectCfg, SceneCfg, SimCfg
+from mjx_nero.tasks.usual import arm_state, observed, on_table, stays_on_table
 
 BOX = (1.6, 1.0, 0.8)  # edges of the box, in edges of the cube that the gripper could lift
 EDGE = 0.05  # [m] edge of that cube for a robot without a gripper

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, SuccessCfg, arm_state, nearer
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, SuccessCfg
 from mjx_nero.mdp import commands, events, fixtures, holes, observations, rewards, sensors, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationGroup, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import contacts, grasp
@@ -15,6 +15,7 @@ from mjx_nero.sim import fixtures as models
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks.building import Tower
+from mjx_nero.tasks.usual import arm_state, nearer
 from mjx_nero.types import UserError
 
 OPEN = 0.06  # [m] greatest opening of the hand

@@ -4,23 +4,14 @@ import dataclasses
 import functools
 
 from mjx_nero.config.bounds import Range
-from mjx_nero.envs.task import (
-    CALM,
-    Budget,
-    CurriculumCfg,
-    EnvCfg,
-    Presets,
-    SuccessCfg,
-    joint_actions,
-    step_weights,
-    velocity_actions,
-)
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, observations, rewards, success, terminations
 from mjx_nero.mdp.terms import CommandTerm, DoneTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tasks import sim2real as sim2reals
+from mjx_nero.tasks.usual import CALM, step_weights, velocity_actions
 from mjx_nero.types import UserError
 
 STILL: Range = (0.0, 0.0)

@@ -6,13 +6,14 @@ from typing import Any
 
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, arm_state, joint_actions
+from mjx_nero.envs.task import EnvCfg, Presets, SuccessCfg, joint_actions
 from mjx_nero.mdp import commands, events, metrics, observations, obstacles, rewards, success, terminations
 from mjx_nero.mdp.terms import ONCE, CommandTerm, DoneTerm, MetricTerm, ObservationGroup, ObservationTerm, RewardTerm, Term
 from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import ObstacleCfg, SceneCfg
 from mjx_nero.tasks.reach import BUDGET
+from mjx_nero.tasks.usual import arm_state
 
 NAMES = ("one", "two")  # the boxes that make an obstacle
 SHARE = 0.3  # share of the region's width, at either side, from which start and goal are drawn

@@ -6,18 +6,7 @@ import math
 import numpy as np
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import (
-    SHOWN,
-    Budget,
-    CurriculumCfg,
-    EnvCfg,
-    Presets,
-    SuccessCfg,
-    arm_state,
-    observed,
-    on_table,
-    stays_on_table,
-)
+from mjx_nero.envs.task import Budget, CurriculumCfg, EnvCfg, Presets, SuccessCfg
 from mjx_nero.mdp import metrics, observations, rewards, sides, towers
 from mjx_nero.mdp.sides import Lying
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term
@@ -26,6 +15,7 @@ from mjx_nero.sim import scene as scenes
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tasks.building import lets_go
+from mjx_nero.tasks.usual import SHOWN, arm_state, observed, on_table, stays_on_table
 from mjx_nero.types import UserError
 
 BOX = "box"

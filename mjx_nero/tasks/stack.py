@@ -6,7 +6,7 @@ The preset ``three`` adds a third cube on top.
 import dataclasses
 
 from mjx_nero.envs import regions
-from mjx_nero.envs.task import Budget, EnvCfg, Presets, arm_state
+from mjx_nero.envs.task import Budget, EnvCfg, Presets
 from mjx_nero.mdp import commands, events, observations, towers
 from mjx_nero.mdp.terms import ONCE, CommandTerm, ObservationTerm, RewardTerm, Term, groups
 from mjx_nero.sim import grasp
@@ -15,6 +15,7 @@ from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg
 from mjx_nero.tasks import seeing
 from mjx_nero.tasks.building import LIFTED, Tower
+from mjx_nero.tasks.usual import arm_state
 
 COLORS = {"blue": (0.2, 0.35, 0.9, 1.0), "red": (0.85, 0.3, 0.2, 1.0), "yellow": (0.95, 0.75, 0.15, 1.0)}  # from the bottom up
 BESIDE = 0.03  # [m] size of an open finger behind its pad, added to the gap between cubes

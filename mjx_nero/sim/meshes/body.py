@@ -95,7 +95,7 @@ def draw(spec: mujoco.MjSpec, body: Any, name: str, shape: int, solid: Solid) ->
 
 
 def shapes_of(solids: list[Solid]) -> tuple[np.ndarray, ...]:
-    """What terms see of each shape, [shapes, ...]: points, middle, edges and code, as in ``ShapeView``."""
+    """Returns what terms see of each shape, [shapes, ...]: points, middle, edges and code, as in ``ShapeView``."""
     boxes = np.stack([shapes.box(solid) for solid in solids])
     points, codes = (np.stack([make(solid) for solid in solids]) for make in (shapes.points, shapes.code))
     return tuple(x.astype(np.float32) for x in (points, boxes[:, 0], boxes[:, 1], codes))
