@@ -162,13 +162,9 @@ def _kind(node: Any, kind: Any, name: str, old: Any) -> Any:
 
 def parameters(func: Callable) -> dict[str, Any]:
     """Returns the declared types of a function's parameters by name, for the types that ``read`` can read."""
-    try:
-        found = typing.get_type_hints(bounds.unwrapped(func), include_extras=True)
-    except (TypeError, NameError, SyntaxError, AttributeError):  # not a function, or invalid annotations
-        return {}
     return {
         name: kind
-        for name, kind in found.items()
+        for name, kind in bounds.parameter_hints(func).items()
         if kind in (float, int, bool, str) or typing.get_origin(kind) in (tuple, Annotated)
     }
 

@@ -145,7 +145,7 @@ def _hints(kind: Any) -> dict[str, Any]:
     """Returns the annotations of a config or of a function's parameters; empty if they cannot be resolved."""
     try:
         return typing.get_type_hints(kind, include_extras=True)
-    except (NameError, TypeError):
+    except (TypeError, NameError, SyntaxError, AttributeError):  # not a function, or invalid annotations
         return {}
 
 

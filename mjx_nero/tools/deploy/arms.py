@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 from mjx_nero.config.bounds import Bounds
-from mjx_nero.deploy import drivers
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
@@ -177,8 +176,3 @@ def warn(args: argparse.Namespace) -> None:
     """Prints the warning about real arms."""
     if args.arm != "sim" and not args.emulate:
         print(f"warning: {WARNING}", flush=True)
-
-
-def known(kind: str, metadata: Mapping[str, Any]) -> None:
-    """See ``drivers.check``."""
-    drivers.check(kind, metadata)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import Clock
 from mjx_nero.deploy.guard import Guarded, WallClock, urgent
 from mjx_nero.deploy.loop import Stop, go_home
@@ -53,7 +54,7 @@ def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
         whether it ended in a fault.
     """
     metadata, clock = metadata_of(robot), WallClock()
-    arms.known(args.arm, metadata)
+    drivers.check(args.arm, metadata)
     swings = sweeps(robot, args.seconds, args.amplitude)
     targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
     limits = dataclasses.replace(Limits.of(metadata, arms.safety_of(args)), home=targets[0])
