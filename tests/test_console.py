@@ -70,6 +70,13 @@ def test_no_word_is_broken(width):
     assert text.count("left_outer_knuckle_joint") == (2 if width == 80 else 1)
 
 
+def test_a_column_that_wraps_keeps_the_table_in_one_piece():
+    table = console.Table("t", ("name", "text"), left=("text",), wraps=("text",))
+    table.add("first", "one two three " * 10)
+    text = printed(table, 50)
+    assert text.count("first") == 1 and text.count("three") == 10 and max(map(len, text.splitlines())) <= 50
+
+
 def test_a_wide_table_is_one():
     lines = [line.split() for line in printed(TABLE, 200).splitlines() if line.split()]
     assert lines[0] == ["joints", "[rad]"] and lines[1] == ["joint", "range", "[rad]", "kind"]
