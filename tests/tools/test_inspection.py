@@ -275,9 +275,9 @@ def test_mistakes_end_in_one_line_and_leave_nothing(call, tmp_path, argv, messag
     assert not list(tmp_path.iterdir())
 
 
-def test_unknown_names_list_the_known_ones():
-    with pytest.raises(UserError, match="choose one of .*nero, .*cobotta_lift, .*, or the folder of a robot"):
-        report.find("something")
+def test_unknown_names_list_the_nearest_ones():
+    with pytest.raises(UserError, match="did you mean 'nero_lift'.*choose one of .*nero_lift, .*, or the folder of a robot"):
+        report.find("nero_lif")
 
 
 def test_a_sheet_of_pictures_draws_each_once(monkeypatch):

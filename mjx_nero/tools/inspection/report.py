@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import config
-from mjx_nero.config import docs
+from mjx_nero.config import docs, values
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
@@ -128,7 +128,7 @@ def find(name: str, preset: str | None = None, robot: str | None = None) -> tupl
     known = (*registry.list_robots(), *registry.list_envs())
     if name not in known and not pathlib.Path(name).is_dir():
         hint = config.hint(name, known)
-        raise UserError(f"no robot or environment {name!r}{hint}: choose one of {', '.join(known)}, or the folder of a robot")
+        raise UserError(f"no robot or environment {name!r}{hint}: {values.choices(name, known)}, or the folder of a robot")
     if preset or robot:
         raise UserError(f"{name} is a robot: leave out --preset and --robot, which are for environments")
     return registry.robot(name), None
