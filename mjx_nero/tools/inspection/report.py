@@ -81,6 +81,7 @@ class Report:
     Attributes:
         open, close: targets of the gripper's joints, in order [rad or m].
         gaps: distance between the pads, open and closed [m]; None: unknown, or no gripper.
+        room: ``opening`` of an imported robot: less than the open gap if a jaw swings out to the side [m]; 0: unknown.
         regions: ``workspace``, ``pick`` and ``hold`` of ``RobotCfg``, if it has them: ranges of x, y and z [m].
         sites: name -> position at home, world frame [m].
         masses: body -> mass [kg], of the robot only.
@@ -95,6 +96,7 @@ class Report:
     open: tuple[float, ...]
     close: tuple[float, ...]
     gaps: Range | None
+    room: float
     regions: dict[str, Box]
     actuators: tuple[Actuator, ...]
     sites: dict[str, tuple[float, float, float]]
@@ -160,6 +162,7 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
         open=gripper.open,
         close=gripper.close,
         gaps=gaps,
+        room=robot.opening if robot.folder else 0.0,
         regions={name: box for name in ("workspace", "pick", "hold") if (box := getattr(robot, name))},
         actuators=tuple(_actuators(model)),
         sites={model.site(s).name: tuple(map(float, data.site_xpos[s])) for s in range(model.nsite)},  # type: ignore[misc]
