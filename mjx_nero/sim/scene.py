@@ -93,9 +93,7 @@ class SimCfg:
     dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
     decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps per control step
     iterations: Iterations = 10  # most iterations of the constraint solver
-    ls_iterations: Iterations = (
-        50  # most iterations of the solver's line search (MJX-JAX 20); at 20, MuJoCo's C library may throw a cube
-    )
+    ls_iterations: Iterations = 50  # most iterations of the solver's line search (MJX-JAX 20); with 20, MuJoCo C may throw cubes
     ramp: bool = False  # spreads a change of the drives' targets over the control step: stiff drives would jerk otherwise
     impratio: Positive = 10.0  # stiffness of friction relative to normal forces: high enough that grasps do not creep
     elliptic: bool = True  # elliptic friction cones; False: pyramidal
