@@ -91,7 +91,7 @@ class RobotCfg:
         workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
             draw their commands from it by default.
         floor: height of the floor under a robot beside the table [m]; 0: the robot stands on the table.
-        opening: distance between the pads of the open gripper, along the line on which they close [m]; 0: unknown.
+        opening: distance between the pads of the open gripper, along the line on which the pads close [m]; 0: unknown.
         closed: the same of the closed gripper [m].
         pad: size of a pad along the approach, across it, and along the opening [m]; zeros: unknown.
         grip: centre of a held cube in the frame of ``ee_site`` [m].
