@@ -110,7 +110,7 @@ def _coarser(mesh: trimesh.Trimesh, most: int, force: float = 7) -> trimesh.Trim
     if len(mesh.faces) <= most:
         return mesh
     if importlib.util.find_spec("fast_simplification") is None:
-        raise UserError(f"has more than {most:,} triangles: make it coarser, or install the extra (pip install 'mjx-nero[meshes]')")
+        raise UserError(f"has more than {most:,} triangles: make it coarser, or pip install 'mjx-nero[meshes]'")
     import fast_simplification
 
     vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
