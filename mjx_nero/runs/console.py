@@ -96,11 +96,12 @@ class Table:
         return parts
 
 
-def compiling(impl: str) -> str:
+def compiling(impl: str, on_cpu: bool) -> str:
     """Announces the wait before training."""
-    if impl == "native":  # JAX's cache cannot hold programs with callbacks
-        return "compiling (about half a minute; programs that call MuJoCo's C library are compiled at every start) ..."
-    return "compiling (a minute or two the first time, a few seconds once the compiled programs are kept) ..."
+    first = "about half a minute" if impl == "native" else "a minute or two"
+    if impl == "native" and not on_cpu:  # JAX's cache cannot hold an accelerator's programs that call back
+        return f"compiling ({first}; programs that call MuJoCo's C library are compiled at every start) ..."
+    return f"compiling ({first} the first time, a few seconds once the compiled programs are kept) ..."
 
 
 def clock(seconds: float) -> str:
