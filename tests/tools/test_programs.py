@@ -48,6 +48,7 @@ MISTAKES = [
     ("train", ["--restore", "."], "holds no checkpoint to restore"),
     ("train", ["--out", "/proc/run"], "cannot write to /proc/run"),
     ("eval", ["--env", "nero"], "unknown env 'nero'"),
+    ("mjx_nero", ["export", "nero_lfit", "--out", "x.onnx"], "no bundled policy 'nero_lfit' (did you mean 'nero_lift'?)"),
     ("eval", ["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
     ("eval", ["--policy", "README.md"], "is not a policy or checkpoint of mjx_nero, or it is damaged"),
     ("eval", ["--preset", "isaac"], "was trained on other observations (preset default): pass --preset default"),
