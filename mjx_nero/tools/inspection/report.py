@@ -182,7 +182,7 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
         UserError: the machine cannot draw offscreen.
     """
     if cfg:
-        env = ManipulationEnv(cfg, impl="jax")
+        env = ManipulationEnv(cfg, impl="native")
         state = jax.jit(env.reset)(jax.random.PRNGKey(0))
         qpos, scenery = jax.device_get((state.pipeline_state.qpos, env.scenery(state)))
         with render.Renderer(env.mj_model, width, height) as renderer:
@@ -241,7 +241,7 @@ def _extent(robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _task(name: str, preset: str | None, cfg: EnvCfg) -> Task:
-    env = ManipulationEnv(cfg, impl="jax")
+    env = ManipulationEnv(cfg, impl="native")
     sizes = jax.eval_shape(lambda key: env.named_observations(env.reset(key)), jax.random.PRNGKey(0))
     action = "; ".join(f"{_call(term)}: {_summary(term)}" for term in cfg.actions.values())
     action += f"; clipped to +-{cfg.action_clip:g}" if cfg.action_clip else ""
