@@ -274,6 +274,7 @@ def test_list_envs(call, monkeypatch):
         (["nero", "--render", "nowhere/nero.png"], "cannot write nowhere/nero.png: the folder nowhere does not exist"),
         (["nero", "--json", "."], "--json takes a name that ends in .json, got '.'"),
         (["nero", "--jsn", "x"], "unknown argument '--jsn'"),
+        (["nero_lift", "--object", "mug"], "--object shows an object alone: leave out nero_lift"),
     ],
 )
 def test_mistakes_end_in_one_line_and_leave_nothing(call, tmp_path, argv, message):
