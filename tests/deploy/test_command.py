@@ -66,7 +66,7 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
         (("--arm", "sim", "--speed", "2"), "--speed"),
         (("--arm", "sim", "--hottest", "1000"), "--hottest"),
         (("--arm", "sim", "--log", "nowhere/log.csv"), "the folder nowhere does not exist"),
-        (("--arm", "piper", "--emulate"), "the policy is for so_arm101, but --arm piper is a piper"),
+        (("--arm", "piper", "--emulate"), "--arm piper is a piper, not a so_arm101"),
         (("--arm", "so101", "--port", "/dev/nothing", "--object", "0.2,0,0.015"), "needs --calibration"),
         (("--arm", "sim", "--object", "udp://x"), "an object's address takes udp://HOST:PORT"),
     ],
