@@ -21,7 +21,7 @@ COMMANDS = {
     "benchmark": ("mjx_nero.tools.benchmark.command", "main", "measure the speed of this machine"),
     "results": ("mjx_nero.tools.results", "main", "measure how every environment learns and what the bundled policies achieve"),
     "public-robots": ("mjx_nero.tools.public_robots", "main", "import and test public robot descriptions, and write their table"),
-    "list-envs": ("mjx_nero.tools.list_envs", "main", "list the environments: task, robot, presets"),
+    "list-envs": ("mjx_nero.tools.list_envs", "main", "list the environments: robot, presets, bundled policies"),
     "inspect": ("mjx_nero.tools.inspect", "main", "show a robot, a model folder or an environment: joints, gains, contacts"),
     "import-urdf": ("mjx_nero.tools.import_urdf", "main", "make a model folder from a URDF"),
     "tune-gains": ("mjx_nero.tools.tuning", "main", "propose stiffness and damping from step responses"),

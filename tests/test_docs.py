@@ -2,6 +2,7 @@
 
 import ast
 import fnmatch
+import itertools
 import pathlib
 import re
 import shlex
@@ -14,8 +15,10 @@ import yaml
 from PIL import Image
 
 import mjx_nero
+from mjx_nero import config
 from mjx_nero.__main__ import COMMANDS
 from mjx_nero.learn import header, policy
+from mjx_nero.runs import cfg
 from mjx_nero.sim import robot_file
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli, results
@@ -103,6 +106,28 @@ def test_commands_and_their_flags_exist(page, monkeypatch):
         used = [word.partition("=")[0] for word in argv if word.startswith("--")]
         wrong = [flag for flag in used if flag not in flags and flag.removeprefix("--").partition(".")[0] not in prefixes]
         assert not [flag for flag in wrong if flag != "--help"], words
+
+
+OWN = {"./my_arm": "nero", "./so101": "so_arm101", "./my_nero": "nero"}  # folders that a page's commands make
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_dotted_flags_name_fields_and_have_values_that_these_take(page):
+    for words in commands(page.read_text()):
+        given = {flag: value for flag, value in itertools.pairwise([*words, ""]) if flag.startswith("--")}
+        fields: dict[str, dict[str, str]] = {}
+        for flag, value in given.items():
+            prefix, _, name = flag[2:].partition(".")
+            if name:
+                fields.setdefault(prefix, {})[name] = value
+        if "--load" in given or not fields:
+            continue
+        env = next((word for word in words if word in mjx_nero.list_envs()), "nero_lift")
+        preset, robot = given.get("--preset", "default"), given.get("--robot")
+        run = cfg.resolve(env, preset, OWN.get(robot, robot), fields.pop("env", {}), {}, given.get("--learner", ""))
+        for learner, changes in fields.items():
+            assert learner == run.learner, words
+            config.override(run.hyperparameters, changes)
 
 
 def test_the_first_commands_leave_a_clone_clean():

@@ -153,6 +153,23 @@ def test_long_functions_are_found(tmp_path):
     assert not long_functions(path)
 
 
+def test_whoever_imports_brax_or_mjx_silences_them_first():
+    """Otherwise MJX prints that it has no Warp, depending on which module of the package comes first."""
+    loud = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        names = [name for node in ast.parse(path.read_text()).body for name in _names(node)]
+        heavy = [k for k, name in enumerate(names) if name.startswith(("brax.", "mujoco.mjx"))]
+        if heavy and "mjx_nero.sim.quiet" not in names[: heavy[0]]:
+            loud.append(path)
+    assert not loud
+
+
+def _names(node: ast.stmt) -> list[str]:
+    if isinstance(node, ast.ImportFrom):
+        return [f"{node.module}.{name.name}" for name in node.names]
+    return [name.name for name in node.names] if isinstance(node, ast.Import) else []
+
+
 if __name__ == "__main__":
     for name, count in (counted := core()).items():
         print(f"{name:12}{count:7,}")

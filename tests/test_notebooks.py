@@ -138,14 +138,14 @@ def test_controllers_do_their_tasks_in_the_notebook(motion_outputs):
     assert _figure(r"([\d,]+) control steps/s", text) > 100
 
 
-def test_shipped_policy_succeeds_in_the_notebook(outputs):
+def test_bundled_policy_succeeds_in_the_notebook(outputs):
     assert _figure(r"success rate over 64 episodes: ([\d.]+)", _text(outputs)) >= 0.9
 
 
 def test_reward_terms_tell_the_policy_from_no_action(outputs):
     text = _text(outputs)
     idle = _figure(r"return, no action: (-?[\d.]+)", text)
-    assert _figure(r"return, the shipped policy: (-?[\d.]+)", text) > 10 * max(idle, 1.0)
+    assert _figure(r"return, the bundled policy: (-?[\d.]+)", text) > 10 * max(idle, 1.0)
 
 
 def test_changed_config_changes_the_reward(outputs):

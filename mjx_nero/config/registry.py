@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import TypeVar
 
-from mjx_nero.config.values import hint, read, short
+from mjx_nero.config.values import choices, hint, read, short
 from mjx_nero.errors import UserError
 
 Thing = TypeVar("Thing")
@@ -44,8 +44,8 @@ def pick(table: Mapping[str, Thing], name: str, kind: str) -> Thing:
     """Looks up a name.
 
     Raises:
-        UserError: the table does not have it; the message lists the names that it has.
+        UserError: the table does not have it; the message lists the names that it has, or the nearest.
     """
     if read(str, name, kind) not in table:
-        raise UserError(f"unknown {kind} {short(name)}{hint(name, table)}: choose one of {', '.join(table)}")
+        raise UserError(f"unknown {kind} {short(name)}{hint(name, table)}: {choices(name, table)}")
     return table[name]

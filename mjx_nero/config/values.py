@@ -29,6 +29,15 @@ def hint(name: str, valid: Iterable[str]) -> str:
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
+def choices(name: str, valid: Iterable[str], most: int = 30) -> str:
+    """Lists the valid names, for the end of a message; if there are more than ``most``, only the nearest."""
+    names = list(valid)
+    if len(names) <= most:
+        return f"choose one of {', '.join(names)}"
+    near = difflib.get_close_matches(name[:100], names, n=6, cutoff=0.0)
+    return f"choose one of {len(names)}, such as {', '.join(near)}"
+
+
 def short(value: Any) -> str:
     """Formats a value for a message as one short line, however large the value is."""
     cut = reprlib.Repr()

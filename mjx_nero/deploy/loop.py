@@ -138,13 +138,13 @@ def run(
     dt = float(brain.metadata["control_dt"])
     gc.disable()  # a collection takes longer than the allowed jitter
     brain.begin(observer, arm.read(), delay)
-    timing, limited, late, k = Timing(), dict[str, int](), 0, 0
+    timing, limited, late, k, done = Timing(), dict[str, int](), 0, 0, Fault("stop", f"{seconds:g} s are over")
     begun = clock.now()
     try:
         while arm.fault is None:
             due = begun + k * dt
             clock.sleep_until(due)
-            if ending := stop() or (Fault("stop", "its time is over") if k * dt >= seconds else None):
+            if ending := stop() or (done if k * dt >= seconds else None):
                 arm.hold(ending)
                 break
             for name in _cycle(arm, brain, clock, due, timing):
@@ -159,7 +159,7 @@ def run(
                 arm.hold(Fault("deadline", f"{late} cycles in a row were late"))
     finally:
         gc.enable()
-    return Report(arm.fault or Fault("stop", "its time is over"), timing, limited)
+    return Report(arm.fault or done, timing, limited)
 
 
 def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing) -> tuple[str, ...]:

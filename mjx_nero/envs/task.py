@@ -88,7 +88,7 @@ class ThingCfg:
 
     Attributes:
         file: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name. Empty: none.
-        scale: factor of its lengths.
+        scale: factor of the mesh's lengths.
         density: density [kg/m3]; 0: that of its ``object.yaml``, or else 500.
     """
 

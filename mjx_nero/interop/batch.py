@@ -1,5 +1,8 @@
 """A batch of environments that restarts ended episodes, and returns how they ended."""
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 _GAP = 3  # maximum gap between two columns of a table
+_WRAPPED = 30  # width that a column keeps when its text wraps
 _BAR = (BarColumn(bar_width=14), TextColumn("{task.percentage:3.0f}%  {task.fields[text]}"))  # fits 80 columns
 
 
@@ -43,11 +44,13 @@ class Table:
     Attributes:
         columns: headings of the columns; if all are empty, there is no heading row.
         left: columns that are aligned left; the first column always is.
+        wraps: columns whose text continues on the next line where the table is too wide.
     """
 
     title: str
     columns: Sequence[str]
     left: Sequence[str] = ()
+    wraps: Sequence[str] = ()
     caption: str = ""
     rows: list[tuple[str, ...]] = dataclasses.field(default_factory=list)
 
@@ -82,6 +85,7 @@ class Table:
         widths = [
             max(len(line) for row in (self.columns, *self.rows) for line in row[i].split("\n")) for i in range(len(self.columns))
         ]
+        widths = [min(n, _WRAPPED) if name in self.wraps else n for n, name in zip(widths, self.columns, strict=True)]
         parts, used = [[0]], widths[0]
         for i in range(1, len(widths)):
             if len(parts[-1]) > 1 and used + _GAP + widths[i] > width:
@@ -92,11 +96,12 @@ class Table:
         return parts
 
 
-def compiling(impl: str) -> str:
+def compiling(impl: str, on_cpu: bool) -> str:
     """Announces the wait before training."""
-    if impl == "native":  # JAX's cache cannot hold programs with callbacks
-        return "compiling (about half a minute; programs that call MuJoCo's C library are compiled at every start) ..."
-    return "compiling (a minute or two the first time, a few seconds once the compiled programs are kept) ..."
+    first = "about half a minute" if impl == "native" else "a minute or two"
+    if impl == "native" and not on_cpu:  # JAX's cache cannot hold an accelerator's programs that call back
+        return f"compiling ({first}; programs that call MuJoCo's C library are compiled at every start) ..."
+    return f"compiling ({first} the first time, a few seconds once the compiled programs are kept) ..."
 
 
 def clock(seconds: float) -> str:

@@ -20,7 +20,7 @@ class EvalCfg:
 
     Attributes:
         robot: robot instead of the environment's own, by name or folder.
-        agent: who plays (default: the bundled policy, or the task's controller if there is none).
+        agent: who plays, if not a controller (default: the bundled policy, or the task's controller if there is none).
         policy: policy file (default: the environment's bundled policy).
         any_robot: also play a policy that was trained for another model of the robot.
         controller: play one of the task's controllers instead of an agent; expert: the first of them.

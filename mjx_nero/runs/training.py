@@ -110,7 +110,7 @@ def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pat
     """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
-    with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl)):
+    with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl, jax.default_backend() == "cpu")):
         importlib.import_module("tensorboardX")  # takes seconds if PyTorch is installed
         made = compiled.compile(run, learner, chunk, start)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""

@@ -61,7 +61,8 @@ class GripperCfg(DriveCfg):
     """Drives with an open and a closed target. Without a gripper, it has no joints.
 
     Attributes:
-        open, close: targets of the two actions [rad] or [m].
+        open: targets that open the gripper [rad] or [m].
+        close: targets that close it [rad] or [m].
         gap: ``positions [n] -> distance between the fingers' pads [m]``; None: unknown. The default suits two opposed slides.
         positions: inverse of ``gap``.
     """
@@ -90,7 +91,8 @@ class RobotCfg:
         workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
             draw their commands from it by default.
         floor: height of the floor under a robot beside the table [m]; 0: the robot stands on the table.
-        opening, closed: distance between the pads of the open and of the closed gripper [m]; an opening of 0: unknown.
+        opening: distance between the pads of the open gripper, along the line on which the pads close [m]; 0: unknown.
+        closed: the same of the closed gripper [m].
         pad: size of a pad along the approach, across it, and along the opening [m]; zeros: unknown.
         grip: centre of a held cube in the frame of ``ee_site`` [m].
         pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the

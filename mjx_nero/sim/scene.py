@@ -32,7 +32,8 @@ class SceneCfg:
     that counts an object beyond them as fallen.
 
     Attributes:
-        table_center, table_size: centre and size of the drawn top, along x and y.
+        table_center: centre of the drawn table top, along x and y.
+        table_size: size of the drawn table top, along x and y.
         table: False draws the table but lets nothing touch it; without contacts the physics is several times faster.
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
@@ -44,14 +45,15 @@ class SceneCfg:
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
         goal_edge: edge of the ``cube`` marker.
-        look_at, view_distance: point that the viewer's cameras look at, and their distance from it.
-        view_from: direction from there to the camera ``front``.
+        look_at: point that the cameras for people look at.
+        view_distance: distance of these cameras from that point.
+        view_from: direction from that point to the camera ``front``.
         distractors: number of things without collisions that cameras may see (``mdp.looks.places`` places them).
         backdrop: adds a wall behind the robot, which only cameras see.
         photographs: folder with the user's pictures (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.
         patterns: number of patterns that ``mdp.looks.patterns`` may show.
         cameras: cameras of terms and policies, by name.
-        renderer: draws their pictures: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: ``mujoco`` with
+        renderer: draws what cameras see: ``mujoco`` (OpenGL), ``warp`` (MuJoCo Warp's ray tracer), or ``auto``: ``mujoco`` with
             native physics, otherwise ``warp``.
     """
 
@@ -91,7 +93,7 @@ class SimCfg:
     dt: Annotated[float, Bounds(1e-6, 1.0)] = 0.01  # physics step [s]
     decimation: Annotated[int, Bounds(1, 10_000)] = 2  # physics steps per control step
     iterations: Iterations = 10  # most iterations of the constraint solver
-    ls_iterations: Iterations = 50  # most iterations of its line search (MJX-JAX 20); at 20, MuJoCo's C library may throw a cube
+    ls_iterations: Iterations = 50  # most iterations of the solver's line search (MJX-JAX 20); with 20, MuJoCo C may throw cubes
     ramp: bool = False  # spreads a change of the drives' targets over the control step: stiff drives would jerk otherwise
     impratio: Positive = 10.0  # stiffness of friction relative to normal forces: high enough that grasps do not creep
     elliptic: bool = True  # elliptic friction cones; False: pyramidal

@@ -131,7 +131,7 @@ class Parser(argparse.ArgumentParser):
             flag, equals, value = rest.pop(0).partition("=")
             prefix, _, name = flag.removeprefix("--").partition(".")
             if not flag.startswith("--") or prefix not in dotted or not name:
-                self.error(f"unknown argument {values.short(flag)}")
+                self.error(f"unknown argument {values.short(flag)}{values.hint(flag, self._option_string_actions)}")
             if not equals:
                 if not rest:
                     self.error(f"{values.short(flag)[1:-1]} needs a value")

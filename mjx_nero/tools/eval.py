@@ -119,7 +119,9 @@ def table(result: dict[str, Any]) -> console.Table:
     distances = f"{figure('final_distance_mean', 100)} cm mean, {figure('final_distance_median', 100)} cm median"
     view.add("final distance", distances)
     if "settled_error_max" in result:
-        view.add("second half", f"{figure('settled_error_mean', 100)} cm mean, {figure('settled_error_max', 100)} cm at most")
+        view.add(
+            "error, second half", f"{figure('settled_error_mean', 100)} cm mean, {figure('settled_error_max', 100)} cm at most"
+        )
     if "grasp_rate" in result:
         grasp = result["time_to_grasp_mean"]
         view.add("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
@@ -129,7 +131,7 @@ def table(result: dict[str, Any]) -> console.Table:
     if "touched_mean" in result:
         view.add("touched", f"{result['touched_mean']:.1%}")
     calm = figure("target_change_mean", 1000, 1), figure("joint_acc_mean", 1, 1)
-    view.add("a control step", f"targets move {calm[0]} mrad, joints gain {calm[1]} rad/s²")
+    view.add("motion", f"targets move {calm[0]} mrad per control step, joints accelerate by {calm[1]} rad/s²")
     view.add("return", figure("return_mean"))
     for name, value in result["return_by_term"].items():
         view.add(f"  {name}", "-" if value is None else f"{value:.3f}")

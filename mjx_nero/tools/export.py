@@ -1,6 +1,5 @@
 """The command ``export``: writes a policy as ONNX, for machines without this package."""
 
-import pathlib
 from collections.abc import Sequence
 
 from mjx_nero import config, files
@@ -33,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
 
     onnx_package = need("onnx", "onnx")
     cli.setup_jax()
-    path = bundled.names().get(args.policy) or pathlib.Path(args.policy)
+    path = bundled.find(args.policy)
     meta = policy.load(path).meta
     env = ManipulationEnv(config.override(registry.env_cfg(meta["env"], meta["preset"], args.robot), dotted["env"]))
     trained = policy.load_for(env, meta["env"], path)

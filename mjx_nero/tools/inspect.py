@@ -33,6 +33,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--json", type=cli.output(".json"), metavar="FILE", help="write everything as JSON, for programs")
     args, dotted = parser.parse(argv, ("env",))
     if args.object is not None:
+        if args.name is not None:
+            parser.error(f"--object shows an object alone: leave out {args.name}")
         return _thing(args)
     if dotted["env"] and not args.cameras:
         parser.error("fields of the environment only affect its cameras: pass --cameras FILE, too")

@@ -1,11 +1,9 @@
 """The command ``list-envs``."""
 
 import dataclasses
-import pkgutil
 from collections.abc import Sequence
 
-from mjx_nero import tasks
-from mjx_nero.learn.bundled import shipped
+from mjx_nero.learn import bundled
 from mjx_nero.runs import console
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
@@ -21,30 +19,34 @@ def main(argv: Sequence[str]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Environment:
-    """A row of ``list-envs``; ``robot`` is None if the environment takes any robot."""
+    """A row of ``list-envs``; ``robot`` is None if the environment takes any robot.
+
+    Attributes:
+        bundled: presets with a bundled policy of their own.
+    """
 
     name: str
-    task: str
     robot: str | None
     presets: tuple[str, ...]
-    policy: bool
+    bundled: tuple[str, ...]
 
 
 def environments() -> tuple[Environment, ...]:
     """Lists all environments, without building scenes or tracing functions; sizes are shown by ``inspect``."""
-    known = [module.name for module in pkgutil.iter_modules(tasks.__path__)]
+    policies = bundled.names()
     out = []
     for name in registry.list_envs():
-        task, robot = next((task for task in known if name.endswith(task)), name), registry.robot_of(name)
-        bundled = robot is not None and shipped(name).is_file()
-        out.append(Environment(name, task, robot.name if robot else None, registry.list_presets(name), bundled))
+        robot, presets = registry.robot_of(name), registry.list_presets(name)
+        own = tuple(preset for preset in presets if (name if preset == "default" else f"{name}_{preset}") in policies)
+        out.append(Environment(name, robot.name if robot else None, presets, own))
     return tuple(out)
 
 
 def environment_table(rows: Sequence[Environment]) -> console.Table:
     """Makes a table with one row per environment."""
-    columns = ("name", "task", "robot", "presets", "policy")
-    view = console.Table("environments", columns, left=columns)
+    columns = ("name", "robot", "presets")
+    view = console.Table("environments", columns, left=columns, wraps=columns[2:], caption="*: has a bundled policy")
     for row in rows:
-        view.add(row.name, row.task, row.robot or "any (--robot)", ", ".join(row.presets), "bundled" if row.policy else "")
+        presets = (f"{preset}*" if preset in row.bundled else preset for preset in row.presets)
+        view.add(row.name, row.robot or "any (--robot)", ", ".join(presets))
     return view

@@ -108,7 +108,7 @@ def home(search: Search, amid: Float[np.ndarray, "n k"], place: Place, name: str
             best, way = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
     if not len(poses):
         return _clear(search, name, notes), place.ways[0][1]
-    where = "amid the workspace" if best < len(amid) else "over the place to grasp at"
+    where = "over the middle of the workspace" if best < len(amid) else "over the middle of pick"
     notes.add("guessed", "robot", name, f"home: {where} (--home changes it)")
     return search.pose(poses[best]), place.ways[way][1]
 

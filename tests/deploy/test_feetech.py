@@ -346,7 +346,7 @@ def test_calibrations_that_are_wrong(tmp_path, told, field, value, message):
 
 
 def test_another_robots_policy_is_refused(told):
-    with pytest.raises(UserError, match="the policy is for so_arm101, but --arm so100 is a so_arm100"):
+    with pytest.raises(UserError, match="--arm so100 is a so_arm100, not a so_arm101"):
         drivers.make("so100", {"port": "/dev/null", "calibration": "c.json"}, told, arms.Clock())
 
 

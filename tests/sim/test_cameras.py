@@ -4,6 +4,7 @@ import dataclasses
 import math
 import pathlib
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from mjx_nero.sim import cameras, scene
 from mjx_nero.sim.cameras import opengl, places
 from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
 from mjx_nero.tasks import registry
+from mjx_nero.tools.inspection import report
 from mjx_nero.types import Scenery, UserError
 
 # Straight above the cube, which is 3 cm wide and lies at (0.35, 0.1), 64 pixels over 8 degrees from a metre above the table.
@@ -48,6 +50,16 @@ def worlds():
         return jax.jit(jax.vmap(eyes))(jnp.asarray(qpos, jnp.float32), unseen)
 
     return model, {name: jax.device_get(draw(name)) for name in ("mujoco", "warp")}
+
+
+def test_without_warp_mujoco_draws(monkeypatch):
+    """Also with physics that would draw by Warp, and for a command that only looks."""
+    monkeypatch.setitem(sys.modules, "warp", None)
+    monkeypatch.setattr(cameras.importlib.util, "find_spec", lambda name: None)
+    assert [cameras.renderer("auto", impl) for impl in ("jax", "native")] == ["mujoco", "mujoco"]
+    assert report.inspect("nero_lift", preset="rgb").task.observations["pictures"]["front"] == 64 * 64 * 3
+    with pytest.raises(UserError, match=r"^the renderer warp needs the extra cuda .*: use mujoco or auto here$"):
+        mjx_nero.make("nero_lift", "rgb", impl="native", **{"scene.renderer": "warp"}).cameras  # noqa: B018
 
 
 @pytest.mark.parametrize("renderer", ["mujoco", "warp"])

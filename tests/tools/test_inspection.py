@@ -16,7 +16,7 @@ from mjx_nero.sim.robot import ASSETS, GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import list_envs, motion
-from mjx_nero.tools.inspection import cameras, report
+from mjx_nero.tools.inspection import cameras, report, tables
 from mjx_nero.types import UserError
 
 NERO, COBOTTA = (registry.robot(name) for name in ("nero", "cobotta_pro_900"))
@@ -41,12 +41,14 @@ def test_list_envs_at_eighty_columns(environments):
     rows, screen = environments, Console(width=80)
     with screen.capture() as said:
         screen.print(list_envs.environment_table(rows))
+    lines = said.get().splitlines()
+    assert max(map(len, lines)) <= 80 and not any("continued" in line for line in lines)
     words = said.get().split()
     for row in rows:
-        assert row.name in words and (row.robot or "any") in words and row.task in words
-    policies = [name for name in registry.list_envs() if (ASSETS / "policies" / f"{name}.safetensors").is_file()]
-    assert words.count("bundled") == len(policies) > 40
-    assert sum(row.task == "follow_target" for row in rows) == 3 and words.count("any") == sum(not row.robot for row in rows)
+        assert row.name in words and (row.robot or "any") in words
+    assert "\n".join(lines).count("*") - 1 == len(list((ASSETS / "policies").glob("*.safetensors"))) > 40
+    assert sum(row.name.endswith("follow_target") for row in rows) == 3
+    assert words.count("any") == sum(not row.robot for row in rows)
 
 
 def test_joints_of_nero(nero):
@@ -191,14 +193,20 @@ def test_environments(environments):
     rows = {row.name: row for row in environments}
     assert tuple(rows) == registry.list_envs()
     lift, goal = rows["nero_lift"], rows["cobotta_follow_target"]
-    assert (lift.task, lift.robot, lift.presets, lift.policy) == (
-        "lift",
+    assert (lift.robot, lift.presets, lift.bundled) == (
         "nero",
         ("default", "isaac", "sim2real", "rgb", "depth", "rgbd", "rgb_fixed", "depth_fixed", "rgbd_fixed", "sim2real_rgb"),
-        True,
+        ("default", "sim2real", "rgb"),
     )
-    assert (goal.task, goal.robot, goal.policy) == ("follow_target", "cobotta_pro_900", False)
-    assert (rows["reach"].robot, rows["reach"].policy) == (None, False)
+    assert (goal.robot, goal.bundled) == ("cobotta_pro_900", ())
+    assert (rows["reach"].robot, rows["reach"].bundled) == (None, ())
+
+
+def test_a_jaw_that_swings_open_says_how_much_fits(cobotta):
+    swings = dataclasses.replace(cobotta, gaps=(0.1156, 0.0), room=0.067)
+    for hand, said in ((swings, "only 67 mm fit"), (cobotta, None)):
+        captions = [table.caption for table in tables.tables(hand) if table.title == "gripper"]
+        assert len(captions) == 1 and (said in captions[0] if said else not captions[0])
 
 
 # --- the programs
@@ -266,6 +274,7 @@ def test_list_envs(call, monkeypatch):
         (["nero", "--render", "nowhere/nero.png"], "cannot write nowhere/nero.png: the folder nowhere does not exist"),
         (["nero", "--json", "."], "--json takes a name that ends in .json, got '.'"),
         (["nero", "--jsn", "x"], "unknown argument '--jsn'"),
+        (["nero_lift", "--object", "mug"], "--object shows an object alone: leave out nero_lift"),
     ],
 )
 def test_mistakes_end_in_one_line_and_leave_nothing(call, tmp_path, argv, message):
@@ -274,9 +283,9 @@ def test_mistakes_end_in_one_line_and_leave_nothing(call, tmp_path, argv, messag
     assert not list(tmp_path.iterdir())
 
 
-def test_unknown_names_list_the_known_ones():
-    with pytest.raises(UserError, match="choose one of .*nero, .*cobotta_lift, .*, or the folder of a robot"):
-        report.find("something")
+def test_unknown_names_list_the_nearest_ones():
+    with pytest.raises(UserError, match="did you mean 'nero_lift'.*choose one of .*nero_lift, .*, or the folder of a robot"):
+        report.find("nero_lif")
 
 
 def test_a_sheet_of_pictures_draws_each_once(monkeypatch):

@@ -31,14 +31,14 @@ def can_draw():
 
 
 MISTAKES = [
-    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of cobotta_lift"),
+    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of"),
     ("train", ["--preset", "isac"], "unknown preset of nero_lift 'isac' (did you mean 'isaac'?): choose one of default, isaac"),
     ("train", ["--env.sim.td", "0.01"], "no field 'sim.td': 'td' is not one of dt, decimation"),
     ("train", ["--env.rewards.reaching_object.params.sdt=1"], "(did you mean 'std'?)"),
     ("train", ["--env.sim.dt", "fast"], "sim.dt takes a finite number, got 'fast'"),
     ("train", ["--env.sim.dt"], "--env.sim.dt needs a value"),
     ("train", ["--ppo.num_epoch", "3"], "(did you mean 'num_epochs'?)"),
-    ("train", ["--numenvs", "3"], "unknown argument '--numenvs'"),
+    ("train", ["--numenvs", "3"], "unknown argument '--numenvs' (did you mean '--num-envs'?)"),
     ("train", ["--num-envs", "many"], "--num-envs takes a whole number, got 'many'"),
     ("train", ["--num-timesteps", "0"], "at least 1, got '0'"),
     ("train", ["--num-envs", "100"], "num_envs (100) must be a multiple of ppo.num_minibatches (8)"),
@@ -48,6 +48,7 @@ MISTAKES = [
     ("train", ["--restore", "."], "holds no checkpoint to restore"),
     ("train", ["--out", "/proc/run"], "cannot write to /proc/run"),
     ("eval", ["--env", "nero"], "unknown env 'nero'"),
+    ("mjx_nero", ["export", "nero_lfit", "--out", "x.onnx"], "no bundled policy 'nero_lfit' (did you mean 'nero_lift'?)"),
     ("eval", ["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
     ("eval", ["--policy", "README.md"], "is not a policy or checkpoint of mjx_nero, or it is damaged"),
     ("eval", ["--preset", "isaac"], "was trained on other observations (preset default): pass --preset default"),

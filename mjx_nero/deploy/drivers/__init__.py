@@ -23,7 +23,7 @@ def check(kind: str, metadata: Mapping[str, Any]) -> None:
     if kind not in KINDS:
         raise UserError(f"no arm {kind!r}: choose one of {', '.join(KINDS)}")
     if (wanted := _ROBOTS.get(kind, metadata["robot"])) != metadata["robot"]:
-        raise UserError(f"the policy is for {metadata['robot']}, but --arm {kind} is a {wanted}: pass another --arm or policy")
+        raise UserError(f"--arm {kind} is a {wanted}, not a {metadata['robot']}: pass another --arm, policy or --robot")
 
 
 def ports(kind: str, options: Mapping[str, Any]) -> list[str]:

@@ -8,6 +8,9 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np

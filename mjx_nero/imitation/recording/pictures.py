@@ -22,6 +22,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.imitation.recording.batches import Batches
 from mjx_nero.imitation.recording.page_locked import PageLocked
 from mjx_nero.sim.cameras.cfg import MARK
+from mjx_nero.sim.physics import warp_available
 from mjx_nero.sim.render import Renderer
 from mjx_nero.types import Scenery
 
@@ -39,7 +40,7 @@ class Cameras:
     Args:
         names: names of cameras; ``front+wrist`` is one picture of both, side by side.
         size: width and height [pixels], even because encoders need it; None: each camera's own.
-        renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp if JAX has a GPU.
+        renderer: ``mujoco``, or ``warp`` for the scene's own cameras. auto: warp if it is installed and JAX has a GPU.
 
     Attributes:
         sizes: width and height of each camera's pictures, by name.
@@ -86,7 +87,7 @@ class Cameras:
 
 def chosen(renderer: str) -> str:
     """Returns the renderer that draws the scene's own cameras; ``renderer`` may be auto."""
-    return renderer if renderer != "auto" else "warp" if jax.default_backend() == "gpu" else "mujoco"
+    return renderer if renderer != "auto" else "warp" if warp_available() else "mujoco"
 
 
 def _beside(name: str, sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import numpy as np
 from brax.envs.base import State

@@ -10,6 +10,9 @@ needs imitation to last (``PpoCfg.imitation_lasts``): its policy stops trying so
 from collections.abc import Mapping
 from typing import Any
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import optax

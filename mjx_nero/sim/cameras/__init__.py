@@ -5,6 +5,7 @@ Each drawer is one module with one class; ``Cameras`` picks one. All drawers dra
 
 import copy
 import importlib
+import importlib.util
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -17,7 +18,7 @@ from mjx_nero.sim.cameras.cfg import CameraCfg as CameraCfg
 from mjx_nero.sim.cameras.look import Look as Look
 from mjx_nero.sim.cameras.look import rows
 from mjx_nero.sim.fields import nominal
-from mjx_nero.types import Picture, Scenery
+from mjx_nero.types import Picture, Scenery, UserError
 
 _DRAWERS = {"mujoco": ("opengl", "OpenGL"), "warp": ("raytracer", "RayTracer")}
 _UNSEEN = 5  # geom group that no camera sees: the goal's marker is for people
@@ -59,6 +60,8 @@ class Cameras:
     """
 
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], renderer: str, fields: Sequence[str] = ()):
+        if renderer == "warp" and not _has_warp():
+            raise UserError("the renderer warp needs the extra cuda (pip install 'mjx-nero[cuda]'): use mujoco or auto here")
         model = copy.copy(model)
         model.geom_group[model.geom_bodyid == model.body("goal").id] = _UNSEEN
         self._model, self._names = model, tuple(cfg)
@@ -84,4 +87,8 @@ class Cameras:
 
 def renderer(asked: str, impl: str) -> str:
     """Returns the renderer for ``SceneCfg.renderer`` and the physics' ``impl``."""
-    return ("mujoco" if impl == "native" else "warp") if asked == "auto" else asked
+    return ("mujoco" if impl == "native" or not _has_warp() else "warp") if asked == "auto" else asked
+
+
+def _has_warp() -> bool:
+    return importlib.util.find_spec("warp") is not None

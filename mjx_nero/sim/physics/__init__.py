@@ -103,7 +103,7 @@ def resolve_impl(impl: str) -> str:
     if impl == "auto":
         return "warp" if warp_available() else "native" if jax.default_backend() == "cpu" else "jax"
     if impl == "warp" and not warp_available():
-        raise UserError("impl 'warp' needs an NVIDIA GPU and the cuda extra (pip install -e '.[cuda]'): use --impl auto here")
+        raise UserError("impl 'warp' needs an NVIDIA GPU and the cuda extra (pip install 'mjx-nero[cuda]'): use --impl auto here")
     return impl
 
 

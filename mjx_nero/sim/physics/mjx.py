@@ -4,6 +4,9 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import mujoco

@@ -110,7 +110,7 @@ def _coarser(mesh: trimesh.Trimesh, most: int, force: float = 7) -> trimesh.Trim
     if len(mesh.faces) <= most:
         return mesh
     if importlib.util.find_spec("fast_simplification") is None:
-        raise UserError(f"has more than {most:,} triangles: make it coarser, or install the extra (pip install -e '.[meshes]')")
+        raise UserError(f"has more than {most:,} triangles: make it coarser, or pip install 'mjx-nero[meshes]'")
     import fast_simplification
 
     vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
@@ -144,7 +144,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
             return [np.asarray(hull.vertices) for hull in hulls]
     if importlib.util.find_spec("coacd") is None:
         raise UserError(
-            "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install -e '.[meshes]')"
+            "is not convex, and cutting it into convex parts needs coacd: install the extra (pip install 'mjx-nero[meshes]')"
         )
     coarse = _coarse(mesh)
     given = io.BytesIO()

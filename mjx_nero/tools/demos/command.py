@@ -94,9 +94,7 @@ def write(cfg: DemosCfg, out: pathlib.Path) -> None:
             elif none >= making.HOPELESS:
                 raise UserError(f"none of {none} episodes succeeded: try another --agent, or keep them with --all")
         frames, new = int(form.lengths.sum()), len(form.lengths) - before
-    took = (
-        f"{time.perf_counter() - begun:.1f} s ({time.process_time() - busy:.1f} s of the processor's cores), compilation included"
-    )
+    took = f"{time.perf_counter() - begun:.1f} s ({time.process_time() - busy:.1f} s of core time), compilation included"
     print(f"{out}: {len(form.lengths)} episodes, {frames} steps; {new} new, from {tries} played in {took}")
 
 

@@ -79,7 +79,7 @@ def overview(path: pathlib.Path, found: Dataset) -> console.Table:
         table.add("lengths", f"{shown}  {histogram(lengths)}")
     if names.ACTION in schema.features and names.EXECUTED in schema.features and schema.about.get("actions") != "hand":
         off = found.column(names.ACTION) - found.column(names.EXECUTED)
-        table.add("noise done", f"{off.std():.4g} (standard deviation of executed actions from their labels, over all joints)")
+        table.add("deviation", f"{off.std():.4g} (of executed actions from their labels, standard deviation over all joints)")
     return table
 
 

@@ -3,6 +3,9 @@
 import dataclasses
 import pathlib
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -22,20 +22,20 @@ _HEAD = """\
 
 def table(joints: Sequence[str], fit: Fit, nominal: Drives) -> Table:
     """Makes the table of identified drives, one row per joint."""
-    unit = "error held out [mrad, mm]"
     view = Table(
-        "identified, with 95% intervals (the model's own)", ("joint", *POSITIVE, "offset [mrad, mm]", unit, "the model's own")
+        "identified, with 95% intervals (the model's own)",
+        ("joint", *POSITIVE, "offset [mrad, mm]", "error held out [mrad, mm]"),
     )
     for i, joint in enumerate(joints):
         cells = []
         for name in POSITIVE:
             value, low, high, own = (float(getattr(x, name)[i]) for x in (fit.drives, fit.low, fit.high, nominal))
-            cells.append(f"{value:.4g} +-{(high - low) / 2:.1g} ({own:.3g})")
+            cells.append(f"{value:.4g} +-{_digit((high - low) / 2)} ({own:.3g})")
         offset, width = fit.drives.offset[i], (fit.high.offset - fit.low.offset)[i] / 2
-        cells += [f"{1e3 * offset:.2f} +-{1e3 * width:.1g}", f"{1e3 * fit.rms[i]:.3f}", f"{1e3 * fit.nominal_rms[i]:.3f}"]
+        cells += [f"{1e3 * offset:.2f} +-{_digit(1e3 * width)}", f"{1e3 * fit.rms[i]:.3f} ({1e3 * fit.nominal_rms[i]:.3g})"]
         view.add(joint, *cells)
     half = (fit.high.delay - fit.low.delay) / 2
-    view.caption = f"delay {1e3 * fit.drives.delay:.2f} +-{1e3 * half:.1g} ms"
+    view.caption = f"delay {1e3 * fit.drives.delay:.2f} +-{_digit(1e3 * half)} ms"
     return view
 
 
@@ -81,3 +81,8 @@ def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> 
     figure.supxlabel("time [s]", fontsize=9)
     with files.whole(path) as part:
         figure.savefig(part, dpi=110)
+
+
+def _digit(value: float) -> str:
+    """Formats a number with one significant digit, without an exponent if it is large."""
+    return f"{float(f'{value:.1g}'):g}"

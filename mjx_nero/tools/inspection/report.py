@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import config
-from mjx_nero.config import docs
+from mjx_nero.config import docs, values
 from mjx_nero.config.bounds import Range
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
@@ -81,6 +81,7 @@ class Report:
     Attributes:
         open, close: targets of the gripper's joints, in order [rad or m].
         gaps: distance between the pads, open and closed [m]; None: unknown, or no gripper.
+        room: ``opening`` of an imported robot: less than the open gap if a jaw swings out to the side [m]; 0: unknown.
         regions: ``workspace``, ``pick`` and ``hold`` of ``RobotCfg``, if it has them: ranges of x, y and z [m].
         sites: name -> position at home, world frame [m].
         masses: body -> mass [kg], of the robot only.
@@ -95,6 +96,7 @@ class Report:
     open: tuple[float, ...]
     close: tuple[float, ...]
     gaps: Range | None
+    room: float
     regions: dict[str, Box]
     actuators: tuple[Actuator, ...]
     sites: dict[str, tuple[float, float, float]]
@@ -128,7 +130,7 @@ def find(name: str, preset: str | None = None, robot: str | None = None) -> tupl
     known = (*registry.list_robots(), *registry.list_envs())
     if name not in known and not pathlib.Path(name).is_dir():
         hint = config.hint(name, known)
-        raise UserError(f"no robot or environment {name!r}{hint}: choose one of {', '.join(known)}, or the folder of a robot")
+        raise UserError(f"no robot or environment {name!r}{hint}: {values.choices(name, known)}, or the folder of a robot")
     if preset or robot:
         raise UserError(f"{name} is a robot: leave out --preset and --robot, which are for environments")
     return registry.robot(name), None
@@ -160,6 +162,7 @@ def inspect_robot(robot: RobotCfg, where: SceneCfg, sim: SimCfg) -> Report:
         open=gripper.open,
         close=gripper.close,
         gaps=gaps,
+        room=robot.opening if robot.folder else 0.0,
         regions={name: box for name in ("workspace", "pick", "hold") if (box := getattr(robot, name))},
         actuators=tuple(_actuators(model)),
         sites={model.site(s).name: tuple(map(float, data.site_xpos[s])) for s in range(model.nsite)},  # type: ignore[misc]
@@ -179,7 +182,7 @@ def picture(robot: RobotCfg, cfg: EnvCfg | None = None, width: int = 960, height
         UserError: the machine cannot draw offscreen.
     """
     if cfg:
-        env = ManipulationEnv(cfg, impl="jax")
+        env = ManipulationEnv(cfg, impl="native")
         state = jax.jit(env.reset)(jax.random.PRNGKey(0))
         qpos, scenery = jax.device_get((state.pipeline_state.qpos, env.scenery(state)))
         with render.Renderer(env.mj_model, width, height) as renderer:
@@ -238,7 +241,7 @@ def _extent(robot: RobotCfg) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _task(name: str, preset: str | None, cfg: EnvCfg) -> Task:
-    env = ManipulationEnv(cfg, impl="jax")
+    env = ManipulationEnv(cfg, impl="native")
     sizes = jax.eval_shape(lambda key: env.named_observations(env.reset(key)), jax.random.PRNGKey(0))
     action = "; ".join(f"{_call(term)}: {_summary(term)}" for term in cfg.actions.values())
     action += f"; clipped to +-{cfg.action_clip:g}" if cfg.action_clip else ""

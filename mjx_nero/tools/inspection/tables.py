@@ -23,6 +23,8 @@ def tables(report: Report) -> list[Table]:
         ends = zip(("open", "closed"), (report.open, report.close), report.gaps or (None, None), strict=True)
         for name, values, gap in ends:
             gripper.add(name, *map(_number, values), "unknown" if gap is None else f"{1e3 * gap:.1f}")
+        if report.room and report.gaps and report.gaps[0] > report.room + 2e-3:
+            gripper.caption = f"it swings open: only {1e3 * report.room:.0f} mm fit between the pads"
         out.append(gripper)
     drives = _table("actuators: position drives", "actuator", "joint", "target", "force")
     for a in report.actuators:

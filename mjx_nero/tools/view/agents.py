@@ -4,6 +4,9 @@ import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import mjx_nero.sim.quiet  # noqa: F401
+
+# isort: split
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
