@@ -248,13 +248,10 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     except OSError as error:  # from a path that the user gave: a name too long, no permission, a full disk
         print(f"error: {UserError(str(error))}", file=sys.stderr)
         code = 2
-    except BaseException as error:
-        if not interrupted(error):
-            raise
+    except KeyboardInterrupt as error:
         print("interrupted", file=sys.stderr, flush=True)
-        os._exit(
-            getattr(error, "code", 130)
-        )  # threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation
+        # Threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation.
+        os._exit(getattr(error, "code", 130))
     try:
         _flush()
     except OSError:
@@ -274,12 +271,6 @@ def _occupy_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
-
-
-def interrupted(error: BaseException) -> bool:
-    """Returns whether an error is a signal's. In a call to native physics, JAX raises its own error with ours in its text."""
-    names = (KeyboardInterrupt.__name__, signals.Signalled.__name__)
-    return isinstance(error, KeyboardInterrupt) or any(name in str(error) for name in names)
 
 
 def setup_jax() -> None:
