@@ -6,9 +6,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
 from typing import Any
 
 AGAIN = 1.0  # [s] until a signal whose exception was dropped is sent again
+IMPORTING = 0.2  # [s] after which a signal that came during an import is sent again
 SAME = 0.1  # [s] signals closer than this are one: `timeout`, for example, signals the program and then its whole group
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)  # Ctrl-C, and what job queues and terminals send
 
@@ -47,16 +49,19 @@ def at_once() -> Iterator[None]:
 
     Python drops an exception raised in a destructor or in a callback of the garbage collector, and a library may catch it or
     turn it into its own. So a timer sends the signal again until the program begins to end, but never interrupts clean-up.
+    It also sends a signal again that came during an import, where an exception crashes libraries written in C++.
 
     Raises:
         Signalled: a signal came, whatever became of the exception that it raised.
     """
     stop = Stop()
 
-    def handle(number: int, _: Any) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         if stop.took(number):
-            signal.setitimer(signal.ITIMER_REAL, AGAIN)
-            raise Signalled(number)
+            imports = _imports(frame)
+            signal.setitimer(signal.ITIMER_REAL, IMPORTING if imports else AGAIN)
+            if not imports:
+                raise Signalled(number)
 
     def again(*_: Any) -> None:
         if _ends(sys.exception()):
@@ -118,6 +123,13 @@ def ended() -> Iterator[None]:
 
     with _handled(handle):
         yield
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Returns whether a module is being imported where a signal came."""
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
 
 
 def _ends(error: BaseException | None) -> bool:

@@ -27,8 +27,8 @@ with signals.after_this(print) as stop:
 """
 
 
-def run(program):
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+def run(program, **options):
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, **options)
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -117,6 +117,20 @@ def test_a_signal_ends_a_command_though_its_exception_is_dropped(where):
     """In one line, with the signal's status, and after a clean-up that nothing interrupts."""
     done = run(COMMAND.format(body=DROPPED[where]))
     assert (done.returncode, done.stdout, done.stderr) == (143, "cleaned up\n", "interrupted\n")
+
+
+def test_an_import_is_completed_first(tmp_path):
+    """Libraries written in C++ abort, or print a traceback, when what they import raises."""
+    (tmp_path / "sending.py").write_text("import __main__\n__main__.send()\nprint('imported', flush=True)\n")
+    done = run(COMMAND.format(body="import sending"), cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "imported\ncleaned up\n", "interrupted\n")
+
+
+def test_ctrl_c_while_a_program_still_imports_says_nothing(tmp_path):
+    (tmp_path / "argparse.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(30)\n")
+    ignored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "  # may be so in the background
+    done = run(ignored + "from mjx_nero.__main__ import program; program()", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
 def test_a_signal_dropped_at_the_very_end_is_told_by_the_status():
