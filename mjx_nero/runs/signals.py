@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 AGAIN = 1.0  # [s] until a signal whose exception was dropped is sent again
-IMPORTING = 0.2  # [s] after which a signal that came during an import is sent again
+IMPORTING = 0.2  # [s] until a signal that came as compiled code was imported is sent again
 SAME = 0.1  # [s] signals closer than this are one: `timeout`, for example, signals the program and then its whole group
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)  # Ctrl-C, and what job queues and terminals send
 
@@ -49,7 +49,7 @@ def at_once() -> Iterator[None]:
 
     Python drops an exception raised in a destructor or in a callback of the garbage collector, and a library may catch it or
     turn it into its own. So a timer sends the signal again until the program begins to end, but never interrupts clean-up.
-    It also sends a signal again that came during an import, where an exception crashes libraries written in C++.
+    It also sends a signal again that came as a library of compiled code was imported, which an exception can crash.
 
     Raises:
         Signalled: a signal came, whatever became of the exception that it raised.
@@ -126,8 +126,8 @@ def ended() -> Iterator[None]:
 
 
 def _imports(frame: FrameType | None) -> bool:
-    """Returns whether a module is being imported where a signal came."""
-    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+    """Returns whether a module of compiled code is being imported where a signal came."""
+    while frame is not None and not frame.f_code.co_qualname.startswith("ExtensionFileLoader."):
         frame = frame.f_back
     return frame is not None
 
