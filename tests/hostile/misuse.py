@@ -197,8 +197,10 @@ def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bo
         time.sleep(wait)
         run.send_signal(getattr(signal, f"SIG{name}"))
     began, before = time.monotonic(), _queued(run.pid)
+    queued = dict(before)
     while run.poll() is None:
-        if time.monotonic() - began > SECONDS + _queued(run.pid) - before:
+        queued |= _queued(run.pid)
+        if time.monotonic() - began > SECONDS + sum(queued.values()) - sum(before.values()):
             run.kill()
             run.wait()
             return f"did not end within {SECONDS:g} s of the last signal: {(folder / 'said').read_text()[-2000:]}"
@@ -217,10 +219,10 @@ def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bo
     return ""
 
 
-def _queued(pid: int) -> float:
-    """Time that the thread of a process which waited longest was ready to run and had no core [s]; see ``server.run``."""
-    found = [0.0]
+def _queued(pid: int) -> dict[str, float]:
+    """By thread: the time that it was ready to run and a busy machine gave it no core [s]; see ``server.run``."""
+    found = {}
     for path in pathlib.Path(f"/proc/{pid}/task").glob("*/schedstat"):
         with contextlib.suppress(OSError, IndexError):  # the thread has ended
-            found.append(1e-9 * int(path.read_text().split()[1]))
-    return max(found)
+            found[path.parent.name] = 1e-9 * int(path.read_text().split()[1])
+    return found
