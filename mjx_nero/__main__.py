@@ -2,12 +2,9 @@
 
 import gc
 import importlib
+import signal
 from collections.abc import Sequence
 from typing import NoReturn
-
-from mjx_nero.config import values
-from mjx_nero.errors import UserError
-from mjx_nero.tools import cli
 
 # command -> (module, function of the arguments, what it does)
 COMMANDS = {
@@ -37,6 +34,10 @@ COMMANDS = {
 
 def main(argv: Sequence[str]) -> None:
     """Passes the arguments to the command that the first of them names."""
+    from mjx_nero.config import values
+    from mjx_nero.errors import UserError
+    from mjx_nero.tools import cli
+
     if not argv or argv[0] in ("-h", "--help"):
         commands = cli.listed("commands", {name: what for name, (_, _, what) in COMMANDS.items()})
         print(f"usage: python -m mjx_nero COMMAND ...\n\n{commands}")
@@ -53,6 +54,10 @@ def main(argv: Sequence[str]) -> None:
 
 def program(*command: str) -> NoReturn:
     """Runs the console script ``mjx-nero``, or one of its commands as a separate program."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until ``cli.run`` handles it, Ctrl-C ends the imports without a traceback
+    from mjx_nero.tools import cli
+
     # Imports and traces make hundreds of thousands of lasting objects. Python would look through all of them again and again.
     gc.set_threshold(100_000)
     cli.run(lambda argv: main([*command, *argv]))

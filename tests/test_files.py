@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import time
 
 import pytest
 
@@ -100,11 +101,31 @@ def test_two_that_write_a_file_at_the_same_time_do_not_mix(tmp_path, monkeypatch
     assert path.read_text() == "mine, both halves" and list(tmp_path.iterdir()) == [path]
     dead = subprocess.Popen(["true"])
     dead.wait()
-    lefts = [tmp_path / f".a.{pid}.part.json" for pid in (dead.pid, ours, 99999999999)]
+    here = files._here()
+    lefts = [tmp_path / f".a.{pid}-{here}.part.json" for pid in (dead.pid, ours, 99999999999)]
     for left in lefts:
         left.write_text("half")
     files.write(path, b"{}")
     assert set(tmp_path.iterdir()) == {path, lefts[2]}
+
+
+def test_another_machine_that_writes_to_the_same_disk_is_left_to_write(tmp_path, monkeypatch):
+    """Its processes are not ours, whatever their numbers. What one of them left a day ago goes away."""
+    path, dead = tmp_path / "a.json", subprocess.Popen(["true"])
+    dead.wait()
+    with monkeypatch.context() as there:
+        there.setattr(files, "_here", lambda: "0123abcd")
+        there.setattr(files.os, "getpid", lambda: dead.pid)
+        with files.whole(path) as theirs:
+            theirs.write_text("theirs, first half")
+            there.undo()
+            files.write(path, b"ours")
+            assert theirs.read_text() == "theirs, first half"
+            os.utime(theirs, (time.time() - 2 * files.SILENT,) * 2)
+            files.write(path, b"ours")
+            assert list(tmp_path.iterdir()) == [path]
+            theirs.write_text("theirs")
+    assert path.read_text() == "theirs" and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,7 @@ def test_fields_of_a_guest_are_overridden_by_dotted_name(drag):
     ("text", "message"),
     [
         ("1 / 0\n", r"^cannot load .*guest.py: ZeroDivisionError: division by zero \(.*guest.py:1\)$"),
+        ("1 +\n", r"^cannot load .*guest.py: SyntaxError: invalid syntax \(guest.py, line 1\)$"),
         ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is already an env 'nero_lift'"),
         ("import mjx_nero\nmjx_nero.register(envs={'new': (None, {})})\n", "the environment 'new' has no preset"),
         ("import mjx_nero\nmjx_nero.register(controllers={'ik': (None, None)})\n", "there is already a controller 'ik'"),
@@ -108,8 +109,14 @@ def test_what_a_guest_does_wrong_is_one_line(call, tmp_path, text, message):
     assert re.search(message, err.removeprefix("error: ").strip())
 
 
-def test_a_guest_that_is_not_there_is_one_line(call):
-    for name, what in (("nowhere.py", "FileNotFoundError"), ("no_such_module", "ModuleNotFoundError")):
+def test_a_guest_that_is_not_there_is_one_line(call, tmp_path):
+    (tmp_path / "my_code").mkdir()
+    missing = (
+        ("nowhere.py", "FileNotFoundError"),
+        ("no_such_module", "ModuleNotFoundError"),
+        ("my_code", "it is a folder"),
+    )
+    for name, what in missing:
         code, _, err = call("eval", "--load", name)
         assert code == 2 and err.startswith(f"error: cannot load {name}: {what}") and err.count("\n") == 1
 

@@ -49,6 +49,19 @@ def _held(path: pathlib.Path) -> str | None:
     return next((name for name, (_, _, index) in FORMS.items() if (path / index).exists()), None)
 
 
+def check_writable(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> None:
+    """Checks that a folder is free, or holds a data set of this schema and form, and makes nothing.
+
+    Raises:
+        UserError: the folder holds something else, or a package is missing.
+    """
+    held = _held(path)
+    if held not in (None, form):
+        raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
+    importlib.import_module(FORMS[form][0])
+    folder.check(path, schema)
+
+
 @contextlib.contextmanager
 def writer(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> Iterator[Form]:
     """Opens a data set for writing: a new one, or the one in the folder, to continue it. It is finished at the end, even after
@@ -57,10 +70,7 @@ def writer(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> Iterato
     Raises:
         UserError: the folder holds something else or cannot be written, or a package is missing.
     """
-    held = _held(path)
-    if held not in (None, form):
-        raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
-    importlib.import_module(FORMS[form][0])  # before the folder is made, because a package may be missing
+    check_writable(path, schema, form)
     with folder.claim(path, schema):
         made = _make(form, path, schema)
         made.tidy()

@@ -32,7 +32,7 @@ def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
     Raises:
         UserError: the folder holds something else or another schema, belongs to a running process, or cannot be written.
     """
-    _check(path, schema)
+    check(path, schema)
     made = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def schema_of(path: pathlib.Path) -> Schema:
     return from_json(files.read_json(where), where)
 
 
-def _check(path: pathlib.Path, schema: Schema) -> None:
+def check(path: pathlib.Path, schema: Schema) -> None:
     """Checks that the folder is free, or holds a data set with the same schema.
 
     Raises:

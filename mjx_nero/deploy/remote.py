@@ -1,5 +1,6 @@
 """The arm as the policy's process sees it: behind a socket, in a separate process that lives until the arm holds."""
 
+import contextlib
 import json
 import socket
 import subprocess
@@ -74,9 +75,18 @@ class Remote:
         self._ask({"do": "hold", "fault": [fault.kind, fault.text]})
 
     def close(self) -> None:
-        """Closes the connection: the arm brakes and holds, and its process ends."""
+        """Closes the connection: the arm brakes and holds, and its process ends.
+
+        Raises:
+            ArmError: its process does not end, even when it is told to.
+        """
         self._channel.close()
-        self._process.wait(_PATIENCE)
+        for end in (self._process.terminate, lambda: None):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_PATIENCE)
+                return
+            end()
+        raise ArmError(f"the arm's process {self.pid} does not end: cut the arm's power, and kill that process")
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         try:

@@ -7,6 +7,7 @@ request, such as ``{"do": "read"}``, has one answer. After ``start``, silence of
 is the end of the socket.
 """
 
+import contextlib
 import dataclasses
 import json
 import pathlib
@@ -140,10 +141,11 @@ def serve(channel: socket.socket) -> None:
     try:
         server = Server(spec)
     except (UserError, ArmError) as error:
-        channel.send(json.dumps({"error": str(error)}).encode())
+        with contextlib.suppress(OSError):  # the other side waits no longer
+            channel.send(json.dumps({"error": str(error)}).encode())
         return
-    channel.send(json.dumps({"fault": None}).encode())
     try:
+        channel.send(json.dumps({"fault": None}).encode())
         while True:
             ready, _, _ = select.select([channel], [], [], server.watch())
             if ready:

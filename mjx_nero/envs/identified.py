@@ -52,7 +52,11 @@ def read(path: pathlib.Path) -> Identified:
     Raises:
         UserError: the file is missing or malformed.
     """
-    found = values.read(Identified, files.read_yaml(path), "")
+    content = files.read_yaml(path)
+    try:
+        found = values.read(Identified, content, "")
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
     for name, number in {"delay": found.delay, **_numbers(found)}.items():
         least, wanted = (math.ulp(0.0), "0 < low") if name.endswith(DRIVE) else (-1e6, "low")
         if not least <= number.low <= number.value <= number.high <= 1e6:

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import glob
 import json
 import math
@@ -10,6 +11,8 @@ import pathlib
 import re
 import shutil
 import stat
+import time
+import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO, NoReturn
 
@@ -20,6 +23,7 @@ from mjx_nero.errors import UserError
 
 TRIES = 5  # attempts to write a file whose folder is removed meanwhile
 PART = ".part"  # in the name of a file that is still being written
+SILENT = 86_400.0  # [s] without a write, after which a part of another machine is left over
 MAX_TAGS = 400_000  # elements and attributes in an XML file
 MAX_YAML = 200_000  # bytes
 MAX_NODES = 20_000  # values in a YAML file, with aliases expanded
@@ -304,23 +308,36 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 def _part(path: pathlib.Path) -> pathlib.Path:
     """Returns where this process writes a file before the file appears: two that write the same file have two places."""
-    return path.with_name(f"{_head(path)}{os.getpid()}{PART}{path.suffix}")
+    return path.with_name(f"{_head(path)}{os.getpid()}-{_here()}{PART}{path.suffix}")
 
 
 def _head(path: pathlib.Path) -> str:
     return f".{path.stem[:40]}."  # a name must not become too long by what is added to it
 
 
+@functools.cache
+def _here() -> str:
+    """Returns what tells this machine, and on it this container, from others that write to the same disk."""
+    with contextlib.suppress(OSError):  # no /proc
+        return f"{zlib.crc32((os.uname().nodename + os.readlink('/proc/self/ns/pid')).encode()):08x}"
+    return f"{zlib.crc32(os.uname().nodename.encode()):08x}"
+
+
 def _tidy(path: pathlib.Path) -> None:
     """Removes what killed processes, or an enemy who knew our number, left at the parts of a file."""
     head, own = _head(path), _part(path)
     for left in path.parent.glob(f"{glob.escape(head)}*{PART}*"):
-        owner = re.fullmatch(rf"(\d{{1,9}}){PART}.*", left.name[len(head) :])
-        if left == own or owner and not _runs(int(owner[1])):
+        owner = re.fullmatch(rf"(\d{{1,9}})-(\w{{8}}){PART}.*", left.name[len(head) :])
+        if left == own or owner and not _runs(int(owner[1]), owner[2], left):
             left.unlink(missing_ok=True)
 
 
-def _runs(process: int) -> bool:
+def _runs(process: int, where: str, part: pathlib.Path) -> bool:
+    """Returns whether a part's process may still run. On another machine it counts as ended once the part is a day old."""
+    if where != _here():
+        with contextlib.suppress(FileNotFoundError):
+            return time.time() - part.lstat().st_mtime < SILENT
+        return False
     try:
         os.kill(process, 0)
     except OSError as error:

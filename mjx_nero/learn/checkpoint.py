@@ -97,6 +97,8 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
     Raises:
         UserError: the file is missing, or ``save`` did not write it.
     """
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give a file in it, such as {path}/policy.safetensors")
     if not path.is_file():
         raise UserError(f"no such file: {path}")
     _, texts = header.read(path)

@@ -181,7 +181,8 @@ def load_guests(names: Sequence[str] = ()) -> None:
             if not name.endswith(".py"):
                 if os.getcwd() not in sys.path:  # a module in the current folder, as for python -m
                     sys.path.insert(0, os.getcwd())
-                importlib.import_module(name)
+                if getattr(importlib.import_module(name), "__file__", "") is None:
+                    raise UserError("it is a folder without an __init__.py: name a module, or a file that ends in .py")
             elif (module := f"mjx_nero_guest_{pathlib.Path(name).resolve()}") not in sys.modules:
                 spec = importlib.util.spec_from_file_location(module, name)
                 assert spec and spec.loader
@@ -195,8 +196,9 @@ def _blamed(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        where = "" if isinstance(error, UserError | FileNotFoundError) else f" ({frame.filename}:{frame.lineno})"
+        frames = traceback.extract_tb(error.__traceback__)
+        theirs = [f"{at.filename}:{at.lineno}" for at in frames if at.filename != __file__ and "importlib" not in at.filename]
+        where = f" ({theirs[-1]})" if theirs and not isinstance(error, UserError | FileNotFoundError) else ""
         kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
         raise UserError(f"cannot load {name}: {kind}{' '.join(str(error).split())}{where}") from error
 
@@ -248,13 +250,10 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     except OSError as error:  # from a path that the user gave: a name too long, no permission, a full disk
         print(f"error: {UserError(str(error))}", file=sys.stderr)
         code = 2
-    except BaseException as error:
-        if not interrupted(error):
-            raise
+    except KeyboardInterrupt as error:
         print("interrupted", file=sys.stderr, flush=True)
-        os._exit(
-            getattr(error, "code", 130)
-        )  # threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation
+        # Threads may still be compiling, and JAX before 0.11 crashes at the end of an interrupted compilation.
+        os._exit(getattr(error, "code", 130))
     try:
         _flush()
     except OSError:
@@ -274,12 +273,6 @@ def _occupy_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
-
-
-def interrupted(error: BaseException) -> bool:
-    """Returns whether an error is a signal's. In a call to native physics, JAX raises its own error with ours in its text."""
-    names = (KeyboardInterrupt.__name__, signals.Signalled.__name__)
-    return isinstance(error, KeyboardInterrupt) or any(name in str(error) for name in names)
 
 
 def setup_jax() -> None:

@@ -25,6 +25,8 @@ RECORDED = 1000  # maximum number of episodes that --failures searches
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     args, dotted = _parser().parse(argv, ("env", "control"), _cfgs)
+    if args.view and (args.video or args.failures or args.json):
+        raise UserError("--view only shows: leave out --video, --failures and --json")
     if args.view:
         from mjx_nero.tools.view import opening
 

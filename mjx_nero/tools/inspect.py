@@ -36,6 +36,8 @@ def main(argv: Sequence[str]) -> None:
         if args.name is not None:
             parser.error(f"--object shows an object alone: leave out {args.name}")
         return _thing(args)
+    if "scale" in parser.given(argv):
+        parser.error("--scale is for --object: pass it, too")
     if dotted["env"] and not args.cameras:
         parser.error("fields of the environment only affect its cameras: pass --cameras FILE, too")
     if args.name is None and args.robot is None:

@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -150,6 +151,33 @@ def test_an_arm_whose_process_is_killed_is_said(spec):
             remote.read()
             time.sleep(0.02)
     remote.close()
+
+
+def test_an_arms_process_that_does_not_end_is_said(spec, monkeypatch):
+    remote = Remote(spec)
+    remote.ready()
+    os.kill(remote.pid, signal.SIGSTOP)
+    monkeypatch.setattr("mjx_nero.deploy.remote._PATIENCE", 0.2)
+    with pytest.raises(ArmError, match=f"the arm's process {remote.pid} does not end: cut the arm's power"):
+        remote.close()
+    os.kill(remote.pid, signal.SIGCONT)
+    remote.close()  # it was told to end meanwhile
+
+
+@pytest.mark.parametrize("kind", ["sim", "toaster"])
+def test_an_arm_that_answers_too_late_is_let_go(spec, monkeypatch, kind):
+    """On a busy machine the policy's process may give up before the arm is ready. Nothing is said to nobody."""
+    clock, closed = arms.Clock(), []
+    arm = arms.Ideal(tuple(spec.metadata["joints"]["names"]), np.array(spec.metadata["joints"]["home"]), clock)
+    arm.close = lambda: closed.append(True)
+    if kind == "sim":
+        monkeypatch.setattr(server.drivers, "make", lambda *_: arm)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    theirs.send(json.dumps({**vars(spec), "kind": kind}).encode())
+    theirs.close()
+    with ours:
+        server.serve(ours)
+    assert closed == [True] * (kind == "sim")
 
 
 def test_a_fault_is_told_and_stays(spec):

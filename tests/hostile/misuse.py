@@ -196,12 +196,16 @@ def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bo
     for name, wait in sent:
         time.sleep(wait)
         run.send_signal(getattr(signal, f"SIG{name}"))
-    try:
-        code = run.wait(SECONDS)
-    except subprocess.TimeoutExpired:
-        run.kill()
-        run.wait()
-        return f"did not end within {SECONDS:g} s of the last signal: {(folder / 'said').read_text()[-2000:]}"
+    began, before = time.monotonic(), _queued(run.pid)
+    queued = dict(before)
+    while run.poll() is None:
+        queued |= _queued(run.pid)
+        if time.monotonic() - began > SECONDS + sum(queued.values()) - sum(before.values()):
+            run.kill()
+            run.wait()
+            return f"did not end within {SECONDS:g} s of the last signal: {(folder / 'said').read_text()[-2000:]}"
+        time.sleep(0.05)
+    code = run.returncode
     text, left = (folder / "said").read_text(), [str(path) for path in folder.glob("run/**/*.part*")]
     ways = [-getattr(signal, f"SIG{name}") for name, _ in sent if not training]  # before the program has begun
     ways += [128 + getattr(signal, f"SIG{name}") for name, _ in sent]
@@ -213,3 +217,12 @@ def _signalled(folder: pathlib.Path, sent: list[tuple[str, float]], training: bo
     if "Traceback" in text or (left and len(sent) == 1) or code not in ways:
         return f"exit {code}, left {left}: {text[-2000:]}"
     return ""
+
+
+def _queued(pid: int) -> dict[str, float]:
+    """By thread: the time that it was ready to run and a busy machine gave it no core [s]; see ``server.run``."""
+    found = {}
+    for path in pathlib.Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        with contextlib.suppress(OSError, IndexError):  # the thread has ended
+            found[path.parent.name] = 1e-9 * int(path.read_text().split()[1])
+    return found

@@ -48,6 +48,9 @@ FLAGS = {
     "a joint twice": f"{EVAL} --env.robot.gripper.joints (joint1,joint2)",
     "no way down": f"{EVAL} --env.robot.down (0,0,0,0)",
     "a policy and another agent": f"{EVAL} --policy p --agent zero",
+    "a scale of no object": "inspect nero --scale 2",
+    "a folder for a policy": f"{EVAL} --policy .",
+    "a video of what is only shown": f"{EVAL} --view --video v.mp4",
 }
 EMPTY = (
     *(f"train --env nero_reach --{flag}" for flag in ("robot", "object", "learner", "restore", "seeds", "out")),

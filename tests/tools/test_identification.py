@@ -199,7 +199,7 @@ def test_identified_drives_take_the_place_of_a_robots_own(tmp_path):
 def test_a_bad_file_of_drives_is_one_line(tmp_path, change, message):
     path = tmp_path / "drives.yaml"
     path.write_text(yaml.safe_dump(content(registry.robot("nero").arm) | change))
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=f"^{path}.*{message}"):
         identified.applied(registry.env_cfg("nero_lift", identified=str(path)))
 
 

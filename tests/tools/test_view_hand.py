@@ -144,6 +144,17 @@ def test_a_tape_shows_what_was_recorded(shown, tmp_path):
     session.recorders.clear()
 
 
+def test_a_folder_that_cannot_be_recorded_into_is_told_before_anybody_steers(shown, tmp_path):
+    session, _, _ = shown
+    recording = Recording(session, tmp_path / "d", "nero_lift", "default", "arrays")
+    session.recorders.clear()
+    recording.check()
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "d").write_text("")
+    with pytest.raises(UserError, match="d is not a folder: pass another --out"):
+        recording.check()
+
+
 def test_what_the_hand_did_is_played_again_in_physics(shown, tmp_path, call):
     """The hand stands still, so a start at rest comes to the same."""
     session, _, _ = shown

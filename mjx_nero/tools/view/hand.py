@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_nero import math
 from mjx_nero.control.ik import IkCfg, InverseKinematics
-from mjx_nero.data import Episode, Schema, writer
+from mjx_nero.data import Episode, Schema, check_writable, writer
 from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
@@ -175,6 +175,14 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self._steps)
+
+    def check(self) -> None:
+        """Checks before anybody steers that ``save`` can add to the data set.
+
+        Raises:
+            UserError: the folder holds something else, or a package is missing.
+        """
+        check_writable(self._out, self.schema, self._form)
 
     def tape(self) -> Iterator[Frame]:
         """Returns the recorded frames."""
