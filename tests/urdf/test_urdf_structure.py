@@ -440,7 +440,8 @@ def test_a_hand_alone_is_no_arm(tmp_path, driven):
     for side in ("left", "right"):
         above = "base"
         for k in range(driven):
-            parts += [make.link(f"{side}{k}", make.inertial(0.01)), make.joint(f"{side}_j{k}", above, f"{side}{k}", axis="0 1 0")]
+            joint = make.joint(f"{side}_j{k}", above, f"{side}{k}", xyz="0 0 0.04", axis="0 1 0")
+            parts += [make.link(f"{side}{k}", make.inertial(0.01)), joint]
             above = f"{side}{k}"
     with pytest.raises(UserError, match=f"is not an arm: 2 branches of at most {driven} driven joint.*Import it with an arm"):
         imported(tmp_path, *parts)
