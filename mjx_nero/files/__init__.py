@@ -30,6 +30,8 @@ MAX_NODES = 20_000  # values in a YAML file, with aliases expanded
 MAX_DEPTH = 12  # levels of nesting in a YAML file
 MAX_JSON = 4_000_000  # bytes
 MAX_JSON_DEPTH = 30
+# Errors of libxml2 about <?xml ...?> alone: a version such as "1" or "0.0", none at all, or a line before it.
+_MISDECLARED = ("ERR_UNKNOWN_VERSION", "ERR_VERSION_MISSING", "ERR_XMLDECL_NOT_STARTED", "ERR_RESERVED_XML_NAME")
 
 
 @contextlib.contextmanager
@@ -158,12 +160,23 @@ def parse_xml(content: bytes, name: str) -> etree._Element:
         root = etree.fromstring(content, parser, base_url=name)
     except (etree.XMLSyntaxError, ValueError) as error:
         log = parser.error_log  # the exception's own log may contain errors of other files
+        if (plain := _declared(content)) != content and any(entry.type_name in _MISDECLARED for entry in log):
+            return parse_xml(plain, name)
         if not log or any(entry.domain_name != "NAMESPACE" for entry in log):
             raise UserError(f"{name} is not well-formed XML: {error}") from None
         root = etree.fromstring(content, _parser(recover=True), base_url=name)  # only prefixes are undeclared
     if root.getroottree().docinfo.internalDTD is not None:
         raise UserError(f"{name} declares a document type (<!DOCTYPE ...>): remove it, a robot description needs none")
     return root
+
+
+def _declared(content: bytes) -> bytes:
+    """Returns the XML with a correct declaration at its start, if it has one: robots are published with others."""
+    if not (found := re.search(rb"<\?xml\s[^>]*\?>", content)):
+        return content
+    coding = re.search(rb"encoding\s*=\s*[\"']([\w.-]+)", found[0])
+    first = b'<?xml version="1.0" encoding="%s"?>' % (coding[1] if coding else b"UTF-8")
+    return first + content[: found.start()] + content[found.end() :]
 
 
 def _parser(recover: bool = False) -> etree.XMLParser:

@@ -92,7 +92,7 @@ def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Mak
         except UserError as error:
             say(f"no expert demonstrates: {error}")
             return {}
-        did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} episodes"
+        did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} noisy tries"
         uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if begins else []
         uses += ["it is imitated" if found.enough else "it is not imitated"] if imitates else []
         say(f"{did}: {', '.join(uses)} ({time.perf_counter() - begun:.1f} s)")

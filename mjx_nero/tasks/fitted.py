@@ -81,9 +81,11 @@ def follow_target_setup(robot: RobotCfg) -> follow_target.FollowTargetSetup:
 
 
 def _lift(robot: RobotCfg, factory: Callable[[RobotCfg, lift.LiftSetup], EnvCfg]) -> EnvCfg:
+    """Slow fingers get extra time to close, and the goal stays where it is as much longer."""
     setup, ready = lift_setup(robot), _ready(robot)
-    cfg = factory(ready, setup)
-    return dataclasses.replace(cfg, episode_length_s=round(cfg.episode_length_s + _late(ready), 2))
+    cfg, late = factory(ready, setup), _late(ready)
+    command = dataclasses.replace(cfg.command, resample_s=round(cfg.command.resample_s + late, 2))
+    return dataclasses.replace(cfg, episode_length_s=round(cfg.episode_length_s + late, 2), command=command)
 
 
 def _tower(robot: RobotCfg, factory: Callable[[RobotCfg], EnvCfg]) -> EnvCfg:

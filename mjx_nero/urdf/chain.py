@@ -12,7 +12,7 @@ from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.tree import Body, Joint, Tree, below, bodies, body_of
 
 MOST_CHOICES = 4
-HAND = 4  # most driven joints of a branch, if only fingers leave the base
+HAND, LONG = 4, 0.3  # most driven joints and greatest length [m] of a branch, if only fingers leave the base
 SENSORS = re.compile(r"camera|imu|optical|depth|color|lidar|laser|sensor|realsense|vision|_ft(_|$)", re.IGNORECASE)
 FINGERS = 3  # least driven joints in series that make a branch an arm, not a finger
 
@@ -80,7 +80,8 @@ def _check(tree: Tree) -> None:
     branches = [b.name for b in parts.values() if b.parent == next(iter(parts))]
     driven = {b.name for b in parts.values() if b.joint and not b.joint.mimic}
     counts = [len(driven & set(below(parts, name))) for name in branches]
-    if len(branches) > 1 and max(counts) <= HAND:
+    short = max(counts) < FINGERS or max(_length(parts, name) for name in branches) < LONG
+    if len(branches) > 1 and max(counts) <= HAND and short:
         joints = f"{len(branches)} branches of at most {max(counts)} driven joint{'s' * (max(counts) > 1)} leave its base"
         choice = f"--chain {limbs[0].base}:{_named(parts, limbs[0].end)}"
         advice = f"Import it with an arm that carries it, or one of its branches, {choice}"
@@ -104,7 +105,9 @@ def _limbs(parts: dict[str, Body]) -> list[Limb]:
     """Finds the arms.
 
     Where the tree forks, a branch with at least ``FINGERS`` more joints is the arm. If several branches have, and are longer than
-    the path to the fork, they are arms. Otherwise the fork carries the hand.
+    the path to the fork, they are arms. Otherwise the fork carries the hand, as it does where three branches of at least two
+    joints are shorter than that path: one may be a thumb of ``FINGERS`` joints. A gear beside the last joint of a wrist ends no
+    arm.
     """
     children: dict[str, list[Body]] = {name: [] for name in parts}
     for body in parts.values():
@@ -121,8 +124,10 @@ def _limbs(parts: dict[str, Body]) -> list[Limb]:
         long = [b for b in branches if length[b.name] >= FINGERS]
         if len(branches) == 1 or not passed and len(long) < 2:
             long = sorted(branches, key=lambda b: -length[b.name])[:1]
-        elif len(long) > 1 and max(length[b.name] for b in long) <= len(passed):
-            long = []
+        elif len(long) > 1 or sum(length[b.name] > 1 for b in branches) > 2:  # arms, or fingers and a longer thumb
+            long = long if max(length[b.name] for b in branches) > len(passed) else []
+        elif not long and len(onward := [b for b in branches if children[b.name]]) == 1 and not any(map(_follows, branches)):
+            long = onward if _forks(children, onward[0]) else []  # the others are the gears of a wrist
         if not long or not any(length[b.name] for b in long):
             out.append(Limb(base, here, passed))
         for branch in long if any(length[b.name] for b in long) else []:
@@ -132,6 +137,24 @@ def _limbs(parts: dict[str, Body]) -> list[Limb]:
     walk(next(iter(parts)), next(iter(parts)), ())
     turning = {b.joint.name for b in parts.values() if b.joint and b.joint.type == "continuous"}
     return [one for one in out if set(one.joints) - turning] or out  # a caster turns about three endless axes
+
+
+def _length(parts: dict[str, Body], branch: str) -> float:
+    """Returns how far a branch can reach from its first joint [m]."""
+    far = {branch: 0.0}
+    for name in below(parts, branch)[1:]:
+        far[name] = far[parts[name].parent] + float(np.linalg.norm(parts[name].frame[:3, 3]))
+    return max(far.values())
+
+
+def _follows(body: Body) -> bool:
+    return bool(body.joint and body.joint.mimic)
+
+
+def _forks(children: Mapping[str, Sequence[Body]], body: Body) -> bool:
+    """True if a body carries fingers: somewhere beyond it more than one body moves."""
+    onward = children[body.name]
+    return len(onward) > 1 or bool(onward) and _forks(children, onward[0])
 
 
 def _named(parts: dict[str, Body], end: str) -> str:

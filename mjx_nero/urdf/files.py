@@ -15,6 +15,7 @@ from mjx_nero.types import UserError
 MAX_URDF = 10_000_000  # bytes
 MAX_PACKAGE = 100_000  # bytes of a package.xml
 LEVELS = 5  # greatest number of levels that a package's folder lies above the URDF
+MOST_BESIDE = 200  # greatest number of packages in a folder whose names are read
 _DEPTH = 32  # how many of an absolute path's last folders may be a package
 _PARTS = ("urdf", "robots", "xacro")  # folders of a package that hold its URDFs
 read = read_bytes
@@ -33,7 +34,8 @@ class Roots:
 
     They are: the URDF's own folder; its package, the nearest folder with a ``package.xml`` at most ``LEVELS`` above (or the
     parent folder, if there is none and the URDF lies in ``urdf``, ``robots`` or ``xacro``); the given ``packages``; and packages
-    that the URDF names, if ``NAME/package.xml`` lies beside it or beside a folder above.
+    that the URDF names, if their folder lies beside it or beside a folder above: ``NAME`` with a ``package.xml``, or any folder
+    whose ``package.xml`` has that name.
 
     Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name. A file whose folder
     is not here is taken from the own folders, at a tail of its path (``elsewhere``).
@@ -61,6 +63,7 @@ class Roots:
         elif self.here.name in _PARTS and len(self._above) > 1:
             self._own.append(self.here.parent)
         self.folders = [*self._own, *self.packages.values()]
+        self._packages_in: dict[pathlib.Path, dict[str, list[pathlib.Path]]] = {}
         self.elsewhere: dict[str, pathlib.Path] = {}  # files of folders that are not here, and what was taken instead
 
     def find(self, name: str, base: pathlib.Path | None = None) -> pathlib.Path:
@@ -122,11 +125,20 @@ class Roots:
             if above.is_relative_to(self._own[-1]):
                 if plain or described:
                     places.append(folder)
-            elif described and os.path.realpath(folder) == str(folder) and folder not in _private():
-                places.append(folder)
-                if folder not in self.folders:
-                    self.folders.append(folder)
+            else:
+                places += (found := [folder] if described and _usable(folder) else self._beside(above).get(package, []))
+                self.folders += [folder for folder in found if folder not in self.folders]
         return places
+
+    def _beside(self, above: pathlib.Path) -> dict[str, list[pathlib.Path]]:
+        """Lists the packages that lie in a folder, by the names in their ``package.xml``."""
+        if above not in self._packages_in:
+            found: dict[str, list[pathlib.Path]] = {}
+            for file in sorted(above.glob("*/package.xml"))[:MOST_BESIDE]:
+                if os.path.realpath(file) == str(file) and os.path.isfile(file) and _usable(file.parent):
+                    found.setdefault(package_name(file.parent), []).append(file.parent)
+            self._packages_in[above] = found
+        return self._packages_in[above]
 
     def _foreign(self, path: str) -> Iterator[tuple[pathlib.Path, str]]:
         """Yields where a file with an absolute path may lie here: the packages that the path passes through, outermost first."""
@@ -188,6 +200,11 @@ def package_name(folder: pathlib.Path) -> str:
     except UserError:
         return folder.name
     return (root.findtext("name") or "").strip() or folder.name
+
+
+def _usable(folder: pathlib.Path) -> bool:
+    """True if a folder may count as a package: it is no link, and none of the ``_private`` ones."""
+    return os.path.realpath(folder) == str(folder) and folder not in _private()
 
 
 def _private() -> tuple[pathlib.Path, ...]:

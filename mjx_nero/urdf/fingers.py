@@ -130,6 +130,12 @@ def grip(swing: Swing, joints: tuple[str, ...], open: Mapping[str, float], close
             notes.add(
                 "warning", "joint", name, f"{text}; give its limits in the URDF, or --open {name}=VALUE and --closed {name}=VALUE"
             )
+    for name in swing.shortened:
+        if name not in open:
+            far = swing.joints[name].upper - swing.joints[name].lower
+            text = f"slides by {far:g} m, farther than any hand opens: open at {wide[name]:.3g}, where its finger leaves the hand"
+            text += f"; correct its limits in the URDF, or give --open {name}=VALUE"
+            notes.add("warning", "joint", name, text)
     meetings = swing.between(close, wide)
     if not meetings:
         raise UserError(

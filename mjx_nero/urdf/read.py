@@ -5,6 +5,7 @@ import io
 import logging
 import math
 import pathlib
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -21,6 +22,8 @@ from mjx_nero.urdf.tree import MOVING, Joint, Link, Mass, Pose, Shape, Tree
 
 MAX_MOVING = 100  # MuJoCo's XML reader nests no deeper than a few hundred bodies
 RESERVED = {"link": ("world", "cube", "goal"), "joint": ("cube",)}  # names that scenes use
+_ARGUMENT = re.compile(r"[\w.-]{1,40}")  # names of arguments that fit a message
+_OTHERS = {"mujoco": "MuJoCo", "sdf": "Gazebo"}  # by outermost element
 logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
 
 
@@ -42,10 +45,16 @@ def read(
             prismatic joints.
     """
     root = files.parse_xml(files.read(path, files.MAX_URDF), str(path))
+    unset: list[str] = []
     if xacro.is_xacro(root):
+        unset = [
+            name for arg in root.iter("{*}arg", "arg") if _ARGUMENT.fullmatch(name := arg.get("name", "")) and name not in args
+        ]
         root = xacro.expand(root, path, roots, args, notes)
     elif args:
         raise UserError(f"--arg {next(iter(args))}: {path} is not a xacro file")
+    if root.tag in _OTHERS:
+        raise UserError(f"{path} is a model for {_OTHERS[root.tag]}, not a URDF: give the URDF or xacro of this robot")
     if root.tag != "robot":
         raise UserError(f"{path} is not a URDF: its outermost element is <{root.tag}>, not <robot>")
     if not (root.get("name") or "").strip():
@@ -63,13 +72,14 @@ def read(
     except Exception as error:  # yourdfpy fails in its own ways on what passed the checks above
         raise UserError(f"{path} cannot be read as a URDF: {type(error).__name__}: {' '.join(str(error).split())}") from None
     units_of.applied(urdf.robot, units)
-    tree, mount = _tree(urdf.robot, notes)
+    tree, mount = _tree(urdf.robot, notes, unset)
     if not units.degrees:
         units_of.suspect_degrees(tree, notes)
     return tree, mount
 
 
-def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
+def _tree(robot: yourdfpy.Robot, notes: Notes, unset: list[str]) -> tuple[Tree, Pose]:
+    """Returns what ``read`` does; ``unset`` are arguments of the file that may decide whether its parts are joined."""
     mount = _unmounted(robot, notes)
     rename = {kind: _free_names(kind, names, notes) for kind, names in _names(robot).items()}
     links = [rename["link"][link.name] for link in robot.links]
@@ -77,7 +87,8 @@ def _tree(robot: yourdfpy.Robot, notes: Notes) -> tuple[Tree, Pose]:
         raise UserError("the URDF has no links")
     joints = [_joint(j, rename, notes) for j in robot.joints]
     left_out = "".join(f" ({note.text})" for note in notes if note.text.startswith("left out: "))  # it may have had a link
-    order, root = _ordered(links, joints, left_out)
+    advice = f"; or set what joins it, --arg NAME:=VALUE ({', '.join(unset[:8])})" if unset else ""
+    order, root = _ordered(links, joints, left_out + advice)
     colours = {m.name: _rgba(m) for m in robot.materials}
     read = {rename["link"][link.name]: link for link in robot.links}
     parsed = {name: _link(name, read[name], colours, notes) for name in [root, *(j.child for j in order)]}
@@ -118,14 +129,14 @@ def _free_names(kind: str, names: list[str], notes: Notes) -> dict[str, str]:
     return out
 
 
-def _ordered(links: list[str], joints: list[Joint], left_out: str) -> tuple[list[Joint], str]:
-    """Orders joints, parents first, and finds the root link."""
+def _ordered(links: list[str], joints: list[Joint], why: str) -> tuple[list[Joint], str]:
+    """Orders joints, parents first, and finds the root link. ``why`` ends the errors: what the file lacks may be the reason."""
     parent_of: dict[str, Joint] = {}
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in links:
                 lack = f"joint {joint.name!r} names link {link!r}, which is not there{config.hint(link, links)}"
-                raise UserError(lack + left_out)
+                raise UserError(lack + why)
         if joint.child in parent_of:
             raise UserError(
                 f"link {joint.child!r} hangs on two joints, {parent_of[joint.child].name!r} and {joint.name!r}: "
@@ -135,7 +146,7 @@ def _ordered(links: list[str], joints: list[Joint], left_out: str) -> tuple[list
     roots = [link for link in links if link not in parent_of]
     if len(roots) > 1:
         names = ", ".join(map(repr, roots[:5])) + ", ..." * (len(roots) > 5)
-        raise UserError(f"{len(roots)} links hang on no joint ({names}): join them to one root, or remove them")
+        raise UserError(f"{len(roots)} links hang on no joint ({names}): join them to one root, or remove them{why}")
     children: dict[str, list[Joint]] = {}
     for joint in joints:
         children.setdefault(joint.parent, []).append(joint)

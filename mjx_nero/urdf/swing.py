@@ -19,6 +19,7 @@ BESIDE = 0.7  # worth of meeting a fixed shape: two moving shapes that meet equa
 INNER = 0.25  # shapes have met on the way only if they part again by this share of the range
 STILL = 1e-6  # [m, 1] least change of pose that counts as motion
 TOUCH = 5e-3  # [m] distance at which shapes touch, as sampled points are millimetres apart
+SLIDE = 0.3  # [m] a slide that is longer has placeholders for limits
 WIDE = 0.01  # [m] shapes that part by less never met
 AT_ZERO, NEAR_ZERO = 0.1, 1.2  # [rad] an endless jaw closes this near to zero; farther round it meets the arm
 Positions = Mapping[str, Values]
@@ -60,6 +61,8 @@ class Swing:
         fixed: surfaces of the fork's links, in the fork's frame.
         blind: True if no shape is known.
         assumed: joints without limits that meet nothing, for which ``ends`` assumed a quarter turn.
+        limits: joint -> its limits, without those that are placeholders [rad, m].
+        shortened: slides whose limits are placeholders.
     """
 
     def __init__(self, tree: Tree, parts: dict[str, Body], looks: Mapping[str, Look], joints: Sequence[str], fork: str):
@@ -79,7 +82,22 @@ class Swing:
         self.link = parent if parent in parts[fork].links else fork
         if self.blind or not self.fixed:
             self.fixed = {self.link: (parts[fork].links[self.link] @ np.append(tree.links[self.link].mass.com, 1.0))[None, :3]}
+        self.limits = {j: self._limits(j) for j in joints}
+        self.shortened = [j for j in joints if self.limits[j] != limits(self.joints[j])]
         self._trees = {n: spatial.cKDTree(points) for n, points in {**self.fixed, **self.shapes}.items()}
+
+    def _limits(self, name: str) -> tuple[float, float]:
+        """Returns a joint's limits [rad, m]. A slide of placeholders ends where the middle of its finger leaves the hand."""
+        lower, upper = limits(self.joints[name])
+        body = next(b for b in self.parts.values() if b.joint and b.joint.name == name)
+        if self.joints[name].type != "prismatic" or upper - lower <= SLIDE or self.blind or body.name not in self.shapes:
+            return lower, upper
+        at = self.poses({j: np.zeros(1) for j in self.joints})[body.name][0]
+        axis = at[:3, :3] @ self.joints[name].axis
+        finger = (self.shapes[body.name] @ at[:3, :3].T + at[:3, 3]) @ axis
+        hand = np.concatenate(list(self.fixed.values())) @ axis
+        middle = (finger.min() + finger.max()) / 2
+        return float(np.clip(hand.min() - middle, lower, upper)), float(np.clip(hand.max() - middle, lower, upper))
 
     def poses(self, q: Positions) -> dict[str, Poses]:
         """Poses of the moving bodies and of the fork, in the fork's frame [n, 4, 4]."""
@@ -125,7 +143,7 @@ class Swing:
         Args:
             open, closed: positions that are known already.
         """
-        rest = {j: np.zeros(1) if endless(self.joints[j]) else np.array([np.mean(limits(self.joints[j]))]) for j in joints}
+        rest = {j: np.zeros(1) if endless(self.joints[j]) else np.array([np.mean(self.limits[j])]) for j in joints}
         ways = {j: self._way(j, rest) for j in joints}
         start = {j: closed.get(j, ways[j][0]) for j in joints}
         end = {j: open.get(j, ways[j][1]) for j in joints}
@@ -148,7 +166,7 @@ class Swing:
             ends = self.jaw(name, rest)
             self.assumed += [] if ends else [name]
             return ends or (0.0, np.pi / 2)
-        lower, upper = limits(joint)
+        lower, upper = self.limits[name]
         q = np.linspace(lower, upper, STEPS)
         found = self.meetings({**{j: np.repeat(v, STEPS) for j, v in rest.items()}, name: q})
         apart = found[0].apart if found else q

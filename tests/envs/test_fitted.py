@@ -195,8 +195,9 @@ def test_experts_wait_for_slow_fingers(hand):
     late = patient.controllers["pick_place"]["wait"]
     assert usual.controllers["pick_place"]["wait"] == 0.0 and late == pytest.approx(1.0 - fitted.SLOW, abs=0.1)
     assert patient.episode_length_s == pytest.approx(usual.episode_length_s + 2 * late)
-    lifts = [env_cfg("lift", robot=each).episode_length_s for each in (robot, slow)]
-    assert lifts == [5.0, pytest.approx(5.0 + late)]
+    lifts = [env_cfg("lift", robot=each) for each in (robot, slow)]
+    assert [cfg.episode_length_s for cfg in lifts] == [5.0, pytest.approx(5.0 + late)]
+    assert all(cfg.command.resample_s == cfg.episode_length_s for cfg in lifts)  # no other goal shortly before the end
     nero = dataclasses.replace(NERO, gripper=dataclasses.replace(NERO.gripper, speed=(0.02, 0.02)))
     closing = [env_cfg("clutter", robot=each).controllers["pick_up"]["closing"] for each in (NERO, nero)]
     assert closing == [0.3, pytest.approx((0.06 - 0.0143) / 2 / 0.02, abs=0.06)]  # from 6 cm to the thinnest there is

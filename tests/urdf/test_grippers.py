@@ -261,6 +261,20 @@ def test_two_slides_of_different_signs_each_find_their_ends(tmp_path):
     assert report.robot.opening == pytest.approx(0.1, abs=1e-3)
 
 
+def test_slides_of_a_metre_open_as_far_as_the_hand_is_wide(tmp_path):
+    """Limits of +-1 m are placeholders."""
+    parts = fingers(tmp_path, "palm", at="0 0 0.05")
+    for row, name, axis, lower, upper in ((2, "left", "0 1 0", 0, 1), (3, "right", "0 1 0", -1, 0)):
+        metre = f'lower="{lower}" upper="{upper}" effort="20" velocity="0.2"'
+        parts[row] = make.joint(name, "palm", f"{name}_finger", xyz="0 0 0.05", axis=axis, **{**SLIDE, "limit": metre})
+    palm = make.link("palm", make.inertial(0.2), make.shape('<box size="0.04 0.12 0.04"/>', xyz="0 0 0.02"))
+    on = make.joint("mount", "link6", "palm", "fixed", xyz="0 0 0.05")
+    _, report = imported(tmp_path, base(), *six(), palm, on, *parts)
+    assert report.robot.gripper.open == pytest.approx((0.055, -0.055), abs=2e-3)
+    assert report.robot.opening == pytest.approx(0.11, abs=4e-3)
+    assert sum("slides by 1 m" in text for text in report.warnings) == 2
+
+
 def test_a_collision_that_lies_elsewhere_than_the_visual_of_the_same_mesh_is_moved_there(tmp_path):
     """The left finger's collision is turned by half a turn about the finger, so that its back would be its inner face."""
 

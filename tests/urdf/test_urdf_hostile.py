@@ -36,6 +36,35 @@ def warned(folder: pathlib.Path, text: str, match: str):
     return mujoco.MjModel.from_xml_path(str(folder / "out" / "model.xml")), report
 
 
+@pytest.mark.parametrize(
+    "head",
+    [
+        '<?xml version="1"?>',
+        '<?xml version="0.0" ?>',
+        "<?xml ?>",
+        '\n<?xml version="1.0"?>',
+        "<!-- a robot -->\n<?xml version='1.0'?>",
+    ],
+)
+def test_a_declaration_that_parsers_refuse_is_no_matter(tmp_path, head):
+    make.write(tmp_path, head + GOOD.split("?>", 1)[-1])
+    assert len(import_urdf(tmp_path / "robot.urdf", tmp_path / "out").robot.arm.joints) == 3
+
+
+def test_parts_that_an_argument_would_join_name_it(tmp_path):
+    """Arms for several bases leave it to an argument what they stand on."""
+    head = '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="x"><xacro:arg name="{}" default=""/>'
+    text = GOOD[GOOD.index("<link") :].replace("</robot>", make.link("foot") + "</robot>")
+    make.write(tmp_path, head.format("base_model") + text)
+    with pytest.raises(UserError, match=r"2 links hang on no joint .*what joins it, --arg NAME:=VALUE \(base_model\)"):
+        import_urdf(tmp_path / "robot.urdf", tmp_path / "out")
+    with pytest.raises(UserError, match="or remove them$"):
+        import_urdf(tmp_path / "robot.urdf", tmp_path / "out", args={"base_model": "none"})
+    make.write(tmp_path, head.format("a\u202e b") + text)
+    with pytest.raises(UserError, match="or remove them$"):
+        import_urdf(tmp_path / "robot.urdf", tmp_path / "out")
+
+
 def limited(limit: str, type: str = "revolute") -> str:
     return make.arm(2, make.link("e", make.inertial()), make.joint("j", "l2", "e", type, limit=limit))
 
@@ -45,7 +74,9 @@ REFUSED = {
     "no XML": ("hello", "not well-formed"),
     "cut off": (GOOD[: len(GOOD) // 2], "not well-formed"),
     "binary": (bytes(range(256)), "not well-formed"),
-    "other root": ("<mujoco/>", "not <robot>"),
+    "MJCF": ("<mujoco/>", "is a model for MuJoCo, .*: give the URDF or xacro"),
+    "SDF": ("<sdf/>", "is a model for Gazebo, .*: give the URDF or xacro"),
+    "other root": ("<model/>", "not <robot>"),
     "nothing in it": ("<robot name='x'/>", "no links"),
     "entity bomb": (BOMB + "<robot name='&c;'/>", "document type"),
     "external entity": (OUTER + "<robot name='x'><link name='&x;'/></robot>", "not well-formed|document type"),
@@ -397,9 +428,9 @@ def test_packages_that_are_none(tmp_path):
     """Neither a folder without package.xml nor a link, nor what lies in one above that the URDF does not name."""
     here = in_packages(tmp_path)
     make.box(tmp_path / "work" / "repo" / "plain" / "m.stl", (0, 0, 0), (1, 1, 1))
-    make.write(tmp_path / "secret", PACKAGE.format("linked"), "package.xml")
-    make.box(tmp_path / "secret" / "m.stl", (0, 0, 0), (1, 1, 1))
-    (tmp_path / "work" / "repo" / "linked").symlink_to(tmp_path / "secret")
+    make.write(tmp_path / "far" / "secret", PACKAGE.format("linked"), "package.xml")
+    make.box(tmp_path / "far" / "secret" / "m.stl", (0, 0, 0), (1, 1, 1))
+    (tmp_path / "work" / "repo" / "linked").symlink_to(tmp_path / "far" / "secret")
     roots = files.Roots(here / "robot.urdf", {})
     for package in ("plain", "linked", "secret"):
         with pytest.raises(files.Missing, match=f"--package {package}=DIR"):
@@ -454,8 +485,12 @@ def test_packages_that_are_none(tmp_path):
         ("pkg", ["secret/m.stl", "pkg/n.stl"], "/home/no/pkg/../secret/m.stl", UserError),
         ("pkg", ["secret/m.stl", "pkg/m.stl>secret/m.stl"], "/home/no/pkg/m.stl", UserError),
         ("other", ["secret/m.stl", "other/pkg>secret"], "package://pkg/m.stl", UserError),
-        ("a/b", ["secret/m.stl", "secret/package.xml:pkg", "pkg>secret"], "package://pkg/m.stl", None),
-        ("other", ["secret/m.stl", "secret/package.xml:pkg", "other/in>secret"], "package://pkg/m.stl", None),
+        ("a/b", ["s/x/m.stl", "s/x/package.xml:pkg", "pkg>s/x"], "package://pkg/m.stl", None),
+        ("other", ["s/x/m.stl", "s/x/package.xml:pkg", "other/in>s/x"], "package://pkg/m.stl", None),
+        # beside, in a folder that is called otherwise
+        ("arm/urdf", ["arm/package.xml:arm", "hand_x/m.stl", "hand_x/package.xml:pkg"], "package://pkg/m.stl", "hand_x/m.stl"),
+        ("arm/urdf", ["arm/package.xml:arm", "hand_x/m.stl", "hand_x/package.xml:no"], "package://pkg/m.stl", None),
+        ("arm/urdf", ["arm/package.xml:arm", "a/x/m.stl", "a/x/package.xml:pkg"], "package://pkg/m.stl", None),
     ],
 )
 def test_what_is_a_package(tmp_path, urdf, there, name, found):

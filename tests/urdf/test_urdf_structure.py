@@ -52,6 +52,17 @@ def test_limited_horn_is_no_finger(tmp_path):
     assert report.robot.gripper.joints == ("left",)
 
 
+def test_a_gear_beside_the_wrist_ends_no_arm(tmp_path):
+    """It turns on the body that carries the last joint, so that the tree forks before the hand."""
+    gear = make.link("gear", make.inertial(0.01), make.shape('<cylinder radius="0.01" length="0.01"/>'))
+    turn = make.joint("drive", "link5", "gear", xyz="0 0.03 0", axis="0 0 1", limit=ROOM)
+    parts = base(), *six(), gear, turn, *fingers(tmp_path, "link6")
+    with pytest.raises(UserError, match=r"an arm, and 1 joint beside it \(drive\)\. Choose --chain base:link6"):
+        imported(tmp_path, *parts)
+    _, report = imported(tmp_path, *parts, chain="base:link6")
+    assert report.robot.arm.joints == tuple(f"a{i}" for i in range(1, 7)) and report.robot.gripper.joints == ("left",)
+
+
 def test_endless_fingers_are_bounded(tmp_path):
     """Two jaws that turn without limits: open and closed lie within a quarter turn."""
     make.box(tmp_path / "in" / "jaw.stl", (-0.01, -0.005, 0), (0.01, 0.005, 0.08))
@@ -223,6 +234,33 @@ def test_legs_and_casters_are_no_choice_before_an_arm(tmp_path):
     eye = make.link("hand_camera_frame"), make.joint("eye", "link6", "hand_camera_frame", "fixed", xyz="0 0.05 0")
     with pytest.raises(UserError, match="it has 5 arms, and 6 joints beside them .*Choose --chain base:link6, --chain base:a_3"):
         imported(tmp_path, *parts, *six(), *eye)
+
+
+def test_a_hand_with_a_thumb_of_three_joints_ends_the_arm(tmp_path):
+    """The thumb is long enough for an arm, but two fingers of two joints stand beside it."""
+    parts = []
+    for name, y, count in (("thumb", -0.04, 3), ("index", 0.04, 2), ("middle", 0.02, 2)):
+        above = "link6"
+        for k in range(count):
+            box = make.shape('<box size="0.01 0.01 0.03"/>', xyz="0 0 0.015")
+            parts.append(make.link(f"{name}{k}", make.inertial(0.01), box))
+            at = f"0 {y} 0.05" if k == 0 else "0 0 0.03"
+            parts.append(make.joint(f"{name}_j{k}", above, f"{name}{k}", xyz=at, axis="1 0 0"))
+            above = f"{name}{k}"
+    _, report = imported(tmp_path, base(), *six(), *parts)
+    assert report.robot.arm.joints == tuple(f"a{i}" for i in range(1, 7))
+
+
+def test_two_short_arms_are_no_hand(tmp_path):
+    """Two SCARAs of four joints on one stand have as few joints as fingers, but are as long as arms."""
+    parts = [base()]
+    for tag, y in (("upper_", 0.1), ("lower_", -0.1)):
+        links = ["base", *(f"{tag}{k}" for k in range(4))]
+        parts += [make.link(name, make.inertial(), make.shape('<box size="0.05 0.05 0.05"/>')) for name in links[1:]]
+        at = [f"0 {y} 0.2", "0.2 0 0", "0.2 0 0", "0 0 0"]
+        parts += [make.joint(f"{tag}j{k}", links[k], links[k + 1], xyz=at[k], axis="0 0 1") for k in range(4)]
+    with pytest.raises(UserError, match="more than an arm: it has 2 arms. Choose --chain base:upper_3, --chain base:lower_3"):
+        imported(tmp_path, *parts)
 
 
 def test_fix_holds_joints_where_told(tmp_path):
@@ -402,7 +440,8 @@ def test_a_hand_alone_is_no_arm(tmp_path, driven):
     for side in ("left", "right"):
         above = "base"
         for k in range(driven):
-            parts += [make.link(f"{side}{k}", make.inertial(0.01)), make.joint(f"{side}_j{k}", above, f"{side}{k}", axis="0 1 0")]
+            joint = make.joint(f"{side}_j{k}", above, f"{side}{k}", xyz="0 0 0.04", axis="0 1 0")
+            parts += [make.link(f"{side}{k}", make.inertial(0.01)), joint]
             above = f"{side}{k}"
     with pytest.raises(UserError, match=f"is not an arm: 2 branches of at most {driven} driven joint.*Import it with an arm"):
         imported(tmp_path, *parts)
