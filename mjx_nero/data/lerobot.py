@@ -9,7 +9,7 @@ import concurrent.futures
 import functools
 import json
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,21 +75,19 @@ class LeRobotForm:
         totals = len(self.lengths) + len(episodes), int(self.lengths.sum()) + steps.num_rows
         first = {} if self._pieces else {lf.TASKS: lambda path: parquet.write_table(lf.tasks(self.schema.task), path)}
 
-        def film(name: str) -> folder.Write:
-            feature, of_pictures[name] = self.schema.features[name], [{} for _ in episodes]
-            films = [
-                functools.partial(_frames, len(each), each.pictures[name], found)
-                for each, found in zip(episodes, of_pictures[name], strict=True)
-            ]
-            return lambda path: video.write(path, films, feature.shape, self.schema.fps)
+        def film(name: str, path: pathlib.Path) -> None:
+            films = [(len(each), each.pictures[name]) for each in episodes]
+            of_pictures[name] = video.write(path, films, self.schema.features[name].shape, self.schema.fps)
 
         folder.commit(
             self.path,
             {
                 **first,
-                **{lf.name_of(lf.film(name), self._pieces): film(name) for name in self._pictures},
+                **{lf.name_of(lf.film(name), self._pieces): functools.partial(film, name) for name in self._pictures},
                 lf.name_of(lf.DATA, self._pieces): lambda path: parquet.write_table(steps, path, **_PLAIN),
-                lf.name_of(lf.EPISODES, self._pieces): lambda path: parquet.write_table(self._about(episodes, of_pictures), path),
+                lf.name_of(lf.EPISODES, self._pieces): lambda path: parquet.write_table(
+                    self._about(episodes, of_pictures), path, **_PLAIN
+                ),
                 lf.INFO: lambda path: path.write_text(json.dumps(lf.info(self.schema, *totals), indent=2)),
             },
         )
@@ -196,13 +194,3 @@ class LeRobotForm:
             of_each = [lf.per_channel(found) for found in of_pictures[name]]
             columns |= {f"stats/{name}/{what}": [found[what] for found in of_each] for what in of_each[0]}
         return pa.table(columns)
-
-
-def _frames(length: int, pictures: Callable[[], Iterable[np.ndarray]], found: stats.Stats) -> Iterator[np.ndarray]:
-    """Yields a camera's pictures of an episode, and adds their statistics to ``found``."""
-    wanted, kept = stats.sampled(length), []
-    for i, frame in enumerate(pictures()):
-        if i in wanted:
-            kept.append(frame)
-        yield frame
-    found |= stats.of_pictures(kept)

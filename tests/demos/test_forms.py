@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import errno
+import itertools
 import json
 import os
 import pathlib
@@ -14,7 +16,7 @@ import pytest
 from lerobots import lerobot_python
 from written import episode, schema
 
-from mjx_nero.data import Episode, Schema, open_dataset, writer
+from mjx_nero.data import Episode, Schema, encoding, open_dataset, writer
 from mjx_nero.data.episode import picture
 from mjx_nero.errors import UserError
 from mjx_nero.tools.demos import inspection
@@ -248,6 +250,33 @@ def test_pictures_come_back(form, tmp_path):
         colours = wanted.reshape(-1, 3) / 255
         for what, values in (("mean", colours.mean(0)), ("std", colours.std(0)), ("max", colours.max(0))):
             np.testing.assert_allclose(np.ravel(stats["observation.images.front"][what]), values, atol=1e-6)
+
+
+def test_a_film_that_breaks_off_and_a_process_that_dies_spoil_no_other(tmp_path):
+    """Either is an error, nothing is written, and the next piece is as if it had not been."""
+    name, good = "observation.images.front", [filmed(i) for i in range(3)]
+
+    def broken():
+        yield from itertools.islice(good[0].pictures[name](), 2)
+        raise OSError(errno.ENOSPC, "full")
+
+    with writer(tmp_path / "d", with_camera()) as out:
+        with pytest.raises(UserError, match="No space left"):
+            out.put([dataclasses.replace(good[0], pictures={name: broken})])
+        out.put(good[:1])
+        encoding.close()
+        encoding._free.put(dead := encoding.Encoder())
+        dead._process.kill()
+        dead._process.wait()
+        with pytest.raises(UserError, match="a process that encodes videos died, .*: free some, and repeat the command"):
+            out.put(good[1:2])
+        out.put(good[1:])
+    with writer(tmp_path / "e", with_camera()) as out:
+        out.put(good[:1])
+        out.put(good[1:])
+    for path in sorted((tmp_path / "e").rglob("*.*")):
+        if path.is_file():
+            assert (tmp_path / "d" / path.relative_to(tmp_path / "e")).read_bytes() == path.read_bytes(), path
 
 
 @pytest.mark.slow

@@ -385,3 +385,11 @@ def test_warp_and_c_agree_without_contacts(ramp):
         assert not lost.any()
         np.testing.assert_allclose(sim.qpos, reference.qpos, rtol=0, atol=1e-4)
         np.testing.assert_allclose(sim.qvel, reference.qvel, rtol=0, atol=2e-3)
+
+
+def test_the_c_library_reads_no_clock():
+    """Its timers, which take a twentieth of a step, stay at zero."""
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].number == 1 and data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration == 0

@@ -6,6 +6,7 @@ A program calls the host once per control step, with all environments of a batch
 import collections
 import contextlib
 import copy
+import ctypes
 import dataclasses
 import functools
 import hashlib
@@ -32,6 +33,11 @@ from mjx_nero.types import Sim
 _lock = threading.Lock()
 _arrays: collections.OrderedDict[tuple[int, int], tuple] = collections.OrderedDict()
 _KEPT = 8
+
+# MuJoCo reads the clock dozens of times a step, for timers that nobody looks at here: a twentieth of its time. Its Python package
+# sets that clock, and cannot unset it.
+with contextlib.suppress(AttributeError, OSError, ValueError):
+    ctypes.c_void_p.in_dll(ctypes.CDLL(mujoco._structs.__file__), "mjcb_time").value = None
 
 
 class NativePhysics(Physics):
