@@ -36,7 +36,7 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
     "thousand": (1000, (640, 360), 5, 45),
 }
 
-SEEING = ("nero_lift", "piper_lift")  # have bundled policies of the preset rgb
+SEEING = ("nero_lift", "piper_lift", "so101_lift")  # have bundled policies of the preset rgb
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
@@ -77,15 +77,16 @@ def gallery(folder: pathlib.Path) -> None:
 
 def episode(path: pathlib.Path) -> None:
     """Films the first successful episode of an environment, played by its bundled policy or its controller."""
-    played = evaluation.play(evaluation.EvalCfg(path.stem, episodes=8, record=8, backend="mujoco"))
+    preset, count = ("rgb", 4) if path.stem.endswith("_rgb") else ("default", 8)
+    name = path.stem.removesuffix("_rgb")
+    played = evaluation.play(evaluation.EvalCfg(name, preset, episodes=count, record=count, backend="mujoco"))
     film(path.with_suffix(".webp"), played, np.argmax(played.episodes.success, keepdims=True))
 
 
 def seeing(folder: pathlib.Path) -> None:
     """Films the policies that act on pictures, with these in the corner."""
     for name in SEEING:
-        played = evaluation.play(evaluation.EvalCfg(name, preset="rgb", episodes=4, record=4, backend="mujoco"))
-        film(folder.with_name("gallery") / f"{name}_rgb.webp", played, np.argmax(played.episodes.success, keepdims=True))
+        episode(folder.with_name("gallery") / f"{name}_rgb")
 
 
 def objects_sheet(path: pathlib.Path) -> None:
