@@ -15,22 +15,7 @@ from mjx_nero.tools import cli
 
 def main(argv: Sequence[str]) -> None:
     """The command line of ``inspect``."""
-    parser = cli.Parser("inspect", "Shows what a robot or an environment is made of.")
-    parser.add_load()
-    parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
-    parser.add_argument("--preset", help="preset of the environment (default: the first)")
-    parser.add_argument("--robot", help="robot in the environment, or to inspect alone: a name, or the folder of an imported one")
-    parser.add_argument("--object", metavar="FILE", help="show a mesh object instead: a file, a folder or a name")
-    parser.add_argument(
-        "--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths (default: %(default)s)"
-    )
-    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
-    parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
-    parser.add_argument("--render", type=cli.output(".png"), metavar="FILE", help="write a PNG of the robot at home")
-    parser.add_argument(
-        "--cameras", type=cli.output(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
-    )
-    parser.add_argument("--json", type=cli.output(".json"), metavar="FILE", help="write everything as JSON, for programs")
+    parser = _parser()
     args, dotted = parser.parse(argv, ("env",))
     if args.object is not None:
         if args.name is not None:
@@ -75,6 +60,26 @@ def main(argv: Sequence[str]) -> None:
         with files.whole(args.json) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
         console.wrote(screen, "json", args.json)
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser("inspect", "Shows what a robot or an environment is made of.")
+    parser.add_load()
+    parser.add_argument("name", nargs="?", help="robot, environment, or folder of an imported robot")
+    parser.add_argument("--preset", help="preset of the environment (default: the first)")
+    parser.add_argument("--robot", help="robot in the environment, or to inspect alone: a name, or the folder of an imported one")
+    parser.add_argument("--object", metavar="FILE", help="show a mesh object instead: a file, a folder or a name")
+    parser.add_argument(
+        "--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths (default: %(default)s)"
+    )
+    parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
+    parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
+    parser.add_argument("--render", type=cli.output(".png"), metavar="FILE", help="write a PNG of the robot at home")
+    parser.add_argument(
+        "--cameras", type=cli.output(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
+    )
+    parser.add_argument("--json", type=cli.output(".json"), metavar="FILE", help="write everything as JSON, for programs")
+    return parser
 
 
 def _thing(args) -> None:
