@@ -34,8 +34,8 @@ class Roots:
 
     They are: the URDF's own folder; its package, the nearest folder with a ``package.xml`` at most ``LEVELS`` above (or the
     parent folder, if there is none and the URDF lies in ``urdf``, ``robots`` or ``xacro``); the given ``packages``; and packages
-    that the URDF names, if their folder lies beside it or beside a folder above: ``NAME`` with a ``package.xml``, or any folder
-    whose ``package.xml`` has that name.
+    that the URDF names, if their folder lies beside it or beside a folder above: ``NAME`` with a ``package.xml``, or a folder
+    beside the URDF's own whose ``package.xml`` has that name.
 
     Inside its own folders, a package is a folder of that name, or one whose ``package.xml`` has that name. A file whose folder
     is not here is taken from the own folders, at a tail of its path (``elsewhere``).
@@ -107,11 +107,12 @@ class Roots:
                     return path
         raise refused or Absent(f"there is no such file{lacking}")
 
-    def _places(self, package: str, plain: bool = True) -> list[pathlib.Path]:
+    def _places(self, package: str, plain: bool = True, named: bool = True) -> list[pathlib.Path]:
         """Lists the folders that may be a package, the nearest to the URDF first; only the given one, if one is given.
 
         A folder outside the own folders needs a ``package.xml`` and must not be a link; it joins ``folders``. Inside them,
-        ``plain`` folders need none.
+        ``plain`` folders need none. The folders beside the own ones are looked through only for a package that is ``named``, not
+        for one that is guessed from a path.
         """
         if package in self.packages:
             return [self.packages[package]]
@@ -126,7 +127,10 @@ class Roots:
                 if plain or described:
                     places.append(folder)
             else:
-                places += (found := [folder] if described and _usable(folder) else self._beside(above).get(package, []))
+                found = [folder] if described and _usable(folder) else []
+                if not found and named and above == self._own[-1].parent and above not in _private():
+                    found = self._beside(above).get(package, [])
+                places += found
                 self.folders += [folder for folder in found if folder not in self.folders]
         return places
 
@@ -147,7 +151,7 @@ class Roots:
         parts = [part for part in path.split("/") if part][-_DEPTH:]
         for i, part in enumerate(parts[:-1]):
             if part not in _PARTS:  # a folder below share/ is a package; elsewhere a name like meshes proves nothing
-                for place in self._places(part, plain=parts[i - 1 : i] == ["share"]):
+                for place in self._places(part, plain=parts[i - 1 : i] == ["share"], named=False):
                     yield place, "/".join(parts[i + 1 :])
 
     def _tails(self, path: str) -> Iterator[tuple[pathlib.Path, str]]:

@@ -211,7 +211,7 @@ np.save("targets.npy", out)
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere.safetensors", "--out", "p.onnx"], "no such file: nowhere.safetensors"),
+        (["nowhere.safetensors", "--out", "p.onnx"], "no policy file and no bundled policy 'nowhere.safetensors'"),
         (["nero_lift", "--out", "nowhere/p.onnx"], "cannot write nowhere/p.onnx"),
         (["nero_lift", "--out", "p.onnx", "--env.rewards", "1"], "rewards takes a"),
         (["nero_lift"], "the following arguments are required: --out"),

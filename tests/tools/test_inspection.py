@@ -16,7 +16,8 @@ from mjx_nero.sim.robot import ASSETS, GripperCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import list_envs, motion
-from mjx_nero.tools.inspection import cameras, report, tables
+from mjx_nero.tools.inspection import cameras, report
+from mjx_nero.tools.inspection.tables import tables
 from mjx_nero.types import UserError
 
 NERO, COBOTTA = (registry.robot(name) for name in ("nero", "cobotta_pro_900"))
@@ -205,7 +206,7 @@ def test_environments(environments):
 def test_a_jaw_that_swings_open_says_how_much_fits(cobotta):
     swings = dataclasses.replace(cobotta, gaps=(0.1156, 0.0), room=0.067)
     for hand, said in ((swings, "only 67 mm fit"), (cobotta, None)):
-        captions = [table.caption for table in tables.tables(hand) if table.title == "gripper"]
+        captions = [table.caption for table in tables(hand) if table.title == "gripper"]
         assert len(captions) == 1 and (said in captions[0] if said else not captions[0])
 
 

@@ -463,7 +463,9 @@ def touched(folder: pathlib.Path, act) -> list[tuple[str, str]]:
     finally:
         Watch.on = False
     own = [("open", str(folder)), ("import", "")]
-    return [(e, what) for e, what in Watch.seen if not any(e == kind and what.startswith(start) for kind, start in own)]
+    beside = ("os.scandir", str(folder.parent))  # a named package may lie beside the description
+    seen = [each for each in Watch.seen if each != beside]
+    return [(e, what) for e, what in seen if not any(e == kind and what.startswith(start) for kind, start in own)]
 
 
 def one_line(path: pathlib.Path, match: str = "") -> None:
