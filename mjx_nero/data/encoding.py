@@ -2,7 +2,8 @@
 
 Threads of one process would wait for Python's lock: they kept five of twelve cores busy. The pictures go through memory that both
 processes see. Everything else goes through the process's standard input and output, as lines of JSON; bytes of packets follow
-their line.
+their line. The process forks for each film: x264 ends a slice by bits that depend on what it encoded before, so the same pictures
+would not always be the same file.
 """
 
 import atexit
@@ -108,7 +109,10 @@ class Encoder:
         except (OSError, ValueError):
             raise _died() from None
         for size, key, pts, dts, duration in answer["packets"]:
-            packet = Packet(self._process.stdout.read(size))  # type: ignore[union-attr]
+            content = self._process.stdout.read(size)  # type: ignore[union-attr]
+            if len(content) < size:
+                raise _died()
+            packet = Packet(content)
             packet.pts, packet.dts, packet.duration, packet.is_keyframe = pts, dts, duration, key
             packets.append(packet)
         return packets, answer["stats"]
@@ -127,10 +131,16 @@ def _died() -> UserError:
 
 def serve(memory: int) -> None:
     """Encodes films until the standard input ends; the other process's side is ``Encoder``."""
-    given, told = sys.stdin.buffer, sys.stdout.buffer
+    import av  # noqa: F401  # here, not once for each film
+
+    given, told = open(0, "rb", buffering=0), sys.stdout.buffer  # a buffer would hold lines that are for the fork
     try:
         while line := given.readline():
-            _film(given, told, memory, **json.loads(line))
+            if not (film := os.fork()):
+                _film(given, told, memory, **json.loads(line))
+                os._exit(0)
+            if os.waitpid(film, 0)[1]:
+                os._exit(1)
     except (BrokenPipeError, json.JSONDecodeError):
         os._exit(1)  # the other process died: nothing to say, and nobody to hear it
 

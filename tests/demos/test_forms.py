@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import io
 import itertools
 import json
 import os
@@ -10,6 +11,7 @@ import pathlib
 import resource
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -277,6 +279,18 @@ def test_a_film_that_breaks_off_and_a_process_that_dies_spoil_no_other(tmp_path)
     for path in sorted((tmp_path / "e").rglob("*.*")):
         if path.is_file():
             assert (tmp_path / "d" / path.relative_to(tmp_path / "e")).read_bytes() == path.read_bytes(), path
+
+
+def test_an_answer_that_is_cut_off_is_an_error():
+    """Its last packet would be half a picture."""
+    encoder = encoding.Encoder()
+    process = encoder._process
+    answer = io.BytesIO(b'{"packets": [[9, true, 0, 0, 1]], "stats": {}}\nshort')
+    encoder._process = types.SimpleNamespace(stdin=io.BytesIO(), stdout=answer)
+    with pytest.raises(UserError, match="a process that encodes videos died"):
+        encoder._handed(0)
+    encoder._process = process
+    encoder.close()
 
 
 @pytest.mark.slow
