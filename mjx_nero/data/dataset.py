@@ -55,11 +55,15 @@ def check_writable(path: pathlib.Path, schema: Schema, form: str = "lerobot") ->
     Raises:
         UserError: the folder holds something else, or a package is missing.
     """
+    _check_form(path, form)
+    folder.check(path, schema)
+
+
+def _check_form(path: pathlib.Path, form: str) -> None:
     held = _held(path)
     if held not in (None, form):
         raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
-    importlib.import_module(FORMS[form][0])
-    folder.check(path, schema)
+    importlib.import_module(FORMS[form][0])  # a package may be missing
 
 
 @contextlib.contextmanager
@@ -70,7 +74,7 @@ def writer(path: pathlib.Path, schema: Schema, form: str = "lerobot") -> Iterato
     Raises:
         UserError: the folder holds something else or cannot be written, or a package is missing.
     """
-    check_writable(path, schema, form)
+    _check_form(path, form)  # before the folder is made
     with folder.claim(path, schema):
         made = _make(form, path, schema)
         made.tidy()
