@@ -58,6 +58,7 @@ def inserting(robot: RobotCfg, clearance: float = LOOSE, square: bool = True) ->
     grip = putting.picking(task.builder, width, DEEP + grasp.lowest(robot.pad), LONG + ABOVE, object="peg", turns=(task.fold,))
     put = {**grip, "foot": LONG / 2, "over": DEEP + OVER, "top": DEEP, "turns": task.fold, "reach": 0.002}
     put |= {"press": PRESS, "done": DONE, "away": AWAY}
+    # Training that begins in the expert's states, a moment before success, unlearns the way there.
     return task.cfg({"put_in": put}, training={**PRECISE, "max_std": 0.15}, curriculum=CurriculumCfg())
 
 
