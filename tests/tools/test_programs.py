@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_nero import list_envs
 from mjx_nero.learn import checkpoint, policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import evaluation, logs, training, videos
@@ -31,7 +32,11 @@ def can_draw():
 
 
 MISTAKES = [
-    ("train", ["--env", "nero_lfit"], "unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of"),
+    (
+        "train",
+        ["--env", "nero_lfit"],
+        f"unknown env 'nero_lfit' (did you mean 'nero_lift'?): choose one of {len(list_envs())}, such as nero_lift",
+    ),
     ("train", ["--preset", "isac"], "unknown preset of nero_lift 'isac' (did you mean 'isaac'?): choose one of default, isaac"),
     ("train", ["--env.sim.td", "0.01"], "no field 'sim.td': 'td' is not one of dt, decimation"),
     ("train", ["--env.rewards.reaching_object.params.sdt=1"], "(did you mean 'std'?)"),

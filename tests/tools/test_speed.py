@@ -7,6 +7,7 @@ dear.
 
 import dataclasses
 import os
+import pathlib
 import statistics
 import time
 import types
@@ -93,8 +94,11 @@ def costs(optimised) -> dict[str, list[float]]:
 # XLA's code for the terms is faster from JAX 0.11 on; MuJoCo's C library is the same for all. How the two compare depends on the
 # processor: the same commit takes 0.08 on an AMD EPYC and 0.135 to 0.15 on an Intel Xeon, both with JAX 0.10.
 OLD = jax.__version_info__ < (0, 11)
+INTEL = "GenuineIntel" in pathlib.Path("/proc/cpuinfo").read_text()
 BOUNDS = [
-    pytest.param("terms", "physics", 0.2 if OLD else 0.07, id="the MDP beside the physics (0.08 to 0.15; 0.045)"),
+    pytest.param(
+        "terms", "physics", (0.2 if INTEL else 0.12) if OLD else 0.07, id="the MDP beside the physics (0.08 to 0.15; 0.045)"
+    ),
     pytest.param("ppo", "step", 4.0, id="training beside random actions (2.5; 2.8)"),
     pytest.param("physics", "bare", 1.8, id="the physics beside MuJoCo's own rollout (1.2)"),
 ]
