@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_nero import control
+from mjx_nero.config import values
 from mjx_nero.envs import things
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg, for_controllers
@@ -17,7 +18,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.mdp import metrics
-from mjx_nero.runs.evaluation_cfg import EXPERT, EvalCfg
+from mjx_nero.runs.evaluation_cfg import EXPERT, EvalCfg, controller_of
 from mjx_nero.sim.physics import warp_available
 from mjx_nero.tasks import registry
 
@@ -47,10 +48,9 @@ def controller(name: str, env: ManipulationEnv, env_name: str, fields: Mapping[s
         UserError: the controller cannot do the task, or a field of its config is wrong.
     """
     able = env.cfg.controllers
-    if not able:
-        raise UserError(f"{env_name} has no controller: play a policy instead")
     if name not in able:
-        raise UserError(f"controller {name!r} cannot do {env_name}: choose one of {', '.join(able)}")
+        names = ", ".join(["policy", EXPERT, *able]) if able else "policy, it has no expert"
+        raise UserError(f"{values.short(name)} cannot play {env_name}: choose {'one of ' if able else ''}{names}")
     return control.make(name, env.cfg.robot, env.dt, {**able[name], **(fields or {})}, env.cfg.scene.robots)
 
 
@@ -65,10 +65,9 @@ class Played:
 
 def _controller_name(cfg: EvalCfg, env_cfg: EnvCfg) -> str | None:
     """Returns the name of the controller that plays, or None if an agent does."""
-    usual = next(iter(env_cfg.controllers), None)
-    if cfg.controller:
-        return (usual or EXPERT) if cfg.controller == EXPERT else cfg.controller
-    return None if cfg.agent or cfg.policy or bundled.shipped(cfg.env_name, cfg.preset).exists() else usual
+    if cfg.player:
+        return controller_of(cfg.player, env_cfg.controllers)
+    return None if cfg.policy or bundled.shipped(cfg.env_name, cfg.preset).exists() else next(iter(env_cfg.controllers), None)
 
 
 def play(cfg: EvalCfg) -> Played:
@@ -84,7 +83,7 @@ def play(cfg: EvalCfg) -> Played:
     env_cfg = dataclasses.replace(env_cfg, metrics={**metrics.calmness(len(env_cfg.robot.arm.joints)), **env_cfg.metrics})
     env = ManipulationEnv(env_cfg, impl=_impl(cfg.backend, cfg.impl), num_envs=cfg.episodes)
     if cfg.control_fields and not name:
-        raise UserError("--control.* needs --controller")
+        raise UserError("--control.* needs --agent with a controller's name")
     steering = controller(name, env, cfg.env_name, cfg.control_fields) if name else None
     act, params = (rollout.controller_agent(env, steering), None) if steering else agent(cfg, env)
     begun = time.perf_counter()

@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 from mjx_nero.config import flag
@@ -14,16 +14,28 @@ EXPERT = "expert"  # the task's first controller
 BACKENDS = ("auto", "mjx", "mujoco")
 
 
+def controller_of(agent: str, able: Iterable[str]) -> str | None:
+    """Returns the name of the controller that an agent's name means; None if the agent is not a controller.
+
+    Args:
+        able: names of the task's controllers.
+    """
+    if agent in AGENTS:
+        return None
+    return next(iter(able), EXPERT) if agent == EXPERT else agent
+
+
 @dataclasses.dataclass(frozen=True)
 class EvalCfg:
     """Settings of an evaluation.
 
     Attributes:
         robot: robot instead of the environment's own, by name or folder.
-        agent: who plays, if not a controller (default: the bundled policy, or the task's controller if there is none).
+        agent: who plays: policy, expert (the task's first controller), the name of one of its controllers, zero or random
+            (default: the bundled policy, or the expert if there is none).
         policy: policy file (default: the environment's bundled policy).
         any_robot: also play a policy that was trained for another model of the robot.
-        controller: play one of the task's controllers instead of an agent; expert: the first of them.
+        controller: the same as --agent with a controller's name.
         episodes: number of episodes, played side by side.
         backend: mjx, or mujoco (the C library on the CPU); auto: as --impl says.
         impl: physics, one of ``physics.impls()``.
@@ -34,7 +46,7 @@ class EvalCfg:
     env_name: str
     preset: str = flag("default")
     robot: str | None = flag(None)
-    agent: Annotated[str, OneOf(*AGENTS)] | None = flag(None)
+    agent: str | None = flag(None)
     policy: pathlib.Path | None = flag(None)
     any_robot: bool = flag(False)
     controller: str | None = flag(None)
@@ -49,5 +61,10 @@ class EvalCfg:
     def __post_init__(self):
         if self.controller and (self.agent or self.policy) or self.policy and self.agent not in (None, "policy"):
             raise UserError("only one can play: pass --controller, --agent or --policy")
-        if self.control_fields and (self.agent or self.policy):
-            raise UserError("--control.* needs --controller")
+        if self.control_fields and (self.policy or self.player in AGENTS):
+            raise UserError("--control.* needs --agent with a controller's name")
+
+    @property
+    def player(self) -> str | None:
+        """Name of the agent or controller that plays; None: the default."""
+        return self.controller or self.agent

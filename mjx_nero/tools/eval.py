@@ -12,7 +12,7 @@ import numpy as np
 from mjx_nero import control, files
 from mjx_nero.errors import UserError
 from mjx_nero.runs import console, videos
-from mjx_nero.runs.evaluation_cfg import EXPERT, EvalCfg
+from mjx_nero.runs.evaluation_cfg import EvalCfg, controller_of
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 
@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the configs whose fields ``--help`` lists."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
-    name = next(iter(env.controllers), "") if args.controller == EXPERT else args.controller
+    name = controller_of(args.controller or args.agent or "policy", env.controllers)
     return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
 
 

@@ -44,7 +44,7 @@ def test_tracking_by_hand():
 def followed(call, tmp_path, x):
     """Three seconds of inverse kinematics towards a target at rest, ``x`` ahead [m]: what is printed, and the result."""
     dotted = [f"--env.{name}={value}" for name, value in at(x, 0.0, 0.5).items()] + ["--env.episode_length_s=3"]
-    argv = ["--env", "cobotta_follow_target", "--preset", "static", "--controller", "ik", "--episodes", 1]
+    argv = ["--env", "cobotta_follow_target", "--preset", "static", "--agent", "ik", "--episodes", 1]
     code, out, err = call("eval", *argv, *dotted, "--json", "result.json")
     assert code == 0, err
     return out, err, json.loads((tmp_path / "result.json").read_text())
@@ -138,21 +138,24 @@ FOLLOW = ["--env", "cobotta_follow_target"]
     [
         (
             [*FOLLOW, "--controller", "pick_place"],
-            "controller 'pick_place' cannot do cobotta_follow_target: choose one of rmpflow, ik",
+            "'pick_place' cannot play cobotta_follow_target: choose one of policy, expert, rmpflow, ik",
         ),
         (
             ["--env", "cobotta_pick_place", "--controller", "ik"],
-            "controller 'ik' cannot do cobotta_pick_place: choose one of pick_place",
+            "'ik' cannot play cobotta_pick_place: choose one of policy, expert, pick_place",
         ),
-        (["--env", "cobotta_push", "--controller", "ik"], "cobotta_push has no controller: play a policy instead"),
-        (["--env", "cobotta_push", "--controller", "expert"], "cobotta_push has no controller: play a policy instead"),
+        (["--env", "cobotta_push", "--controller", "ik"], "'ik' cannot play cobotta_push: choose policy, it has no expert"),
+        (["--env", "cobotta_push", "--agent", "expert"], "'expert' cannot play cobotta_push: choose policy, it has no expert"),
         ([*FOLLOW, "--controller", "ik", "--policy", "p.safetensors"], "pass --controller, --agent or --policy"),
         ([*FOLLOW, "--controller", "ik", "--agent", "zero"], "pass --controller, --agent or --policy"),
-        ([*FOLLOW, "--agent", "zero", "--control.restarts", "3"], "--control.* needs --controller"),
-        (["--env", "cobotta_lift", "--control.restarts", "3"], "--control.* needs --controller"),
+        ([*FOLLOW, "--agent", "zero", "--control.restarts", "3"], "--control.* needs --agent with a controller's name"),
+        (["--env", "cobotta_lift", "--control.restarts", "3"], "--control.* needs --agent with a controller's name"),
         ([*FOLLOW, "--controller", "ik", "--control.restart", "3"], "no field 'restart'"),
         ([*FOLLOW, "--controller", "rmpflow", "--control.descriptor", "nowhere.yaml"], "nowhere.yaml"),
-        ([*FOLLOW, "--controller", "spline"], "controller 'spline' cannot do cobotta_follow_target: choose one of rmpflow, ik"),
+        (
+            [*FOLLOW, "--controller", "spline"],
+            "'spline' cannot play cobotta_follow_target: choose one of policy, expert, rmpflow, ik",
+        ),
         (["--env", "cobotta_pick_place", "--control.events_dt", "(1, 1)"], "events_dt takes 10 shares above 0 and up to 1"),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",

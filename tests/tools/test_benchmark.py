@@ -31,7 +31,7 @@ MISTAKES = [
     (["--seeds", "-1"], "--seeds must be at least 1, got '-1'"),
     (["--env", "nero_lft"], "unknown env 'nero_lft' (did you mean 'nero_lift'?)"),
     (["--env", "reach"], "reach is for any robot: pass one (--robot"),
-    (["--env", "nero_push", "--what", "control"], "nero_push has no controller: play a policy instead"),
+    (["--env", "nero_push", "--what", "control"], "'expert' cannot play nero_push: choose policy, it has no expert"),
     (["--what", "step,ppo", "--num-envs", "8,12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
     (["--what", "learning", "--num-envs", "12"], "num_envs (12) must be a multiple of ppo.num_minibatches (8)"),
     (["--what", "ppo", "--num-envs", "8", "--num-devices", "99"], "num_devices is 99, but JAX finds"),

@@ -179,7 +179,8 @@ def test_units_of_lerobots_robots_by_hand():
         (["--out", "d", "--inspect", "d"], "demos takes exactly one of"),
         (["--out", "d", "--policy", "p.safetensors"], "--policy needs --agent policy"),
         (["--out", "d", "--agent", "policy", "--through", "task"], "--through is for experts"),
-        (["--out", "d", "--agent", "juggler"], "controller 'juggler' cannot do nero_lift"),
+        (["--out", "d", "--agent", "juggler"], "'juggler' cannot play nero_lift: choose one of policy, expert, pick_up"),
+        (["--out", "d", "--agent", "random"], "--agent random demonstrates nothing: choose policy, expert or a controller"),
         (
             ["--out", "d", "--agent", "policy", "--side-by-side", 65536, "--episodes", 65536, "--env.episode_length_s", 3000],
             "--side-by-side 65,536 with",

@@ -57,7 +57,7 @@ MISTAKES = [
     ("eval", ["--policy", "nowhere.safetensors"], "no such file: nowhere.safetensors"),
     ("eval", ["--policy", "README.md"], "is not a policy or checkpoint of mjx_nero, or it is damaged"),
     ("eval", ["--preset", "isaac"], "was trained on other observations (preset default): pass --preset default"),
-    ("eval", ["--agent", "expert"], "invalid choice: 'expert'"),
+    ("eval", ["--agent", "expret"], "'expret' cannot play nero_lift: choose one of policy, expert, pick_up"),
     ("eval", ["--json", "nowhere/result.json"], "cannot write nowhere/result.json"),
     ("eval", ["--json", "."], "--json takes a name that ends in .json, got '.'"),
     ("eval", ["--failures"], "--failures selects the episodes of a video: pass --video FILE.mp4, too"),

@@ -69,6 +69,8 @@ class DemosCfg:
 
     def __post_init__(self):
         bounds.check(self)
+        if self.agent in ("zero", "random"):
+            raise UserError(f"--agent {self.agent} demonstrates nothing: choose policy, expert or a controller of the task")
         if self.policy and self.agent != "policy":
             raise UserError("--policy needs --agent policy")
         if self.agent == "policy" and self.through != "drives":

@@ -25,7 +25,7 @@ from mjx_nero.imitation.recording.pictures import Cameras
 from mjx_nero.learn import bundled, policy
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import evaluation
-from mjx_nero.runs.evaluation_cfg import EXPERT
+from mjx_nero.runs.evaluation_cfg import controller_of
 from mjx_nero.sim import team
 from mjx_nero.sim.fingerprint import fingerprint
 from mjx_nero.tasks import registry
@@ -57,9 +57,9 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     """
     env_cfg = registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot).uncorrupted()
     env_cfg = things.overridden(env_cfg, cfg.env_fields)
-    acts = cfg.agent == "policy"
+    name = controller_of(cfg.agent, env_cfg.controllers)
+    acts = name is None
     size = min(cfg.side_by_side, cfg.episodes)
-    name = next(iter(env_cfg.controllers), EXPERT) if cfg.agent == EXPERT else cfg.agent
     drives = not acts and cfg.through == "drives"
     told = not cfg.policy and teachers.GROUP in env_cfg.observations  # the agent is told what others must see
     if not acts or told:  # pictures that no term reads are not drawn

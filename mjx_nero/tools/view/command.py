@@ -20,7 +20,7 @@ def main(argv: Sequence[str]) -> None:
         "--policy", type=cli.path(), action="append", default=[], help="policy or checkpoint to choose from; repeatable"
     )
     parser.add_argument(
-        "--agent", help="agent that acts first: a controller, zero, random or 'joint sliders' (default: a policy)"
+        "--agent", help="agent that acts first: expert, a controller, zero, random or 'joint sliders' (default: a policy)"
     )
     parser.add_argument(
         "--run",

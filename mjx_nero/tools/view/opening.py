@@ -14,6 +14,7 @@ from mjx_nero.data import open_dataset
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.interop import need
 from mjx_nero.learn import policy
+from mjx_nero.runs.evaluation_cfg import controller_of
 from mjx_nero.runs.folder import CONFIG
 from mjx_nero.sim import team
 from mjx_nero.tasks import registry
@@ -142,7 +143,7 @@ def open_view(
     makers = agents.known(env, env_name, list(policies), preset)
     if leader and leaders.same_joints(env):
         makers[leaders.NAME] = lambda: leaders.agent(env)
-    chosen = _chosen(agent, list(makers), env_name)
+    chosen = _chosen(agent and (controller_of(agent, env.cfg.controllers) or agent), list(makers), env_name)
     home = jnp.array(team.home(env.team)) if chosen == agents.SLIDERS else None
     sim = session.Session(env, num_envs, makers[chosen](), home, seed)
     if demos and episode is not None:
