@@ -132,8 +132,8 @@ def test_another_machine_that_writes_to_the_same_disk_is_left_to_write(tmp_path,
     ("name", "message"),
     [
         ("nowhere/a.json", "cannot write .*nowhere/a.json: the folder .*nowhere does not exist"),
-        ("file/a.json", "cannot write .*file/a.json: the folder .*file does not exist"),
-        ("folder", "folder is a folder: give a file name"),
+        ("file/a.json", "cannot write .*file/a.json: .*file is a file"),
+        ("folder", "cannot write .*folder: it is a folder, give a file name"),
         ("/proc/a.json", "cannot write /proc/a.json: No such file or directory"),  # a folder, and root may write to it
     ],
 )

@@ -112,7 +112,7 @@ def test_what_a_guest_does_wrong_is_one_line(call, tmp_path, text, message):
 def test_a_guest_that_is_not_there_is_one_line(call, tmp_path):
     (tmp_path / "my_code").mkdir()
     missing = (
-        ("nowhere.py", "FileNotFoundError"),
+        ("nowhere.py", "there is no file"),
         ("no_such_module", "ModuleNotFoundError"),
         ("my_code", "it is a folder"),
     )

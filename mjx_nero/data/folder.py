@@ -75,9 +75,12 @@ def check(path: pathlib.Path, schema: Schema) -> None:
     """Checks that the folder is free, or holds a data set with the same schema.
 
     Raises:
-        UserError: it holds something else.
+        UserError: it holds something else, or is below a file.
     """
     if not path.exists():
+        above = next(folder for folder in path.absolute().parents if folder.exists())
+        if not above.is_dir():
+            raise UserError(f"cannot write to {path}: {above.name} is a file; pass another --out")
         return
     if not path.is_dir():
         raise UserError(f"{path} is not a folder: pass another --out")

@@ -13,7 +13,7 @@ import shutil
 import stat
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, BinaryIO, NoReturn
 
 import yaml
@@ -30,6 +30,8 @@ MAX_NODES = 20_000  # values in a YAML file, with aliases expanded
 MAX_DEPTH = 12  # levels of nesting in a YAML file
 MAX_JSON = 4_000_000  # bytes
 MAX_JSON_DEPTH = 30
+# Marks of kinds of files that are the same whoever writes them.
+MARKS = {".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<svg", ".mp4": b"ftyp", ".onnx": b"mjx_nero"}
 # Errors of libxml2 about <?xml ...?> alone: a version such as "1" or "0.0", none at all, or a line before it.
 _MISDECLARED = ("ERR_UNKNOWN_VERSION", "ERR_VERSION_MISSING", "ERR_XMLDECL_NOT_STARTED", "ERR_RESERVED_XML_NAME")
 
@@ -273,21 +275,36 @@ YamlLoader.yaml_constructors = {
 } | {None: YamlLoader.refuse}
 
 
-def check_writable(path: pathlib.Path) -> None:
+def check_writable(path: pathlib.Path, marks: Sequence[str] = ()) -> None:
     """Checks before long work that its result can be written to a file, by writing an empty one beside it.
 
+    A file that exists is only replaced by another of its kind.
+
+    Args:
+        marks: texts of which every file of this kind holds one; none: it is known by its suffix, or may be any.
+
     Raises:
-        UserError: it is a folder, or its folder does not exist or is not writable.
+        UserError: it is a folder, or of another kind, or its folder does not exist or is not writable.
     """
     if path.is_dir():
-        raise UserError(f"{path} is a folder: give a file name")
+        raise UserError(f"cannot write {path}: it is a folder, give a file name")
+    _check_kind(path, [mark.encode() for mark in marks] or [MARKS.get(path.suffix.lower(), b"")])
     part = _part(path)
     try:
         part.touch()
         part.unlink()
     except OSError as error:
-        why = error.strerror or error if path.parent.is_dir() else f"the folder {path.parent} does not exist"
+        missing = f"{path.parent} is a file" if path.parent.exists() else f"the folder {path.parent} does not exist"
+        why = error.strerror or error if path.parent.is_dir() else missing
         raise UserError(f"cannot write {path}: {why}") from None
+
+
+def _check_kind(path: pathlib.Path, marks: Sequence[bytes]) -> None:
+    if path.exists():
+        with open_file(path) as (file, size):
+            start = file.read(MAX_JSON)
+        if size and not any(mark in start for mark in marks):
+            raise UserError(f"cannot write {path}: it exists and is another kind of file, remove it or name another")
 
 
 class _FolderRemoved(UserError):

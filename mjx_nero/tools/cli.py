@@ -186,6 +186,10 @@ def load_guests(names: Sequence[str] = ()) -> None:
             elif (module := f"mjx_nero_guest_{pathlib.Path(name).resolve()}") not in sys.modules:
                 spec = importlib.util.spec_from_file_location(module, name)
                 assert spec and spec.loader
+                from mjx_nero import files  # needs installed packages
+
+                with files.open_file(pathlib.Path(name)):
+                    pass  # the message is plainer than the loader's
                 sys.modules[module] = importlib.util.module_from_spec(spec)
                 spec.loader.exec_module(sys.modules[module])
 
@@ -389,15 +393,19 @@ def path(*suffixes: str) -> Callable[[str], pathlib.Path]:
     return read
 
 
-def output(*suffixes: str) -> Callable[[str], pathlib.Path]:
-    """Makes an argparse type: the path of a file that the command will write, which is tried at once, before long work."""
+def output(*suffixes: str, marks: Sequence[str] = ()) -> Callable[[str], pathlib.Path]:
+    """Makes an argparse type: the path of a file that the command will write, which is tried at once, before long work.
+
+    Args:
+        marks: see ``files.check_writable``.
+    """
 
     def read(text: str) -> pathlib.Path:
         found = path(*suffixes)(text)
         from mjx_nero import files  # needs installed packages
 
         try:
-            files.check_writable(found)
+            files.check_writable(found, marks)
         except UserError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
         return found

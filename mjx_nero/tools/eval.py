@@ -83,7 +83,7 @@ def _parser() -> cli.Parser:
     parser.add_argument("--video", type=cli.output(".mp4"), help="write an MP4 of up to three episodes")
     parser.add_argument("--failures", action="store_true", help="show only failed episodes in the video")
     parser.add_video()
-    parser.add_argument("--json", type=cli.output(".json"), help="write the result as JSON")
+    parser.add_argument("--json", type=cli.output(".json", marks=('"return_by_term"',)), help="write the result as JSON")
     parser.add_argument("--view", action="store_true", help="play in a browser instead, until Ctrl-C (the extra view)")
     return parser
 

@@ -78,7 +78,12 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--cameras", type=cli.output(".png"), metavar="FILE", help="write a PNG of the cameras' views (takes --env.*)"
     )
-    parser.add_argument("--json", type=cli.output(".json"), metavar="FILE", help="write everything as JSON, for programs")
+    parser.add_argument(
+        "--json",
+        type=cli.output(".json", marks=('"masses"', '"rests"')),
+        metavar="FILE",
+        help="write everything as JSON, for programs",
+    )
     return parser
 
 

@@ -44,7 +44,11 @@ def main(argv: Sequence[str]) -> None:
         "--folder", type=cli.path(), required=True, help="folder that contains the repositories, each as OWNER+NAME"
     )
     parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
-    parser.add_argument("--markdown", type=cli.output(".md"), help="write the tables of all results in the JSON file")
+    parser.add_argument(
+        "--markdown",
+        type=cli.output(".md", marks=("The importer accepts",)),
+        help="write the tables of all results in the JSON file",
+    )
     parser.add_argument(
         "--robots", help="list of robots, or none to only write the table (default: all robots that the JSON file lacks)"
     )
@@ -52,8 +56,8 @@ def main(argv: Sequence[str]) -> None:
         "--jobs", type=cli.at_most(100), default=1, help="number of robots to import at once (default: %(default)s)"
     )
     args, _ = parser.parse(argv)
-    commits, robots = read(args.list)
     held = figures(args.json) if args.json.exists() else {}
+    commits, robots = read(args.list)
     if args.robots == "none":
         names = []
     else:
@@ -94,10 +98,11 @@ def figures(path: pathlib.Path) -> dict[str, Any]:
     """Reads the figures of a JSON file.
 
     Raises:
-        UserError: the file is not JSON, or not a mapping.
+        UserError: the file is not JSON, or has other rows.
     """
     held = files.read_json(path)
-    if not isinstance(held, dict):
+    rows = held.values() if isinstance(held, dict) else [held]
+    if not all(isinstance(row, dict) and {"self_test", "failed"} & row.keys() for row in rows):
         raise UserError(f"{path} holds no results of public-robots: name another file")
     return held
 

@@ -50,7 +50,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_load()
     parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
     parser.add_argument(
-        "--markdown", type=cli.output(".md"), help="write all results in the JSON file as a page, one table per task"
+        "--markdown",
+        type=cli.output(".md", marks=("mjx_nero results",)),
+        help="write all results in the JSON file as a page, one table per task",
     )
     parser.add_argument(
         "--what", help=f"list of {', '.join(WHATS)}, or none to only show the table (default: all)", default=",".join(WHATS)

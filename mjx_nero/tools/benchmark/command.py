@@ -135,7 +135,7 @@ def _parser() -> cli.Parser:
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
     parser.add_argument(
         "--json",
-        type=cli.output(".json"),
+        type=cli.output(".json", marks=('"complete"',)),
         help="write the rows, the machine and all versions as JSON; repeating the command measures only the missing seeds",
     )
     parser.add_argument("--plot", type=cli.output(".png"), help="picture of rates and memory over the number of environments")

@@ -69,8 +69,12 @@ def _parser() -> cli.Parser:
     add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line in joint space")
     add("--dry-run", action="store_true", help="read the arm and show what would be sent, but send nothing")
     text = "instead of running the policy, move each joint a little, ask what you saw, and write offsets and delay"
-    add("--check", type=cli.output(".yaml", ".yml"), metavar="FILE", help=text)
-    add("--log", type=cli.output(".csv"), help="write a table of everything read and sent, which identify reads")
+    add("--check", type=cli.output(".yaml", ".yml", marks=("offset:",)), metavar="FILE", help=text)
+    add(
+        "--log",
+        type=cli.output(".csv", marks=("target.",)),
+        help="write a table of everything read and sent, which identify reads",
+    )
     add("--alive", type=cli.path(), metavar="FILE", help="hold unless this file is touched at least every half second")
     arms.add_limits(parser)
     return parser

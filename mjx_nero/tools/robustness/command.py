@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--only", action="append", default=[], metavar="TEXT", help="only parameters whose names contain this text; repeatable"
     )
-    parser.add_argument("--json", type=cli.output(".json"), help="write the results as JSON")
+    parser.add_argument("--json", type=cli.output(".json", marks=('"curves"',)), help="write the results as JSON")
     parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="plot the curves to this file")
     parser.add_argument(
         "--beside", type=cli.path(".json"), help="with --plot: results of another policy (from --json) to plot as well"

@@ -19,7 +19,9 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_load()
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
-    parser.add_argument("--out", type=cli.output(".yaml", ".yml"), help="write the gains as YAML, for import-urdf --gains")
+    parser.add_argument(
+        "--out", type=cli.output(".yaml", ".yml", marks=("effort:",)), help="write the gains as YAML, for import-urdf --gains"
+    )
     parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the step responses")
     parser.add_argument(
         "--step",

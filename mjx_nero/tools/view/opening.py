@@ -149,7 +149,7 @@ def open_view(
     if demos and episode is not None:
         sim.replay(tape.of_dataset(demos, episode, sim.frame))
     recording = hand.Recording(sim, demos, env_name, preset, fields=overrides) if demos else None
-    if recording and episode is None:
+    if recording is not None and episode is None:  # an empty one is false
         recording.check()
     return _served(sim, makers, chosen, recording, leader, (host, port), run, env_name)
 
