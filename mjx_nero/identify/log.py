@@ -5,7 +5,7 @@
     0.005,,,0.1001,0.4998
 
 ``time`` [s] ascends. At the time of a row its targets [rad or m] were sent and its positions [rad or m] were read; either may be
-empty. The first row has targets. Lines that begin with # are comments.
+empty. The first row has targets. Lines that begin with # are comments; ``# robot: NAME`` says whose log it is.
 """
 
 import dataclasses
@@ -18,8 +18,10 @@ import numpy as np
 from mjx_nero import files
 from mjx_nero.config.values import hint, short
 from mjx_nero.errors import UserError
+from mjx_nero.sim.robot import RobotCfg
 
 MAX_BYTES, MAX_ROWS = 64_000_000, 500_000
+ROBOT = "robot: "  # begins the comment that names the robot
 _LARGEST = 1e4  # largest number in a log: an arm's angles, metres and seconds are smaller
 SHORTEST, FEWEST = 10.0, 500  # minimum length [s] and number of readings
 
@@ -58,17 +60,24 @@ def write(path: pathlib.Path, log: Log, joints: Sequence[str], notes: Sequence[s
     files.write(path, ("\n".join(lines) + "\n").encode())
 
 
-def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, fewest: int = FEWEST) -> Log:
+def read(
+    path: pathlib.Path,
+    joints: Sequence[str],
+    shortest: float = SHORTEST,
+    fewest: int = FEWEST,
+    robot: RobotCfg | None = None,
+) -> Log:
     """Reads a log of a robot's arm. The file is not trusted.
 
     Args:
         joints: names of the arm's joints, in the order of the result; the file may have another order.
         shortest, fewest: minimum length of the log [s], and minimum number of readings.
+        robot: the robot whose log it must be; None: any with these joints.
 
     Raises:
         UserError: the file does not exist, is too large, or is not a log of these joints; the message names the line.
     """
-    lines = numbered(path, MAX_BYTES)
+    lines = numbered(path, MAX_BYTES, robot)
     if len(lines) > MAX_ROWS:
         raise UserError(f"{path} has {len(lines):,} rows, but at most {MAX_ROWS:,} are read: give a shorter log")
     head = [name.strip() for name in lines[0][1].split(",")] if lines else []
@@ -102,17 +111,31 @@ def read(path: pathlib.Path, joints: Sequence[str], shortest: float = SHORTEST, 
     return log
 
 
-def numbered(path: pathlib.Path, limit: int) -> list[tuple[int, str]]:
-    """Reads the lines of a table that are neither empty nor comments, each with its line number.
+def numbered(path: pathlib.Path, limit: int, robot: RobotCfg | None = None) -> list[tuple[int, str]]:
+    """Reads the lines of a log that are neither empty nor comments, each with its line number.
 
     Raises:
-        UserError: the file does not exist, is larger than ``limit`` bytes, or is not text.
+        UserError: the file does not exist, is larger than ``limit`` bytes, is not text, or is the log of another robot.
     """
     try:
         text = files.read_bytes(path, limit).decode()
     except UnicodeDecodeError:
         raise UserError(f"{path} is not text: a log is a comma-separated table of numbers") from None
-    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    table = [(i, line) for i, line in lines if not line.startswith("#")]
+    if robot and table:
+        _check_robot(path, robot, [line[1:].strip() for _, line in lines if line.startswith("#")], table[0][1])
+    return table
+
+
+def _check_robot(path: pathlib.Path, robot: RobotCfg, notes: Sequence[str], head: str) -> None:
+    """Raises ``UserError`` if a log's comments name another robot, or its columns joints that the robot lacks."""
+    named = next((note.removeprefix(ROBOT) for note in notes if note.startswith(ROBOT)), robot.name)
+    if named != robot.name:
+        raise UserError(f"{path} is a log of {short(named)}, but the robot is {robot.name}: pass the log's own --robot")
+    columns = [column.strip().partition(".") for column in head.split(",")]
+    if others := sorted({name for what, _, name in columns if what in ("target", "position")} - set(robot.joints)):
+        raise UserError(f"{path} has columns of {short(', '.join(others))}, which {robot.name} lacks: pass the log's own --robot")
 
 
 def number(text: str, where: str, empty: bool = True) -> float:

@@ -217,7 +217,7 @@ def test_the_commands_write_and_refuse_in_one_line(tmp_path, capsys):
             ["record", "--robot", "nero", "--out", str(out), "--arm", "nero", "--emulate", "--noise", "1e-4"],
             "--noise: only for a simulated arm, leave out --arm",
         ),
-        (["identify", str(out), "--robot", "nero"], "needs exactly one column target.joint1"),
+        (["identify", str(out), "--robot", "nero"], "is a log of .so_arm101., but the robot is nero"),
         (["identify", str(tmp_path / "none.csv"), "--robot", "nero"], "there is no file"),
     ):
         with pytest.raises(UserError, match=message):

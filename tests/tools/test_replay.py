@@ -45,6 +45,26 @@ def test_another_robots_file_is_refused(recorded, tmp_path):
         replay.run_of(recorded[0], ROBOT, 0.005, drives(tmp_path / "d.yaml", 0.0, "nero"))
 
 
+ANOTHERS = {
+    "named": ("# robot: nero\n", "", "is a log of 'nero', but the robot is so_arm101"),
+    "more joints": ("", ",position.joint7", "has columns of 'joint7', which so_arm101 lacks"),
+}
+
+
+@pytest.mark.parametrize("case", ANOTHERS)
+@pytest.mark.parametrize("command", ["replay LOG --no-view --robot so_arm101", "identify LOG --robot so_arm101", "demos"])
+def test_another_robots_log_is_refused(call, tmp_path, command, case):
+    """By its comment, or by its columns: a Nero's log also has all columns of a Piper's."""
+    note, column, said = ANOTHERS[case]
+    wanted = ["time", "inferred", *(f"{what}.{j}" for what in ("target", "position") for j in ROBOT.joints)]
+    (tmp_path / "log.csv").write_text(f"{note}{','.join(wanted)}{column}\n")
+    command = command.replace("LOG", "log.csv")
+    if command == "demos":
+        command = "demos --env so101_reach --form arrays --out made --log log.csv"
+    code, _, err = call("mjx_nero", *command.split())
+    assert code == 2 and said in err and err.count("\n") == 1 and not (tmp_path / "made").exists()
+
+
 class Server:
     """Keeps what a ``viser.ViserServer`` is told to show."""
 

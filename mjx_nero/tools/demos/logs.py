@@ -15,6 +15,7 @@ from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
 from mjx_nero.identify.log import number, numbered
+from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools.demos import making
 from mjx_nero.tools.demos.cfg import DemosCfg
@@ -31,7 +32,7 @@ def write(cfg: DemosCfg, logs: Sequence[pathlib.Path], out: pathlib.Path) -> Non
     """
     env = ManipulationEnv(registry.env_cfg(cfg.env_name, cfg.preset, cfg.robot), impl="native")
     shown, robot = making.units_of(env, cfg.units), env.cfg.robot
-    read = [steps(path, robot.joints) for path in logs]
+    read = [steps(path, robot.joints, robot) for path in logs]
     dt = float(np.median([step for _, _, step in read]))
     for path, (_, _, step) in zip(logs, read, strict=True):
         if abs(step - dt) > _JITTER * dt:
@@ -73,8 +74,11 @@ def _episode(path: pathlib.Path, shown: making.units.Units, at: np.ndarray, told
     return Episode(arrays, True, number)
 
 
-def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, float]:
+def steps(path: pathlib.Path, joints: Sequence[str], robot: RobotCfg | None = None) -> tuple[np.ndarray, np.ndarray, float]:
     """Reads the joint positions before each policy step and the drives' targets in it, up to the first fault.
+
+    Args:
+        robot: the robot whose log it must be; None: any with these joints.
 
     Returns:
         positions and targets [steps, joints] [rad or m], and the length of a step [s].
@@ -84,7 +88,7 @@ def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.nda
     """
     at: list[float] | None = None
     rows: list[tuple[float, list[float], list[float]]] = []
-    for line, cells in _table(path, joints):
+    for line, cells in _table(path, joints, robot):
         read = functools.partial(number, where=f"{path} line {line}", empty=False)
         if cells["position." + joints[0]]:
             at = [read(cells[f"position.{joint}"]) for joint in joints]
@@ -98,9 +102,9 @@ def steps(path: pathlib.Path, joints: Sequence[str]) -> tuple[np.ndarray, np.nda
     return positions, targets, float(np.median(np.diff(times)))
 
 
-def _table(path: pathlib.Path, joints: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+def _table(path: pathlib.Path, joints: Sequence[str], robot: RobotCfg | None) -> list[tuple[int, dict[str, str]]]:
     """Returns the rows of a log, each with its line number, by column name."""
-    lines = numbered(path, MAX_BYTES)
+    lines = numbered(path, MAX_BYTES, robot)
     rows = list(csv.reader(line for _, line in lines))
     head = rows[0] if rows else []
     for name in ["time", "inferred", *(f"{what}.{joint}" for what in ("target", "position") for joint in joints)]:

@@ -136,7 +136,7 @@ def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping
     kept = {name: metadata[name] for name in KEPT}
     dry, out = getattr(args, "dry_run", False), str(log.absolute()) if log else ""
     safety = dataclasses.asdict(safety_of(args))
-    return Spec(args.arm, options, kept, safety, fence, out, dry, (note,), tuple(offsets)), delay
+    return Spec(args.arm, options, kept, safety, fence, out, dry, (f"robot: {metadata['robot']}", note), tuple(offsets)), delay
 
 
 @contextlib.contextmanager

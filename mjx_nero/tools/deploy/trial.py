@@ -81,7 +81,7 @@ def recorded(path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, sec
     plant.faults = faults
     guard: Any = Guard(arm, setup.safety_of(told), clock)
     guard.start(anywhere=True)
-    guard.log = Log(path, arm.joints, targets[0], clock.now(), 0, (f"emulated {robot.name}",))
+    guard.log = Log(path, arm.joints, targets[0], clock.now(), 0, (f"robot: {robot.name}", "emulated"))
     fault, limited = play(guard, targets, clock, lambda: None)
     assert fault is None, fault
     guard.log.close()
