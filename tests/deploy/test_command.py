@@ -1,13 +1,18 @@
 """The command ``deploy`` from end to end, and what it says of mistakes."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from mjx_nero.deploy import emulators
+from mjx_nero.deploy.arm import Feedback
+from mjx_nero.deploy.places import Known
+from mjx_nero.tools.deploy.judge import Witness
 
 FAST = ("--seconds", "1.5")
 
@@ -26,12 +31,48 @@ def test_a_policy_runs(call, policy, tmp_path, arm):
     assert (status, err) == (0, "") and "the arm holds: 1.5 s are over" in out
     timing = json.loads(next(line for line in out.splitlines() if line.startswith("timing: "))[8:])
     assert timing["cycles"] >= 30 and timing["cycles"] <= 75
+    assert re.search(r"the task (succeeded|failed): \d+ mm to go at the end$", out.strip())
     assert len((tmp_path / "log.csv").read_text().splitlines()) > 100
+
+
+class Seer:
+    """Stands for an ``Observer``."""
+
+    pictures, objects, goal_quat = None, ("cube",), np.array([1.0, 0.0, 0.0, 0.0])
+
+    def __init__(self, goal):
+        self.goal = goal
+
+    def __call__(self, *_):
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("away", "said"),
+    [
+        ([0.0] * 30, "the task succeeded: 0 mm to go at the end"),
+        ([0.5] * 30 + [0.015] * 25, "the task succeeded: 15 mm to go at the end"),
+        ([0.0] * 29 + [0.03], "the task failed: 30 mm to go at the end"),
+        ([0.5] * 30 + [0.0] * 24, "the task failed: 0 mm to go at the end"),  # not for half a second yet
+        ([0.0] * 20, ""),
+        ([None] * 30, ""),  # nobody has said where the cube is
+    ],
+)
+def test_the_verdict_is_the_tasks_own(lift_cfg, told, away, said):
+    """A lift succeeds if the cube is within 2 cm of the goal for the last half second."""
+    goal, known = np.array([0.2, 0.0, 0.15]), Known()
+    witness = Witness(Seer(goal), known, lift_cfg, told["joints"]["names"])
+    home = np.array(told["joints"]["home"])
+    for distance in away:
+        if distance is not None:
+            known.say(json.dumps({"object": "cube", "position": [*(goal + [0, 0, distance])]}), 0.0)
+        witness(Feedback(0.0, home, np.zeros_like(home)), home, np.zeros(6), 0.0)
+    assert witness.verdict() == said
 
 
 def test_a_dry_run_shows_targets(call, policy):
     status, out, _ = call("mjx_nero", "deploy", policy, "--arm", "sim", *FAST, "--dry-run")
-    assert status == 0 and out.count("shoulder_pan ") > 50
+    assert status == 0 and out.count("shoulder_pan ") > 50 and "the task" not in out
 
 
 def test_home_first(call, policy):

@@ -111,7 +111,8 @@ def _run(args: argparse.Namespace) -> bool:
     from mjx_nero.deploy.remote import Remote
     from mjx_nero.deploy.safety import Limits
     from mjx_nero.deploy.stop import operator
-    from mjx_nero.tools.deploy.world import pictures_of, places_and_options
+    from mjx_nero.tools.deploy.judge import Witness
+    from mjx_nero.tools.deploy.world import pictures_of, places_and_options, scene_of
 
     brain = _brain(args)
     metadata = brain.metadata
@@ -120,7 +121,9 @@ def _run(args: argparse.Namespace) -> bool:
     with contextlib.ExitStack() as stack:
         places, options = stack.enter_context(places_and_options(args, metadata))
         pictures = stack.enter_context(pictures_of(args, metadata, places))
-        observer = Observer(metadata, setup.body_of(metadata), goal, places, pictures)
+        observer: Any = Observer(metadata, setup.body_of(metadata), goal, places, pictures)
+        if simulated := args.arm == "sim" or args.emulate:
+            observer = Witness(observer, places, scene_of(args, metadata), metadata["joints"]["names"])
         arms.warn(args)
         note = f"{metadata['env']} on {args.arm}{' (emulated)' if args.emulate else ''}, policy {args.policy.name}"
         spec, delay = arms.spec(args, metadata, options, args.log, note)
@@ -143,6 +146,8 @@ def _run(args: argparse.Namespace) -> bool:
             remote, brain, observer, clock, args.seconds, stop, safety.misses, delay if args.delay is None else args.delay
         )
     _tell(args, report, brain.lateness.steps * limits.dt, getattr(pictures, "ages", ()))
+    if simulated and not args.dry_run and (verdict := observer.verdict()):
+        print(verdict)
     return report.fault.kind != "stop"
 
 

@@ -73,13 +73,18 @@ def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any)
         from mjx_nero.deploy.emulators.eyes import Eyes
         from mjx_nero.sim import scene
 
-        cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
+        cfg = scene_of(args, metadata)
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=True)
         source = Eyes(model, told, metadata["joints"]["names"], metadata["base"]["position"], places)
     else:
         raise UserError(f"the policy needs pictures of {' and '.join(told)}: name these cameras in a file with --cameras")
     with contextlib.closing(source):
         yield source
+
+
+def scene_of(args: argparse.Namespace, metadata: dict[str, Any]) -> Any:
+    """Returns the config of the environment that a policy was trained in."""
+    return _cfg(metadata["env"], metadata["preset"], args.robot)
 
 
 def _is_point(text: str) -> bool:
@@ -94,7 +99,7 @@ def _cfg(name: str, preset: str, robot: str | None) -> Any:
 
 
 def _world(args: argparse.Namespace, metadata: dict[str, Any], point: str | None) -> World:
-    cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
+    cfg = scene_of(args, metadata)
     objects: dict[str, Any] = {}
     for name, item in cfg.scene.objects.items():
         x, y, above = item.pos
