@@ -3,6 +3,7 @@
 The log is simulated open loop from its first reading, and the differences to the readings are minimized: first over its start,
 where a Jacobian is cheap, then over everything that is not held out. Intervals follow from the Jacobian at the solution and the
 residuals' variance, which is inflated by their correlation time, because what the model cannot explain is not independent noise.
+They are wider by the error of the physics step, which half the step shows. They know of no other error of the model.
 """
 
 import dataclasses
@@ -22,7 +23,8 @@ _BEGINNING = 15.0  # length of the first part [s]
 _SETTLED = 4.0  # time after which the positions in which dry friction held the joints no longer matter [s]
 _SURE, _NOISE = 1.0, 1e-4  # prior: relative error of the model's own parameters, and noise of a reading [rad or m]
 _FACTOR, _OFFSET, _LATEST = 30.0, 0.5, 0.3  # bounds: factor of the model's own parameters, offset [rad or m], delay [s]
-_STEP = 3e-4  # finite difference in units of ``_unit``
+_STEPS = 3e-4, 0.03  # finite difference of the search, in units of ``_unit``; the other one is for drives that oscillate
+_WIDE = 0.1  # finite difference of the intervals; as joints stick and slip, smaller steps measure noise
 _LEVEL = 0.975
 
 
@@ -31,7 +33,7 @@ class Fit:
     """Identified drives.
 
     Attributes:
-        drives, low, high: the values and their 95% intervals.
+        drives, low, high: the values and their 95% intervals, if the arm follows the equation of ``plant``.
         readings: encoder readings of the identified arm [k, n] [rad or m].
         nominal: encoder readings with the model's own drives [k, n] [rad or m].
         held: where the log was held out [k].
@@ -66,7 +68,7 @@ def identify(plant: Plant, log: Log) -> Fit:
     x = np.concatenate([x[: 2 * plant.n], plant.nominal.armature, x[3 * plant.n :]])
     found = min(found, _solve(plant, log, part, x, enough), key=lambda solution: solution.cost)
     x = found.x
-    half = _half_widths(found.fun, found.jac, plant.n, int((part).sum()))
+    half = _half_widths(plant, log, part, x)
     low, high = x - half, x + half
     low[: 4 * plant.n] = np.maximum(low, _unit(plant) / _FACTOR)[: 4 * plant.n]
     held, drives = log.times > cut, Drives.of(x)
@@ -102,15 +104,15 @@ def _solve(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray, enough: floa
     Args:
         enough: the search ends when a step reduces the sum by less than this share.
     """
-    n, wanted, unit = plant.n, log.positions[part], _unit(plant)
+    n, wanted, unit, step = plant.n, log.positions[part], _unit(plant), _STEPS[plant.oscillation > 0]
     guessed = np.eye(len(x))[: 4 * n] * _NOISE / _SURE
 
     def residuals(z: np.ndarray) -> np.ndarray:
         return np.concatenate([(_read(plant, log, [z * unit], part)[0] - wanted).ravel(), guessed @ (z - 1)])
 
     def jacobian(z: np.ndarray) -> np.ndarray:
-        here, *there = _read(plant, log, [z * unit, *((z + _STEP * row) * unit for row in np.eye(len(z)))], part)
-        return np.concatenate([np.stack([(path - here).ravel() for path in there], axis=1) / _STEP, guessed])
+        here, *there = _read(plant, log, [z * unit, *((z + step * row) * unit for row in np.eye(len(z)))], part)
+        return np.concatenate([np.stack([(path - here).ravel() for path in there], axis=1) / step, guessed])
 
     low, high = np.full(len(x), -_OFFSET / 0.01), np.full(len(x), _OFFSET / 0.01)
     low[: 4 * n], high[: 4 * n], low[-1], high[-1] = 1 / _FACTOR, _FACTOR, 0.0, _LATEST / 0.01
@@ -125,14 +127,19 @@ def _unit(plant: Plant) -> np.ndarray:
     return np.concatenate([plant.nominal.vector()[: 4 * plant.n], np.full(plant.n + 1, 0.01)])
 
 
-def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int) -> np.ndarray:
-    """Computes half the widths of the 95% intervals [p], by linear theory.
+def _half_widths(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Computes half the widths of the 95% intervals [p]: linear theory, plus the error of the physics step.
 
     Raises:
         UserError: a parameter has no effect in the log.
     """
-    seen = residuals[: rows * n]
-    free = len(seen) - jacobian.shape[1]
+    unit, n = _unit(plant), plant.n
+    steps = _WIDE * np.diag(np.where(np.arange(len(x)) < 4 * n, x, unit))
+    more, less = (_read(plant, log, list(x + sign * steps), part) for sign in (1, -1))
+    seen = ((more - less).reshape(len(x), -1) / (2 * _WIDE)).T
+    jacobian = np.concatenate([seen, np.eye(len(x))[: 4 * n] * (x / unit)[: 4 * n, None] * _NOISE / _SURE])
+    (path,), (finer,) = _read(plant, log, [x], part), _read(plant.finer(), log, [x], part)
+    residuals, shift = path - log.positions[part], 2 * (finer - path).ravel()  # of first order in the step
     scale = np.linalg.norm(jacobian, axis=0)
     try:
         factor = scipy.linalg.cho_factor((jacobian / scale).T @ (jacobian / scale))
@@ -141,8 +148,10 @@ def _half_widths(residuals: np.ndarray, jacobian: np.ndarray, n: int, rows: int)
             "the log does not determine all parameters: record one in which every joint moves slowly and fast"
         ) from None
     variance = np.diag(scipy.linalg.cho_solve(factor, np.eye(len(scale)))) / scale**2
-    noise = seen @ seen / free * _correlation(seen.reshape(-1, n))
-    return scipy.special.stdtrit(free, _LEVEL) * np.sqrt(noise * variance)
+    moved = scipy.linalg.cho_solve(factor, (seen / scale).T @ shift) / scale
+    free = residuals.size - len(x)
+    noise = np.sum(residuals**2) / free * _correlation(residuals)
+    return (scipy.special.stdtrit(free, _LEVEL) * np.sqrt(noise * variance) + np.abs(moved)) * np.diag(steps) / _WIDE
 
 
 def _correlation(residuals: Float[np.ndarray, "k n"], longest: int = 400) -> float:

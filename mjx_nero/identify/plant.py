@@ -23,6 +23,8 @@ from mjx_nero.sim.scene import SceneCfg, SimCfg
 REST = 0.5  # time before a log, during which its first target holds the arm [s]
 FRICTION = 0.01  # first guess of joint friction, as a share of the drive's effort, if the model has none
 MAX_NUMBERS = 100_000_000  # maximum count of numbers in states and targets that are simulated at once
+SHORTEST, USUAL = 1e-4, 0.005  # physics steps [s]
+_PHASE = 0.25  # maximum phase of a drive's oscillation in one physics step [rad]
 POSITIVE = ("stiffness", "damping", "armature", "friction")
 
 
@@ -57,6 +59,12 @@ class Drives:
         return cls(stiffness, damping, armature, friction, offset, float(vector[-1]))
 
 
+def usual_step(robot: RobotCfg) -> float:
+    """Returns the physics step for a robot's drives [s]: ``USUAL``, or halves of it if a drive oscillates too fast for that."""
+    fastest = Plant(robot, USUAL).oscillation
+    return max(SHORTEST, USUAL / 2 ** np.ceil(np.log2(max(1.0, USUAL * fastest / _PHASE))))
+
+
 class Plant:
     """Simulates an arm's drives; the gripper's drives hold still.
 
@@ -73,8 +81,8 @@ class Plant:
     """
 
     def __init__(self, robot: RobotCfg, dt: float):
-        if not 1e-4 <= dt <= 0.02:
-            raise UserError(f"dt takes a physics step from 0.0001 to 0.02 s, got {dt:g}")
+        if not SHORTEST <= dt <= 0.02:
+            raise UserError(f"dt takes a physics step from {SHORTEST:g} to 0.02 s, got {dt:g}")
         self.robot, self.dt, self.n = robot, dt, len(robot.arm.joints)
         self.model = scene.build(robot, SceneCfg(objects={}, table=False), SimCfg(dt=dt, iterations=50), visuals=False)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -92,6 +100,16 @@ class Plant:
         threads = cores()
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._rollout = rollout.Rollout(nthread=threads).rollout
+
+    @property
+    def oscillation(self) -> float:
+        """Rate of the fastest oscillation of a drive [rad/s]; 0: all are damped too strongly."""
+        rates = np.sqrt(self.nominal.stiffness * self.model.dof_invweight0[self._dof])
+        return float(np.max(rates, where=self.nominal.damping < 2 * self.nominal.stiffness / rates, initial=0.0))
+
+    def finer(self) -> "Plant":
+        """Returns the same arm with half the physics step."""
+        return Plant(self.robot, max(self.dt / 2, SHORTEST))
 
     def with_drives(self, drives: Drives) -> mujoco.MjModel:
         """Returns the model with other parameters, whose damping belongs entirely to the drives."""

@@ -12,7 +12,7 @@ import numpy as np
 from mjx_nero.envs import identified
 from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
-from mjx_nero.identify.plant import Drives, Plant
+from mjx_nero.identify.plant import Drives, Plant, usual_step
 from mjx_nero.interop import need
 from mjx_nero.runs.console import Table, screen
 from mjx_nero.sim import scene
@@ -53,7 +53,7 @@ def run_of(path: pathlib.Path, robot: RobotCfg, dt: float, drives: pathlib.Path 
         UserError: a file is missing, or from another robot.
     """
     plant = Plant(robot, dt)
-    log = logs.read(path, robot.arm.joints, _SHORTEST, _FEWEST)
+    log = logs.read(path, robot.arm.joints, _SHORTEST, _FEWEST, robot)
     chosen = _drives(drives, robot, plant.nominal) if drives else plant.nominal
     (predicted,) = plant.readings([chosen], log.sent, log.targets, log.positions[0], log.times)
     return Run(log.times - log.times[0], log.positions, predicted)
@@ -132,12 +132,12 @@ def main(argv: Sequence[str]) -> None:
     add("log", type=cli.path(".csv"), help="log written by deploy --log or record")
     add("--robot", required=True, help="name of a robot, or folder of an imported one")
     add("--identified", type=cli.path(".yaml", ".yml"), help="file from identify, whose drives the simulation uses")
-    add("--dt", type=cli.positive_float, default=0.005, help="physics step [s] (default: %(default)s)")
+    add("--dt", type=cli.positive_float, help="physics step [s] (default: 0.005, or less for drives that oscillate fast)")
     add("--no-view", action="store_true", help="only print how far they differ")
     parser.add_address()
     args, _ = parser.parse(argv)
     robot = registry.robot(args.robot)
-    run = run_of(args.log, robot, args.dt, args.identified)
+    run = run_of(args.log, robot, args.dt or usual_step(robot), args.identified)
     table = Table("predicted minus measured", ("joint", "rms [mrad, mm]", "largest [mrad, mm]"))
     largest = np.abs(run.predicted - run.measured).max(axis=0)
     for name, rms, most in zip(robot.arm.joints, run.errors(), largest, strict=True):

@@ -1,4 +1,4 @@
-"""Paths that lead nowhere, for every command: no file, a folder for a file, a file for a folder, a file of another kind."""
+"""What is not there, for every command: an unknown name, no file, a folder for a file, a file for a folder, another kind of file."""
 
 import pytest
 import urdf_files as make
@@ -42,6 +42,28 @@ READS = (  # X: what is read
     "identify X.csv --robot nero",
     "identify X.csv --robot nero --out d.yaml --plot p.png",
 )
+NAMES = (  # X: a name that is not known
+    "train --env X",
+    "train --env nero_reach --learner X",
+    "eval --env nero_lift --agent X",
+    "eval --env nero_lift --backend X",
+    "view --env nero_reach --agent X",
+    "demos --env nero_lift --agent X --out made",
+    "demos --env nero_lift --form X --out made",
+    "export X --out p.onnx",
+    "deploy p.onnx --arm X",
+    "robustness --env nero_reach --only X",
+    "benchmark --what X",
+    "results --json r.json --what X",
+    "public-robots list.yaml --folder . --json r.json --jobs X",
+    "list-envs X",
+    "inspect nero_lift --preset X",
+    "import-urdf in/robot.urdf --out made --gripper X",
+    "tune-gains --robot X",
+    "record --robot X --out log.csv",
+    "replay log.csv --robot X",
+    "identify log.csv --robot X",
+)
 WRITES = (  # Y: what is written
     "eval --env nero_reach --json Y.json",
     "eval --env nero_reach --video Y.mp4",
@@ -81,11 +103,22 @@ LOST = {
 
 
 def test_every_command_is_here():
-    assert {line.split()[0] for line in READS} == set(COMMANDS)
+    for lines in (NAMES, READS):
+        assert {line.split()[0] for line in lines} == set(COMMANDS)
 
 
 def name_in(line, letter):
     return next(word for word in line.split() if word.removeprefix("./").split(".")[0] == letter)
+
+
+@pytest.mark.parametrize("line", NAMES)
+def test_a_name_that_is_not_known(refuse, line):
+    def case(folder):
+        make.write(folder / "work" / "in", make.arm(2))
+        return line.split()
+
+    said = refuse(case)
+    assert "'X'" in said or " X" in said, said
 
 
 @pytest.mark.parametrize("lost", LOST)

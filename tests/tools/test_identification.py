@@ -12,7 +12,7 @@ from mjx_nero.identify import Drives, Log, Plant, RecordCfg, identify, record
 from mjx_nero.identify import fit as fitting
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.excitation import RATE, sweeps
-from mjx_nero.identify.plant import POSITIVE, in_force
+from mjx_nero.identify.plant import POSITIVE, in_force, usual_step
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.tasks import registry
@@ -229,3 +229,22 @@ def test_drives_are_their_vector():
     drives = Drives.of(x)
     np.testing.assert_array_equal(drives.vector(), x)
     assert drives.damping.tolist() == [2.0, 3.0] and drives.delay == 10.0
+
+
+def stiff(stiffness=(3000.0, 1000.0), damping=(8.0, 2.0)):
+    """The arm with servos that oscillate at 150 and 190 rad/s."""
+    return dataclasses.replace(ARM, arm=dataclasses.replace(ARM.arm, stiffness=stiffness, damping=damping))
+
+
+def test_the_usual_step_resolves_drives_that_oscillate():
+    assert usual_step(ARM) == 0.005  # at 33 rad/s
+    assert usual_step(stiff()) == 0.00125
+    assert usual_step(stiff(damping=(60.0, 20.0))) == 0.005  # damped too strongly to oscillate
+
+
+@pytest.mark.slow
+def test_intervals_count_the_error_of_the_physics_step():
+    """A servo that oscillates within 35 ms cannot be known to 1% by steps of 5 ms, however small the remaining error is."""
+    log, _ = record(Plant(stiff(), 0.0003125), RecordCfg(seconds=12.0, noise=1e-4, resolution=1e-4, scatter=1.2, delay=0.02))
+    fit = identify(Plant(stiff(), 0.005), log)
+    assert ((fit.high.stiffness - fit.drives.stiffness) / fit.drives.stiffness > 0.01).all()

@@ -10,7 +10,7 @@ from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.fit import identify
-from mjx_nero.identify.plant import Plant
+from mjx_nero.identify.plant import Plant, usual_step
 from mjx_nero.identify.simulate import RecordCfg, record
 from mjx_nero.runs import console
 from mjx_nero.tasks import registry
@@ -18,7 +18,6 @@ from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import FAULT, arms
 from mjx_nero.tools.identification.report import save, save_plot, table
 
-_DT = 0.005
 _ARM = {"port", "gripper", "calibration", "emulate", "identified", "speed", "table", "workspace", "apart", "hottest"}
 _SIMULATED = {"noise", "resolution", "scatter", "offset", "delay", "seed", "rate", "dt"}
 
@@ -36,7 +35,7 @@ def record_main(argv: Sequence[str]) -> None:
     arms.add_limits(parser)
     parser.add_argument(
         "--out",
-        type=cli.output(".csv"),
+        type=cli.output(".csv", marks=("target.",)),
         required=True,
         help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
@@ -54,9 +53,13 @@ def record_main(argv: Sequence[str]) -> None:
         _record_arm(parser, args)
         return
     cfg = RecordCfg(**{field.name: getattr(args, field.name) for field in dataclasses.fields(RecordCfg)})
-    plant = Plant(registry.robot(args.robot), args.dt)
+    plant = _plant(args)
     log, truth = record(plant, cfg)
-    notes = [f"simulated {plant.robot.name}; its parameters:", *(f"{name}: {value}" for name, value in _plain(truth).items())]
+    notes = [
+        f"{logs.ROBOT}{plant.robot.name}",
+        "simulated; its parameters:",
+        *(f"{name}: {value}" for name, value in _plain(truth).items()),
+    ]
     logs.write(args.out, log, plant.robot.arm.joints, notes)
     console.wrote(console.screen(), "log", args.out)
 
@@ -89,13 +92,15 @@ def identify_main(argv: Sequence[str]) -> None:
     )
     _add_robot(parser)
     parser.add_argument(
-        "--out", type=cli.output(".yaml", ".yml"), help="write the drives as YAML, for make(identified=...) and --env.identified"
+        "--out",
+        type=cli.output(".yaml", ".yml", marks=("offset:",)),
+        help="write the drives as YAML, for make(identified=...) and --env.identified",
     )
     parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the remaining error")
     args, _ = parser.parse(argv)
-    plant = Plant(registry.robot(args.robot), args.dt)
+    plant = _plant(args)
     joints = plant.robot.arm.joints
-    log = logs.read(args.log, joints)
+    log = logs.read(args.log, joints, robot=plant.robot)
     fit = identify(plant, log)
     screen = console.screen()
     screen.print(table(joints, fit, plant.nominal))
@@ -109,7 +114,13 @@ def identify_main(argv: Sequence[str]) -> None:
 
 def _add_robot(parser: cli.Parser) -> None:
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
-    parser.add_argument("--dt", type=cli.positive_float, default=_DT, help="physics step [s] (default: %(default)s)")
+    text = "physics step [s] (default: 0.005, or less for drives that oscillate fast)"
+    parser.add_argument("--dt", type=cli.positive_float, help=text)
+
+
+def _plant(args: argparse.Namespace) -> Plant:
+    robot = registry.robot(args.robot)
+    return Plant(robot, args.dt or usual_step(robot))
 
 
 def _plain(truth) -> dict[str, object]:

@@ -14,7 +14,8 @@ from mjx_nero.identify.plant import POSITIVE, Drives
 from mjx_nero.runs.console import Table
 
 _HEAD = """\
-# Drives of {robot}, identified from {log}: values with 95% intervals. For make(identified=FILE) and --env.identified FILE.
+# Drives of {robot}, identified from {log}: values with 95% intervals if the arm follows the equation of identify.
+# For make(identified=FILE) and --env.identified FILE.
 # stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], armature [kg m2 or kg], friction [N m or N], delay [s];
 # offset [rad or m]: encoder reading minus joint position, to be subtracted on the real arm.
 """
@@ -23,7 +24,7 @@ _HEAD = """\
 def table(joints: Sequence[str], fit: Fit, nominal: Drives) -> Table:
     """Makes the table of identified drives, one row per joint."""
     view = Table(
-        "identified, with 95% intervals (the model's own)",
+        "identified, +- what the log leaves open if the arm follows the equation (the model's own)",
         ("joint", *POSITIVE, "offset [mrad, mm]", "error held out [mrad, mm]"),
     )
     for i, joint in enumerate(joints):
