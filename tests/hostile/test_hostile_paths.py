@@ -1,4 +1,4 @@
-"""What is not there, for every command: an unknown name, no file, a folder for a file, a file for a folder, another kind of file."""
+"""What is not there, for every command: unknown names, no files, folders for files, files for folders, files of another kind."""
 
 import pytest
 import urdf_files as make
