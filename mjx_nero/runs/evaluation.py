@@ -110,15 +110,16 @@ def play(cfg: EvalCfg) -> Played:
     return Played(env, episodes, result)
 
 
-def _by_shape(env: ManipulationEnv, episodes: rollout.Episodes) -> dict[str, list[float]]:
-    """Returns, for objects with a bank of shapes, the success rate with each shape, and the number of its episodes."""
+def _by_shape(env: ManipulationEnv, episodes: rollout.Episodes) -> dict[str, list[float | None]]:
+    """Returns, for objects with a bank of shapes, the success rate with each shape (None: no episode), and the number of its
+    episodes."""
     out = {}
     for name, item in env.cfg.scene.objects.items():
         if (which := episodes.metrics.get(f"shape/{name}")) is None:
             continue
         for k, file in enumerate((item.file, *item.bank)):
             chosen = np.asarray(episodes.success)[np.round(which) == k]
-            out[file] = [float(chosen.mean()) if len(chosen) else 0.0, len(chosen)]
+            out[file] = [float(chosen.mean()) if len(chosen) else None, len(chosen)]
     return out
 
 

@@ -129,7 +129,7 @@ def table(result: dict[str, Any]) -> console.Table:
         view.add("grasped", f"{result['grasp_rate']:.1%}" + (f", first after {grasp:.2f} s" if grasp is not None else ""))
         view.add("dropped", f"{result['dropped_rate']:.1%}")
     for file, (rate, count) in result.get("success_by_shape", {}).items():
-        view.add(f"  {file}", f"{rate:.1%} of {count}")
+        view.add(f"  {file}", "no episode" if rate is None else f"{rate:.1%} of {count}")
     if "touched_mean" in result:
         view.add("touched", f"{result['touched_mean']:.1%}")
     calm = figure("target_change_mean", 1000, 1), figure("joint_acc_mean", 1, 1)

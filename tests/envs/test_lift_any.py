@@ -284,6 +284,13 @@ def test_expert_lifts_things():
     assert played.result["success_rate"] >= 0.6, played.result
 
 
+def test_a_shape_without_an_episode_has_no_success_rate():
+    thing = SimpleNamespace(file="mug", bank=("ring", "jack"))
+    env = SimpleNamespace(cfg=SimpleNamespace(scene=SimpleNamespace(objects={"thing": thing})))
+    episodes = SimpleNamespace(metrics={"shape/thing": np.array([0.0, 1.0, 1.0])}, success=np.array([True, True, False]))
+    assert evaluation._by_shape(env, episodes) == {"mug": [1.0, 1], "ring": [0.5, 2], "jack": [None, 0]}
+
+
 def test_an_iteration_of_the_learner_keeps_the_states_shape():
     """Ends of episodes, starts where the expert was, and the update take worlds of different shapes; nothing is compiled."""
     env = make("nero_lift_any", impl="native", num_envs=8)
