@@ -24,7 +24,7 @@ _HEAD = """\
 def table(joints: Sequence[str], fit: Fit, nominal: Drives) -> Table:
     """Makes the table of identified drives, one row per joint."""
     view = Table(
-        "identified, +- what the log leaves open if the arm follows the equation (the model's own)",
+        "identified, +- if the arm follows the equation (the model's own)",
         ("joint", *POSITIVE, "offset [mrad, mm]", "error held out [mrad, mm]"),
     )
     for i, joint in enumerate(joints):
