@@ -29,3 +29,32 @@ def test_commands_have_help_of_their_own(call, command):
 def test_mistakes_end_in_one_line(call, argv, message):
     status, _, err = call("mjx_nero", *argv)
     assert status == 2 and err.startswith("error: ") and message in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [
+        ("inspect so_arm101 --json a.json", "a.json"),
+        ("inspect --object mug --json a.json", "a.json"),
+        ("record --robot so_arm101 --seconds 12 --rate 50 --out a.csv", "a.csv"),
+        ("tune-gains --robot so_arm101 --out a.yaml --plot a.svg", "a.yaml a.svg"),
+        ("tune-gains --robot so_arm101 --plot a.pdf", "a.pdf"),
+        ("tune-gains --robot so_arm101 --plot a.png", "a.png"),
+        ("export nero_reach --out a.onnx", "a.onnx"),
+        ("eval --env nero_reach --episodes 2 --impl native --env.episode_length_s 0.2 --json a.json", "a.json"),
+        ("results --json a.json --markdown a.md --what none", "a.md"),
+    ],
+)
+def test_a_command_replaces_what_it_wrote_before(call, tmp_path, line, names):
+    if "results" in line:
+        (tmp_path / "a.json").write_text("{}")
+    for _ in range(2):
+        status, _, err = call("mjx_nero", *line.split())
+        assert status == 0, err
+    for name in names.split():
+        assert (tmp_path / name).stat().st_size > 0
+        (tmp_path / name).write_text("mine")
+        status, _, err = call("mjx_nero", *line.split())
+        assert status == 2 and f"cannot write {name}: it exists and is another kind of file" in err
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()

@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
 def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the configs whose fields ``--help`` lists."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
-    name = controller_of(args.controller or args.agent or "policy", env.controllers)
+    name = controller_of(args.controller or args.agent or "policy", env.controllers) or ""
     return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
 
 

@@ -71,7 +71,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     if acts and told:
         teacher = teachers.find(env)
         agent = rollout.policy_agent(lambda params, obs, key: teacher.act({"state": obs[teachers.GROUP]}))
-    elif acts:
+    elif name is None:
         trained = policy.load_for(env, cfg.env_name, cfg.policy, cfg.robot, preset=cfg.preset)
         agent = rollout.policy_agent(lambda params, obs, key: trained.act(obs))
     else:
