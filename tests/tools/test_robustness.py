@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import jax
+import matplotlib
 import pytest
 
 from mjx_nero import UserError, __main__
@@ -115,6 +116,20 @@ def test_two_policies_are_in_one_picture(tmp_path):
         command.save_plot(tmp_path / f"{name}.png", results)
         sizes.append((tmp_path / f"{name}.png").stat().st_size)
     assert sizes[1] > sizes[0] > 1000  # a legend and a second line
+
+
+def test_two_policies_of_one_preset_have_their_own_names(tmp_path):
+    path = tmp_path / "two.svg"
+    plain = {**FIGURES, "policy": None}
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        command.save_plot(path, [plain, {**plain, "policy": "mine.safetensors"}])
+    assert "bundled policy" in path.read_text() and "mine.safetensors" in path.read_text()
+
+
+def test_results_of_another_environment_are_refused(call, tmp_path):
+    (tmp_path / "lift.json").write_text(json.dumps(FIGURES))
+    code, _, err = call("mjx_nero", *"robustness --env nero_reach --plot p.png --beside lift.json".split())
+    assert code == 2 and "lift.json holds results of nero_lift, and this is nero_reach" in err
 
 
 @pytest.mark.parametrize(

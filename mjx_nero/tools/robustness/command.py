@@ -42,6 +42,10 @@ def main(argv: Sequence[str]) -> None:
     if args.beside and not args.plot:
         raise UserError("--beside adds curves to the plot: pass --plot, too")
     other = read(args.beside) if args.beside else None
+    if other and other["env"] != args.env:
+        raise UserError(
+            f"{args.beside} holds results of {other['env']}, and this is {args.env}: give results of the same environment"
+        )
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     names = [name for name in (*sweeps.sweeps(cfg), STEP) if not args.only or any(text in name for text in args.only)]
     if not names:
@@ -118,6 +122,7 @@ def read(path: pathlib.Path) -> dict[str, Any]:
     try:
         return {
             **{name: str(found[name]) for name in ("env", "preset", "version")},
+            "policy": found.get("policy") and str(found["policy"]),
             "curves": {
                 str(name): [
                     {**{k: float(point[k]) for k in ("value", "success_rate")}, "success_rate_95": _interval(point)}
@@ -140,6 +145,7 @@ def save_plot(path: pathlib.Path, results: Sequence[dict[str, Any]]) -> None:
     from matplotlib.figure import Figure
 
     first, *_ = results
+    what = "preset" if len({result["preset"] for result in results}) == len(results) else "policy"
     columns = min(4, len(first["curves"]))
     rows = math.ceil(len(first["curves"]) / columns)
     figure = Figure(figsize=(3.2 * columns, 0.6 + 2.3 * rows), layout="constrained")
@@ -148,7 +154,7 @@ def save_plot(path: pathlib.Path, results: Sequence[dict[str, Any]]) -> None:
         for color, result in zip(("tab:blue", "tab:orange"), results, strict=False):
             curve = result["curves"].get(name, [])
             values, rates = [p["value"] for p in curve], [p["success_rate"] for p in curve]
-            panel.plot(values, rates, marker="o", markersize=3, color=color, label=result["preset"])
+            panel.plot(values, rates, marker="o", markersize=3, color=color, label=result[what] or "bundled policy")
             panel.fill_between(values, *np.array([p["success_rate_95"] for p in curve]).reshape(-1, 2).T, color=color, alpha=0.2)
         panel.set_title(name, loc="left", fontsize=9)
         panel.set_ylim(-0.02, 1.02)
