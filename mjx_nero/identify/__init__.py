@@ -2,7 +2,7 @@
 
 from mjx_nero.identify.fit import Fit, identify
 from mjx_nero.identify.log import Log
-from mjx_nero.identify.plant import Drives, Plant
+from mjx_nero.identify.plant import Drives, Plant, usual_step
 from mjx_nero.identify.simulate import RecordCfg, record
 
-__all__ = ["Drives", "Fit", "Log", "Plant", "RecordCfg", "identify", "record"]
+__all__ = ["Drives", "Fit", "Log", "Plant", "RecordCfg", "identify", "record", "usual_step"]
