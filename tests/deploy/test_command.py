@@ -101,6 +101,7 @@ def test_an_object_that_nobody_sees_is_a_fault(call, policy):
         (("--arm", "lerobot", "--emulate"), "--emulate cannot emulate --arm lerobot"),
         (("--arm", "sim", "--check", "found.yaml", "--dry-run"), "--check moves the arm"),
         (("--arm", "sim", "--identified", "none.yaml"), "none.yaml"),
+        (("--arm", "sim", "--robot", "piper"), "--robot piper is piper, but the policy was trained with so_arm101"),
         (("--arm", "sim", "--goal", "1,2"), "--goal takes 3 or 7 comma-separated numbers"),
         (("--arm", "sim", "--goal", "1,2,nan"), "--goal takes 3 or 7 comma-separated numbers"),
         (("--arm", "sim", "--workspace", "0,1,0,1,1,0"), "--workspace takes ranges from low to high"),

@@ -83,8 +83,17 @@ def pictures_of(args: argparse.Namespace, metadata: dict[str, Any], places: Any)
 
 
 def scene_of(args: argparse.Namespace, metadata: dict[str, Any]) -> Any:
-    """Returns the config of the environment that a policy was trained in."""
-    return _cfg(metadata["env"], metadata["preset"], args.robot)
+    """Returns the config of the environment that a policy was trained in.
+
+    Raises:
+        UserError: ``--robot`` is another robot.
+    """
+    cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
+    if cfg.robot.name != metadata["robot"] or list(cfg.robot.joints) != list(metadata["joints"]["names"]):
+        raise UserError(
+            f"--robot {args.robot} is {cfg.robot.name}, but the policy was trained with {metadata['robot']}: pass that one"
+        )
+    return cfg
 
 
 def _is_point(text: str) -> bool:
