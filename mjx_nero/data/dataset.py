@@ -62,7 +62,7 @@ def check_writable(path: pathlib.Path, schema: Schema, form: str = "lerobot") ->
 def _check_form(path: pathlib.Path, form: str) -> None:
     held = _held(path)
     if held not in (None, form):
-        raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another --out")
+        raise UserError(f"{path} holds a data set in the form {held!r}: pass --form {held}, or another folder")
     importlib.import_module(FORMS[form][0])  # a package may be missing
 
 

@@ -38,7 +38,7 @@ def claim(path: pathlib.Path, schema: Schema) -> Iterator[pathlib.Path]:
         path.mkdir(parents=True, exist_ok=True)
         lock = files.lock(path / _LOCK)
     except OSError as error:
-        raise UserError(f"cannot write to {path}: {error.strerror or error}; pass another --out") from None
+        raise UserError(f"cannot write to {path}: {error.strerror or error}; pass another folder") from None
     try:
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(path / PART)
@@ -80,21 +80,21 @@ def check(path: pathlib.Path, schema: Schema) -> None:
     if not path.exists():
         above = next(folder for folder in path.absolute().parents if folder.exists())
         if not above.is_dir():
-            raise UserError(f"cannot write to {path}: {above.name} is a file; pass another --out")
+            raise UserError(f"cannot write to {path}: {above.name} is a file; pass another folder")
         return
     if not path.is_dir():
-        raise UserError(f"{path} is not a folder: pass another --out")
+        raise UserError(f"{path} is not a folder: pass another folder")
     if _bare(path):
         return
     if not files.inside(path, *ABOUT.split("/")).exists():
-        raise UserError(f"{path} is not empty and holds no demonstrations: pass another --out")
+        raise UserError(f"{path} is not empty and holds no demonstrations: pass another folder")
     there, here = _flat(schema_of(path).to_json()), _flat(files.finite(schema.to_json()))
     if other := [name for name in here | there if here.get(name) != there.get(name)]:
         name = next((name for name in other if name.startswith("about.")), other[0])
         was, now = (short(each.get(name)) for each in (there, here))
         raise UserError(
             f"{path} holds other demonstrations ({name.removeprefix('about.')} was {was}, here it is {now}): "
-            "pass another --out, or the same flags as before"
+            "pass another folder, or the same flags as before"
         )
 
 

@@ -108,12 +108,12 @@ def test_folders_of_something_else_are_refused(form, tmp_path):
         with writer(tmp_path / "d", schema(env="nero_stack"), form):
             pass
     other = next(name for name in FORMS if name != form)
-    with pytest.raises(UserError, match=f"holds a data set in the form '{form}': pass --form {form}, or another --out"):
+    with pytest.raises(UserError, match=f"holds a data set in the form '{form}': pass --form {form}, or another folder"):
         with writer(tmp_path / "d", schema(), other):
             pass
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("")
-    with pytest.raises(UserError, match="is not empty and holds no demonstrations: pass another --out"):
+    with pytest.raises(UserError, match="is not empty and holds no demonstrations: pass another folder"):
         with writer(tmp_path / "full", schema(), form):
             pass
     assert os.listdir(tmp_path / "full") == ["thesis.tex"]

@@ -82,7 +82,7 @@ def test_an_episode_is_drawn_by_its_number(made, call, tmp_path):
     for name in (names.QPOS, names.EXECUTED, names.SEEN):
         np.testing.assert_array_equal(one.column(name), other.column(name))
     code, _, err = call("mjx_nero", "demos", *argv, "--episodes", 9, "--seed", 1)
-    assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another --out" in err
+    assert code == 2 and "holds other demonstrations (seed was 0, here it is 1): pass another folder" in err
 
 
 def test_no_more_is_played_than_is_to_be_kept():

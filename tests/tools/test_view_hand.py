@@ -151,7 +151,7 @@ def test_a_folder_that_cannot_be_recorded_into_is_told_before_anybody_steers(sho
     recording.check()
     assert not list(tmp_path.iterdir())
     (tmp_path / "d").write_text("")
-    with pytest.raises(UserError, match="d is not a folder: pass another --out"):
+    with pytest.raises(UserError, match="d is not a folder: pass another folder"):
         recording.check()
 
 

@@ -91,7 +91,7 @@ def scene_of(args: argparse.Namespace, metadata: dict[str, Any]) -> Any:
     cfg = _cfg(metadata["env"], metadata["preset"], args.robot)
     if cfg.robot.name != metadata["robot"] or list(cfg.robot.joints) != list(metadata["joints"]["names"]):
         raise UserError(
-            f"--robot {args.robot} is {cfg.robot.name}, but the policy was trained with {metadata['robot']}: pass that one"
+            f"--robot {args.robot} is {cfg.robot.name}, but the policy was trained with {metadata['robot']}: pass its folder"
         )
     return cfg
 
