@@ -35,17 +35,19 @@ _BEHIND = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class PickUpCfg:
-    """Settings of the grasp and its speed; lengths in m.
+    """Settings of the grasp and its speed.
 
     Attributes:
-        object: what to pick up.
+        object: name of the object to pick up.
         heading: for each object that may be commanded (``View.target``), the axis that lies across the opening of the hand when
             the fingers fit: 0, 1 or 2.
-        turns: for each of them, how many turns about the vertical look the same; 0: it is round.
-        aside: for each of them, offset of the pads' middle from its usual place along the opening (``grasp.aside``); empty: none.
-        lowest: least height of the pads' middle above the robot's root.
-        beyond: how far the pads' middle is below the grasp point.
-        above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away.
+        turns: for each of these objects, how many turns about the vertical look the same; 0: it is round.
+        aside: for each of these objects, offset of the pads' middle from its usual place along the opening [m] (``grasp.aside``);
+            empty: none.
+        lowest: least height of the pads' middle above the robot's root [m].
+        beyond: how far the pads' middle is below the grasp point [m].
+        above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away
+            [m].
         speed: speed of the grasp point [m/s].
         closing: time that the fingers take to close [s], besides the lag of their drives.
         ik: settings of the arm's motion. Orientation has little weight, least at the goal: a hand that cannot point down leans.

@@ -213,11 +213,22 @@ def fields_help(cfgs: Mapping[str, Any]) -> str:
     """Lists the dotted flags of the configs, each with its default and description, for the end of a help text."""
     lines = ["any config field, with its default:"]
     for prefix, cfg in cfgs.items():
-        about = config.describe(cfg)
+        about = config.describe(cfg) | _lent(cfg)
         for name, value in config.flatten(cfg).items():
             lines.append(f"  --{prefix}.{name} {value!r}")
             lines += textwrap.wrap(about[name], 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
     return "\n".join(lines)
+
+
+def _lent(cfg: Any) -> dict[str, str]:
+    """Returns descriptions of the fields of controllers and learner that an environment's config sets, by dotted name."""
+    from mjx_nero import control  # imports JAX
+    from mjx_nero.learn import learner
+
+    owners = {f"controllers.{name}": control.CONTROLLERS.find(name)[1] for name in getattr(cfg, "controllers", ())}
+    if hasattr(cfg, "training"):
+        owners["training"] = learner.cfg_for(cfg.learner, "default", {})
+    return {f"{at}.{name}": text for at, owner in owners.items() for name, text in config.describe(owner).items()}
 
 
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
