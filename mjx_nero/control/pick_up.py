@@ -134,13 +134,19 @@ class PickUp:
         angles = self._angles(view)
         quats = jax.vmap(self.hand)(angles)
         picks = jax.vmap(self._pick, (None, 0))(view, angles)
-        starts = jnp.broadcast_to(q, (_CHOICES, self._n))
+        over, way = self.reaching(q, picks, quats)
+        best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
+        above, pick, yaw = over[best], picks[best], angles[best]
+        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
+
+    def reaching(
+        self, q: Float[Array, " nj"], picks: Float[Array, "n 3"], quats: Float[Array, "n 4"]
+    ) -> tuple[Float[Array, "n nj"], Float[Array, " n"]]:
+        """Returns the joints over each grasp, and the way there from ``q`` [rad]; the way to what is out of reach is longer."""
+        starts = jnp.broadcast_to(q, (len(picks), self._n))
         over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
         low = jax.vmap(self.ik.local)(picks, quats, over.q)
-        way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
-        best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
-        above, pick, yaw = over.q[best], picks[best], angles[best]
-        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
+        return over.q, jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
         """Computes the targets of all drives."""

@@ -102,6 +102,7 @@ class FromTags(Known):
         super().__init__(FRESH)
         self._camera, self._lock, self._over, self._end = camera, threading.Lock(), threading.Event(), lambda: None
         self._detector = Detector(families=camera.family, quad_decimate=1.0)
+        self._detector.tag_families = {}  # its end would free the families first, which the detector still reads as it ends
         self._pictures = pictures or self._open()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

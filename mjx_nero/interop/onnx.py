@@ -66,9 +66,7 @@ def _own(meta: Mapping[str, Any]) -> Any:
 
 def _build(policy: Policy, graph: Graph) -> None:
     """Adds normalization, then the layers."""
-    network, normalizer = policy.meta["network"], policy.params[0]
-    x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
-    x = graph.apply("Div", x, graph.constant("std", normalizer.std["state"]))
+    network, x = policy.meta["network"], graph.normalized(policy.params[0])
     if bound := network.get("max_observation"):
         x = graph.apply("Clip", x, graph.constant("least", -bound), graph.constant("most", bound))
     *hidden, last = _layers(policy.params[1].policy["params"])
