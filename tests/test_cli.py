@@ -24,7 +24,7 @@ from mjx_nero.learn.ppo.cfg import PpoCfg
 from mjx_nero.runs import evaluation, signals, training
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli, train
+from mjx_nero.tools import cli, config_help, train
 from mjx_nero.tools import eval as evaluate
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -210,7 +210,7 @@ def test_help_takes_its_texts_from_where_the_fields_are():
     assert about["rewards.reaching_object.weight"] == "multiplies the function, per second of simulated time"  # of a term
     assert about["actions.arm.params.time"] == "time constant with which velocities follow the action [s]"  # of a term's class
     assert about["rewards.goal_tracking.params.std"].startswith("parameter of: 1 - tanh(d / std) while held")
-    lines = cli.fields_help({"env": env_cfg("nero_lift")}).splitlines()
+    lines = config_help.listed({"env": env_cfg("nero_lift")}).splitlines()
     assert lines[lines.index("  --env.sim.dt 0.01") + 1] == "        physics step [s]"
     assert lines[lines.index("  --env.controllers.pick_up.speed 0.4") + 1].strip() == docs.fields(PickUpCfg)["speed"]
     assert lines[lines.index("  --env.training.max_std 0.5") + 1].strip() == docs.fields(PpoCfg)["max_std"]

@@ -114,15 +114,16 @@ class RmpFollower:
         robot: robot whose ``ee_site`` follows.
         dt: control step [s].
         cfg: files and integration.
+        obstacles: obstacles to avoid; None: the scene's.
 
     Raises:
         UserError: the robot has no RMPflow files, or they do not fit it.
     """
 
-    def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg()):
+    def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg(), obstacles: Obstacles | None = None):
         descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
         self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
-        self.dt = dt
+        self.dt, self._obstacles = dt, obstacles
         self._lead = np.array(robot.arm.lead, np.float32)
         self._n = len(robot.arm.joints)
 
@@ -136,8 +137,9 @@ class RmpFollower:
         return memory, jnp.concatenate([self.arm(view, target), view.ctrl[self._n :]])
 
     def arm(self, view: View, target: Target) -> Joints:
-        """Computes the targets of the arm's drives on the way to ``target``, past the scene's obstacles [rad]."""
-        q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, Obstacles.seen(view), self.dt)
+        """Computes the targets of the arm's drives on the way to ``target`` [rad]."""
+        obstacles = Obstacles.seen(view) if self._obstacles is None else self._obstacles
+        q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, obstacles, self.dt)
         return q + self._lead * qd
 
     def warning(self, memory: Memory) -> str:
