@@ -22,6 +22,22 @@ MOST_CONTACTS = {
 }
 
 
+def cobotta_down(x, y, z, psi=0.0) -> np.ndarray:
+    """The Cobotta's joints with its flange at places [m], straight down: closed form, the last axis the joints.
+
+    Its links have 0.51 and 0.39 m, the shoulder is 0.05 m up, and 0.12 m lie between the planes of arm and flange.
+
+    Args:
+        psi: turn of the flange about the vertical [rad].
+    """
+    rho = np.hypot(x, y)
+    r, h = np.sqrt(rho**2 - 0.12**2), z - 0.05
+    q1 = np.arctan2(y, x) - np.arcsin(0.12 / rho)
+    q3 = np.arccos((r**2 + h**2 - 0.51**2 - 0.39**2) / (2 * 0.51 * 0.39))
+    q2 = np.arctan2(r, h) - np.arctan2(0.39 * np.sin(q3), 0.51 + 0.39 * np.cos(q3))
+    return np.stack([q1, q2, q3, np.zeros_like(q1), np.pi - q2 - q3, q1 - psi], axis=-1)
+
+
 def poses_agree(model: mujoco.MjModel, robot: str, base: str, sites: Collection[str] = ()) -> None:
     """Every link has the pose that ``data/make_fk.py`` computed from the URDF.
 

@@ -17,11 +17,14 @@ import pytest
 import mjx_nero
 from mjx_nero import config, control, env_cfg, list_envs, list_presets
 from mjx_nero.__main__ import COMMANDS
-from mjx_nero.config import bounds
+from mjx_nero.config import bounds, docs
+from mjx_nero.control.pick_up import PickUpCfg
+from mjx_nero.learn import learner
+from mjx_nero.learn.ppo.cfg import PpoCfg
 from mjx_nero.runs import evaluation, signals, training
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli, train
+from mjx_nero.tools import cli, config_help, train
 from mjx_nero.tools import eval as evaluate
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -193,8 +196,9 @@ def test_help_describes_every_field(name):
             assert not [field for field, text in about.items() if not text]
 
 
-def test_help_describes_every_field_of_the_controllers():
-    for _, cfg in control.CONTROLLERS.values():
+def test_help_describes_every_field_of_the_controllers_and_learners():
+    own = [learner.cfg_for(name, "default", {}) for name in learner.names()] + [cfg for _, cfg in control.CONTROLLERS.values()]
+    for cfg in own:
         guest = not type(cfg).__module__.startswith("mjx_nero.")  # of another test
         assert guest or all(config.describe(cfg).values())
 
@@ -204,9 +208,12 @@ def test_help_takes_its_texts_from_where_the_fields_are():
     assert about["robot.arm.stiffness"] == "[N m/rad] or [N/m]"  # under Attributes
     assert about["sim.dt"] == "physics step [s]"  # behind the field
     assert about["rewards.reaching_object.weight"] == "multiplies the function, per second of simulated time"  # of a term
+    assert about["actions.arm.params.time"] == "time constant with which velocities follow the action [s]"  # of a term's class
     assert about["rewards.goal_tracking.params.std"].startswith("parameter of: 1 - tanh(d / std) while held")
-    lines = cli.fields_help({"env": env_cfg("nero_lift")}).splitlines()
+    lines = config_help.listed({"env": env_cfg("nero_lift")}).splitlines()
     assert lines[lines.index("  --env.sim.dt 0.01") + 1] == "        physics step [s]"
+    assert lines[lines.index("  --env.controllers.pick_up.speed 0.4") + 1].strip() == docs.fields(PickUpCfg)["speed"]
+    assert lines[lines.index("  --env.training.max_std 0.5") + 1].strip() == docs.fields(PpoCfg)["max_std"]
 
 
 def test_a_field_without_a_text_of_its_own_has_none():

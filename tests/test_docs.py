@@ -88,7 +88,7 @@ def test_commands_and_their_flags_exist(page, monkeypatch):
     class Known(Exception):
         pass
 
-    def parse(self, argv, prefixes=(), cfgs=None):
+    def parse(self, argv, prefixes=(), fields=None):
         raise Known(set(self._option_string_actions), prefixes)
 
     for words in commands(page.read_text()):

@@ -81,7 +81,8 @@ def describe(cfg: Any) -> dict[str, str]:
     """Returns the descriptions of all fields that ``flatten`` lists, by dotted name; empty if a field has none.
 
     A field's description comes from ``Attributes:`` in the docstring of its config's class, or from the comment behind the field.
-    A term's parameter is described under ``Args:`` in the docstring of the term's function, or else by its first line.
+    A term's parameter is described as a field of the term's class, under ``Args:`` in the docstring of its function, or else by
+    the first line of that docstring.
     """
     return dict(_described(cfg, "", docs.fields(type(cfg)), ""))
 
@@ -99,7 +100,8 @@ def _described(node: Any, prefix: str, texts: Mapping[str, str], inherited: str)
             if not callable(value):
                 yield prefix + name, text
         elif name == "params" and callable(func := getattr(node, "func", None)):
-            yield from _described(value, f"{prefix}{name}.", docs.entries(func, "Args"), f"parameter of: {docs.summary(func)}")
+            own = docs.fields(func) if isinstance(func, type) else docs.entries(func, "Args")
+            yield from _described(value, f"{prefix}{name}.", own, f"parameter of: {docs.summary(func)}")
         elif dataclasses.is_dataclass(value):
             yield from _described(value, f"{prefix}{name}.", docs.fields(type(value)), "")
         else:

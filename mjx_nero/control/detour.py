@@ -24,13 +24,13 @@ Corners = Float[Array, "n 3"]
 
 @dataclasses.dataclass(frozen=True)
 class DetourCfg:
-    """Settings of the path and the arm's motion; lengths in m.
+    """Settings of the path and the arm's motion.
 
     Attributes:
-        clearance: height of the end effector above the highest obstacle while it crosses.
+        clearance: height of the end effector above the highest obstacle while it crosses [m].
         speed: speed of the target along the path [m/s].
-        ramp: distance from a corner within which the target slows down, nearly to rest: a jerk would shake the object off.
-        lead: the target waits if it is farther than this from the end effector.
+        ramp: distance from a corner within which the target slows down, nearly to rest [m]: a jerk would shake the object off.
+        lead: distance from the end effector beyond which the target waits [m].
         motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
         rmpflow, ik: settings of the arm's motion.
     """

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
-from mjx_nero.control.pick_up import CLOSE, UNREACHABLE, PickUp, PickUpCfg, PickUpMemory
+from mjx_nero.control.pick_up import CLOSE, PickUp, PickUpCfg, PickUpMemory
 from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
@@ -83,10 +83,7 @@ class GraspThing(PickUp):
         middles, angles, gaps, costs = self._ways(view)
         quats = jax.vmap(self.hand)(angles)
         picks = jax.vmap(self._over, (None, 0, 0, 0))(view, middles, angles, gaps)
-        starts = jnp.broadcast_to(q, (len(angles), self._n))
-        over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
-        low = jax.vmap(self.ik.local)(picks, quats, over.q)
-        way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
+        over, way = self.reaching(q, picks, quats)
         best = jnp.argmin(way + _COST_COUNTS * costs)
         zero, pick = jnp.zeros((), jnp.int32), picks[best]
         return GraspThingMemory(
@@ -94,7 +91,7 @@ class GraspThing(PickUp):
             count=zero,
             q=q,
             qd=jnp.zeros_like(q),
-            above=over.q[best],
+            above=over[best],
             pos=pick + self._up,
             pick=pick,
             yaw=angles[best],

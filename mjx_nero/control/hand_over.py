@@ -30,19 +30,19 @@ _AHEAD = 0.03  # [m] greatest correction of the set-point for the object's place
 
 @dataclasses.dataclass(frozen=True)
 class HandOverCfg:
-    """Settings of the script; lengths in m.
+    """Settings of the script.
 
     Attributes:
-        object: an object that is long along its own x axis. The giver holds it on the negative side of its middle, the taker on
-            the positive side.
-        taker: name of the robot that takes it over.
-        along: distance of each hand from the object's middle.
-        meet: where the object's middle is when it changes hands, relative to the giver's root. The object then lies along x.
+        object: name of an object that is long along its own x axis. The giver holds it on the negative side of its middle, the
+            taker on the positive side.
+        taker: name of the robot that takes the object.
+        along: distance of each hand from the object's middle [m].
+        meet: place of the object's middle when it changes hands, relative to the giver's root [m]. The object then lies along x.
         turns: how far the first joint of giver and taker turns from home to the meeting point [rad].
-        lowest: least height of the pads' middle above the table, of giver and taker.
-        beyond: how far the pads' middle is below the grasp point, of giver and taker.
+        lowest: least height of the pads' middle above the table, of giver and taker [m].
+        beyond: how far the pads' middle is below the grasp point, of giver and taker [m].
         closing: time that the fingers take to close [s], besides the lag of their drives, of giver and taker.
-        above: height over the object at which hands start their descent, and to which they lift it.
+        above: height over the object at which hands start their descent, and to which they lift it [m].
         speed: speed of a grasp point on its way up or down [m/s].
         ik: settings of the arms' motion.
     """

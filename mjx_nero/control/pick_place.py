@@ -24,21 +24,21 @@ _CLOSE, _OPEN = PHASES.index("close"), PHASES.index("open")
 
 @dataclasses.dataclass(frozen=True)
 class PickPlaceCfg:
-    """Arguments of the controller; lengths in m.
+    """Settings of the script.
 
     Attributes:
         events_dt: the share of each phase that one control step takes; a phase has ceil(1 / share) steps.
         wait: extra time of the fingers in the phases in which they close and open [s].
-        end_effector_initial_height: height above the robot's root at which the grasp point travels.
-        end_effector_offset: offset of the grasp point from the cube's centre. The tutorial's 0.25 m is measured from the flange,
-            and would press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
+        end_effector_initial_height: height above the robot's root at which the grasp point travels [m].
+        end_effector_offset: offset of the grasp point from the cube's centre [m]. The tutorial's 0.25 m is measured from the
+            flange, and would press the fingertips 3 mm into the table; the grasp point lies 0.26 m beyond the flange.
         arc: travel from pick to place about the robot's axis; False: on a straight line.
         motion: what moves the arm: ``rmpflow``, or ``ik`` for a robot without RMPflow's files.
         rmpflow, ik: settings of the arm's motion.
         tower: the objects from the bottom up. Each is put onto the one before it. The first one stays where it is, or is the goal
             (see ``mdp.towers``).
-        rise: height from the centre of an object to that of the one on it.
-        turn: turns the hand as the object is turned, and then as the goal is.
+        rise: height from the centre of an object to that of the one on it [m].
+        turn: turns the hand to the object's heading, and then to the goal's.
     """
 
     # The tutorial's shares work, too, but take 96 s at 50 Hz. These take 17 s: the arc to the tutorial's goal turns the base by

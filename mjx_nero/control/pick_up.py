@@ -35,17 +35,19 @@ _BEHIND = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class PickUpCfg:
-    """Settings of the grasp and its speed; lengths in m.
+    """Settings of the grasp and its speed.
 
     Attributes:
-        object: what to pick up.
+        object: name of the object to pick up.
         heading: for each object that may be commanded (``View.target``), the axis that lies across the opening of the hand when
             the fingers fit: 0, 1 or 2.
-        turns: for each of them, how many turns about the vertical look the same; 0: it is round.
-        aside: for each of them, offset of the pads' middle from its usual place along the opening (``grasp.aside``); empty: none.
-        lowest: least height of the pads' middle above the robot's root.
-        beyond: how far the pads' middle is below the grasp point.
-        above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away.
+        turns: for each of these objects, how many turns about the vertical look the same; 0: it is round.
+        aside: for each of these objects, offset of the pads' middle from its usual place along the opening [m] (``grasp.aside``);
+            empty: none.
+        lowest: least height of the pads' middle above the robot's root [m].
+        beyond: how far the pads' middle is below the grasp point [m].
+        above: height over the object from which the hand comes down, and to which it lifts the object before carrying it away
+            [m].
         speed: speed of the grasp point [m/s].
         closing: time that the fingers take to close [s], besides the lag of their drives.
         ik: settings of the arm's motion. Orientation has little weight, least at the goal: a hand that cannot point down leans.
@@ -132,13 +134,19 @@ class PickUp:
         angles = self._angles(view)
         quats = jax.vmap(self.hand)(angles)
         picks = jax.vmap(self._pick, (None, 0))(view, angles)
-        starts = jnp.broadcast_to(q, (_CHOICES, self._n))
+        over, way = self.reaching(q, picks, quats)
+        best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
+        above, pick, yaw = over[best], picks[best], angles[best]
+        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
+
+    def reaching(
+        self, q: Float[Array, " nj"], picks: Float[Array, "n 3"], quats: Float[Array, "n 4"]
+    ) -> tuple[Float[Array, "n nj"], Float[Array, " n"]]:
+        """Returns the joints over each grasp, and the way there from ``q`` [rad]; the way to what is out of reach is longer."""
+        starts = jnp.broadcast_to(q, (len(picks), self._n))
         over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
         low = jax.vmap(self.ik.local)(picks, quats, over.q)
-        way = jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
-        best = jnp.argmin(way - _ROOM_COUNTS * self._room(view, angles))
-        above, pick, yaw = over.q[best], picks[best], angles[best]
-        return PickUpMemory(zero, zero, q, jnp.zeros_like(q), zero, above, pick + self._up, pick, yaw, jnp.zeros(3))
+        return over.q, jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
         """Computes the targets of all drives."""

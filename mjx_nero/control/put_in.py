@@ -36,22 +36,23 @@ _CLOSE, _ALIGNED = 1.5e-3, 0.03  # [m, rad] greatest errors of an object that is
 
 @dataclasses.dataclass(frozen=True)
 class PutInCfg:
-    """Settings of the motion once the object is held; lengths in m.
+    """Settings of the motion once the object is held.
 
     Attributes:
         pick: settings of the grasp.
-        foot: distance of the object's end below its centre; this end has to be over the hole.
-        over: height over the goal from which the object comes down.
-        top: height over the goal at which the object, if it misses, meets what it should go into.
+        foot: distance of the object's lower end from its centre [m]. This end has to be over the hole.
+        over: height over the goal from which the object comes down [m].
+        top: height over the goal of the hole's rim or the post's tip, on which an object that misses comes to stand [m].
         turns: how many turns of the object about the vertical look the same; 0: it is round.
         speed: speed on the way down [m/s].
-        press, push: greatest depth of the set-point below the hand, on the rim and in the hole.
-        reach: greatest radius of the search, a spiral about the goal; 0: none.
-        pitch: pitch of the spiral.
+        press: greatest depth of the set-point below the hand while the object stands on the rim [m].
+        push: greatest depth of the set-point below the hand elsewhere, such as in the hole [m].
+        reach: greatest radius of the search, a spiral about the goal [m]; 0: none.
+        pitch: pitch of the spiral [m].
         sweep: speed along the spiral [m/s].
-        done: height over the goal at or below which the object is in.
+        done: height over the goal at or below which the object counts as inserted [m].
         patience: time for the way down, after which the hand begins again above the goal [s].
-        away: how far the hand rises once it has let go.
+        away: how far the hand rises once it has let go [m].
     """
 
     pick: PickUpCfg = PickUpCfg()

@@ -26,20 +26,20 @@ _LATE = {ABOVE: 2.5, DOWN: 1.0, UP: 1.0, TURN: 4.0, SET: 1.5, BACK: 1.0}  # [s] 
 
 @dataclasses.dataclass(frozen=True)
 class TurnOverCfg:
-    """Settings of the turns; lengths in m.
+    """Settings of the turns.
 
     Attributes:
-        object: the cube.
-        rest: height of its centre when it rests.
-        spot: where it is set down, x and y in the world.
+        object: name of the cube.
+        rest: height of the resting cube's centre [m].
+        spot: place where the hand sets the cube down: x and y in the world [m].
         lean: angle of the hand from straight down: to one side when it grasps, to the other when it lets go [rad].
-        beyond: distance from the grasp point to the pads' middle, along the hand's direction.
-        before: distance in front of the cube from which the hand comes, and to which it leaves.
-        lift: height to which the cube is lifted to be turned.
+        beyond: distance from the grasp point to the pads' middle, along the hand's direction [m].
+        before: distance in front of the cube from which the hand comes, and to which it leaves [m].
+        lift: height to which the hand lifts the cube before it turns it [m].
         speed: speed of the grasp point [m/s].
         closing: time that the fingers take to close [s], besides the lag of their drives.
-        clear: clearance of the cube's edge above the table while it is turned. A fast hand is lower than its set-point.
-        rises: least height of the hand over the end of its way to a grasp, per radian of joint motion left [m/rad], so that it
+        clear: clearance of the cube's edge above the table during a turn [m]. A fast hand is lower than its set-point.
+        rises: least height of the hand near the end of its way to a grasp, per radian of joint motion left [m/rad], so that it
             passes over the cube; 0: the joints move straight.
         ik: settings of the arm's motion.
     """

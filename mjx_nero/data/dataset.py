@@ -97,3 +97,15 @@ def open_dataset(path: pathlib.Path) -> Dataset:
     if form is None:
         raise UserError(f"{path} holds no episode yet: repeat the command that started it")
     return _make(form, path, schema).dataset()
+
+
+def open_with(path: pathlib.Path, index: int) -> Dataset:
+    """Opens a data set that has an episode ``index``.
+
+    Raises:
+        UserError: there is no data set, it is damaged, or it has no such episode.
+    """
+    found = open_dataset(path)
+    if not 0 <= index < len(found):
+        raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
+    return found

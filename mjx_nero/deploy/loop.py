@@ -21,6 +21,8 @@ from mjx_nero.errors import UserError
 
 Stop = Callable[[], Fault | None]
 _SOMEWHERE = [0.3, 0.0, 0.3]  # a goal [m]
+_HOMEWARD = 0.2  # maximum share of the joints' speeds on the way home
+_PATIENCE = 2.0  # maximum time without progress on the way home [s]
 
 
 class Brain(Policy):
@@ -182,13 +184,11 @@ def _cycle(arm: Guarded, brain: Brain, clock: Clock, due: float, timing: Timing)
     return command.limited
 
 
-def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop, share: float = 0.2, patience: float = 2.0) -> Fault | None:
+def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop) -> Fault | None:
     """Moves an arm home slowly, in a straight line in joint space.
 
     Args:
         limits: ``safety.Limits`` of the arm.
-        share: maximum share of the joints' speeds.
-        patience: maximum time without progress [s].
 
     Returns:
         why it stopped early; None: the arm is at home.
@@ -204,13 +204,13 @@ def go_home(arm: Guarded, limits: Any, clock: Clock, stop: Stop, share: float = 
             break
         arm.read()
         way = home - at
-        longest = float(np.max(np.abs(way) / (limits.speed * share * dt)))
+        longest = float(np.max(np.abs(way) / (limits.speed * _HOMEWARD * dt)))
         there = arm.command(at + way / max(longest, 1.0)).position
         if np.max(np.abs(home - there)) < 1e-4:
             return arm.fault
         if np.max(np.abs(there - at)) > 1e-5:
             moved = clock.now()
-        if clock.now() - moved > patience:
+        if clock.now() - moved > _PATIENCE:
             return Fault("fence", "the straight way home is blocked: move the arm by hand, or pass another --workspace")
         at = there
     return arm.fault

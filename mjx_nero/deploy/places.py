@@ -14,6 +14,7 @@ import numpy as np
 from mjx_nero.errors import UserError
 
 LONGEST = 4096  # maximum bytes of a message
+FRESH = 0.5  # maximum age of a pose from a tracker or a camera [s]
 _FAR = 10.0  # maximum coordinate of an object [m]
 
 
@@ -157,8 +158,8 @@ class FromSocket(Known):
         UserError: the address is taken, or nothing answers.
     """
 
-    def __init__(self, kind: str, host: str, port: int, fresh: float = 0.5):
-        super().__init__(fresh)
+    def __init__(self, kind: str, host: str, port: int):
+        super().__init__(FRESH)
         self._lines, self._rest = kind == "tcp", b""
         try:
             if self._lines:

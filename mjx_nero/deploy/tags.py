@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from mjx_nero.deploy.body import matrix, transform
-from mjx_nero.deploy.places import Known, Lost, Place
+from mjx_nero.deploy.places import FRESH, Known, Lost, Place
 from mjx_nero.errors import UserError
 
 Pictures = Callable[[], "np.ndarray | None"]  # returns the next picture, grey [h, w]; None: there is none
@@ -91,18 +91,18 @@ class FromTags(Known):
 
     Args:
         pictures: source of pictures; None: the camera.
-        fresh: how long a pose is valid [s].
 
     Raises:
         UserError: the camera does not exist.
     """
 
-    def __init__(self, camera: Camera, pictures: Pictures | None = None, fresh: float = 0.5):
+    def __init__(self, camera: Camera, pictures: Pictures | None = None):
         from pupil_apriltags import Detector  # of the extra ``camera``
 
-        super().__init__(fresh)
+        super().__init__(FRESH)
         self._camera, self._lock, self._over, self._end = camera, threading.Lock(), threading.Event(), lambda: None
         self._detector = Detector(families=camera.family, quad_decimate=1.0)
+        self._detector.tag_families = {}  # its end would free the families first, which the detector still reads as it ends
         self._pictures = pictures or self._open()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

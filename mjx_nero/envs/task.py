@@ -37,8 +37,8 @@ class SuccessCfg:
     """Success: ``condition`` holds at the end of the episode. ``distance`` is the length that it judges [m].
 
     Attributes:
-        hold_s: how long the condition must have held by then [s].
-        follows: the task is to keep the distance small, as when tracking. Otherwise it is to cover the distance once.
+        hold_s: how long the condition must have held at the end of the episode [s].
+        follows: True: the task is to keep the distance small, as when tracking. False: it is to cover the distance once.
     """
 
     condition: Term = Term(success.object_at_goal, params={"threshold": 0.02})
@@ -135,7 +135,7 @@ class EnvCfg:
     action_clip: NonNegative = 0.0
     success: SuccessCfg = SuccessCfg()
     metrics: Mapping[str, MetricTerm] = dataclasses.field(default_factory=dict)
-    episode_length_s: Positive = 5.0  # [s]
+    episode_length_s: Positive = 5.0  # length of an episode [s]
     randomization: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     sensors: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     look: Mapping[str, Term] = dataclasses.field(default_factory=dict)

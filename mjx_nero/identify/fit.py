@@ -154,11 +154,11 @@ def _half_widths(plant: Plant, log: Log, part: np.ndarray, x: np.ndarray) -> np.
     return (scipy.special.stdtrit(free, _LEVEL) * np.sqrt(noise * variance) + np.abs(moved)) * np.diag(steps) / _WIDE
 
 
-def _correlation(residuals: Float[np.ndarray, "k n"], longest: int = 400) -> float:
+def _correlation(residuals: Float[np.ndarray, "k n"]) -> float:
     """Computes how many readings equal one independent reading: 1 + 2 sum of the autocorrelation while it is above 0.05."""
     total = np.sum(residuals**2)
     out = 1.0
-    for lag in range(1, min(longest, len(residuals) // 2)):
+    for lag in range(1, min(400, len(residuals) // 2)):
         rho = np.sum(residuals[lag:] * residuals[:-lag]) / max(total, 1e-30)
         if rho < 0.05:
             break

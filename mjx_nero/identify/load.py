@@ -30,7 +30,7 @@ class Load:
     friction: float
 
 
-def loads(model: mujoco.MjModel, poses: int = _POSES, seed: int = 0) -> tuple[Load, ...]:
+def loads(model: mujoco.MjModel) -> tuple[Load, ...]:
     """Measures each drive's load over random poses within the joint limits.
 
     Joints that are coupled by equality constraints move together, so their drives share inertia and load.
@@ -41,9 +41,9 @@ def loads(model: mujoco.MjModel, poses: int = _POSES, seed: int = 0) -> tuple[Lo
     # With equal gains, a drive carries ratio / sum(ratio^2) of a force and 1 / sum(ratio^2) of an inertia of the common motion.
     squares = np.where(together, ratio**2, 0).sum(axis=1)
     lower, upper = ranges(model)[joints].T
-    rng, full = np.random.default_rng(seed), np.zeros((model.nv, model.nv))
-    inertia, gravity = np.zeros((2, poses, model.nu))
-    for k in range(poses):
+    rng, full = np.random.default_rng(0), np.zeros((model.nv, model.nv))
+    inertia, gravity = np.zeros((2, _POSES, model.nu))
+    for k in range(_POSES):
         pose_model(model, data, rng.uniform(lower, upper))
         mujoco.mj_fullM(model, data, full)
         inertia[k] = np.einsum("ac,ab,bc->c", ways, full, ways)[leader] / squares

@@ -30,6 +30,11 @@ class Graph:
         self.nodes.append(self._onnx.helper.make_node(kind, list(inputs), [f"{kind.lower()}_{len(self.nodes)}"], **attributes))
         return self.nodes[-1].output[0]
 
+    def normalized(self, normalizer: Any) -> str:
+        """Adds the normalization of the input ``observations``."""
+        x = self.apply("Sub", "observations", self.constant("mean", normalizer.mean["state"]))
+        return self.apply("Div", x, self.constant("std", normalizer.std["state"]))
+
     def name_output(self, name: str) -> None:
         """Names the last node's output."""
         self.nodes[-1].output[0] = name

@@ -66,9 +66,7 @@ def _own(meta: Mapping[str, Any]) -> Any:
 
 def _build(policy: Policy, graph: Graph) -> None:
     """Adds normalization, then the layers."""
-    network, normalizer = policy.meta["network"], policy.params[0]
-    x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
-    x = graph.apply("Div", x, graph.constant("std", normalizer.std["state"]))
+    network, x = policy.meta["network"], graph.normalized(policy.params[0])
     if bound := network.get("max_observation"):
         x = graph.apply("Clip", x, graph.constant("least", -bound), graph.constant("most", bound))
     *hidden, last = _layers(policy.params[1].policy["params"])
@@ -143,7 +141,7 @@ def tries(meta: Mapping[str, Any]) -> int:
     return own.TRIES if own else 10_000
 
 
-def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tuple[float, float]:
+def check(made: Any, policy: Policy, observations: int = 0) -> tuple[float, float]:
     """Runs the model with ONNX Runtime on one core, on observations drawn from the normalizer's statistics.
 
     Returns:
@@ -156,7 +154,7 @@ def check(made: Any, policy: Policy, observations: int = 0, seed: int = 0) -> tu
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = runtime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    normalizer, rng = policy.params[0], np.random.default_rng(seed)
+    normalizer, rng = policy.params[0], np.random.default_rng(0)
     mean, std = np.asarray(normalizer.mean["state"]), np.asarray(normalizer.std["state"])
     obs = (mean + std * rng.standard_normal((observations, len(mean)))).astype(np.float32)
     own = _own(policy.meta)

@@ -46,8 +46,7 @@ def mass(key: Key, model: Model, *, bodies: tuple[str, ...], scale: PositiveRang
     """Scales masses and inertias by one uniform factor per body."""
     rows = model.rows("body", bodies)
     (factor,) = _uniform(key, len(rows), scale)
-    inertia = model.fields["body_inertia"][rows] * factor[:, None]
-    return {"body_mass": (rows, model.fields["body_mass"][rows] * factor), "body_inertia": (rows, inertia)}
+    return _scaled(model, rows, body_mass=factor, body_inertia=factor[:, None])
 
 
 def friction(
@@ -89,7 +88,7 @@ def gains(
         "actuator_biasprm": (rows, bias.at[:, :3].multiply(factors)),
     }
     if effort != (1.0, 1.0):
-        drawn["actuator_forcerange"] = (rows, model.fields["actuator_forcerange"][rows] * force[:, None])
+        drawn |= _scaled(model, rows, actuator_forcerange=force[:, None])
     return drawn
 
 
@@ -109,9 +108,8 @@ def joints(
         friction: dry friction (MuJoCo's ``frictionloss``) as a share of the drive's effort. (0, 0) keeps the model's.
     """
     rows = model.rows("dof", joints)
-    *factors, dry = _uniform(key, len(rows), armature, damping, friction)
-    names = ("dof_armature", "dof_damping")
-    drawn = {name: (rows, model.fields[name][rows] * factor) for name, factor in zip(names, factors, strict=True)}
+    inertia, damp, dry = _uniform(key, len(rows), armature, damping, friction)
+    drawn = _scaled(model, rows, dof_armature=inertia, dof_damping=damp)
     if friction != (0.0, 0.0):
         effort = model.fields["actuator_forcerange"][model.rows("actuator", joints), 1]
         drawn["dof_frictionloss"] = (rows, effort * dry)
@@ -137,12 +135,9 @@ def passive_joints(
     """
     dofs, rows = model.rows("dof", joints), model.rows("joint", joints)
     *factors, farther = _uniform(key, len(dofs), armature, damping, friction, upper)
-    names = ("dof_armature", "dof_damping", "dof_frictionloss")
-    drawn = {
-        name: (dofs, model.fields[name][dofs] * factor)
-        for name, factor, bounds in zip(names, factors, (armature, damping, friction), strict=True)
-        if bounds != (1.0, 1.0)
-    }
+    ranges = {"dof_armature": armature, "dof_damping": damping, "dof_frictionloss": friction}
+    varied = {name: factor for (name, bounds), factor in zip(ranges.items(), factors, strict=True) if bounds != (1.0, 1.0)}
+    drawn = _scaled(model, dofs, **varied)
     if upper != (1.0, 1.0):
         drawn["jnt_range"] = (rows, model.fields["jnt_range"][rows].at[:, 1].multiply(farther))
     return drawn
@@ -159,12 +154,8 @@ def size(key: Key, model: Model, *, object: str = "cube", scale: PositiveRange) 
     """Scales an object's lengths by one uniform factor. The mass stays; the inertia follows the size."""
     sides = tuple(name for name in (f"{object}_side",) if name in model.index["geom"])  # only a can has one
     geoms, body = model.rows("geom", (object, *sides)), model.rows("body", (object,))
-    fields, ((factor,),) = model.fields, _uniform(key, 1, scale)
-    return {
-        "geom_size": (geoms, fields["geom_size"][geoms] * factor),
-        "geom_rbound": (geoms, fields["geom_rbound"][geoms] * factor),
-        "body_inertia": (body, fields["body_inertia"][body] * factor**2),
-    }
+    ((factor,),) = _uniform(key, 1, scale)
+    return _scaled(model, geoms, geom_size=factor, geom_rbound=factor) | _scaled(model, body, body_inertia=factor**2)
 
 
 def color(key: Key, model: Model, *, geoms: tuple[str, ...]) -> Drawn:
@@ -180,7 +171,7 @@ def color(key: Key, model: Model, *, geoms: tuple[str, ...]) -> Drawn:
 def gravity_compensation(key: Key, model: Model, *, bodies: tuple[str, ...], scale: NonNegativeRange) -> Drawn:
     """Scales the share of each body's weight that the drives carry, by uniform factors per body."""
     rows = model.rows("body", bodies)
-    return {"body_gravcomp": (rows, model.fields["body_gravcomp"][rows] * _uniform(key, len(rows), scale)[0])}
+    return _scaled(model, rows, body_gravcomp=_uniform(key, len(rows), scale)[0])
 
 
 def encoder_bias(key: Key, model: Model, *, actuators: tuple[str, ...], bias: NonNegative) -> Drawn:
@@ -222,6 +213,11 @@ def drives(
         "dof_armature": (dofs, inertia),
         "dof_frictionloss": (dofs, dry),
     }
+
+
+def _scaled(model: Model, rows: np.ndarray, **factors: Array) -> Drawn:
+    """Multiplies rows of the named fields by factors."""
+    return {name: (rows, model.fields[name][rows] * factor) for name, factor in factors.items()}
 
 
 def _uniform(key: Key, n: int, *bounds) -> Float[Array, "parts n"]:

@@ -171,7 +171,7 @@ class MetricTerm(Term):
 class DoneTerm(Term):
     """A condition that ends the episode."""
 
-    time_out: bool = dataclasses.field(default=False, kw_only=True)  # truncates: the learner sees no terminal state
+    time_out: bool = dataclasses.field(default=False, kw_only=True)  # truncates the episode: the learner sees no terminal state
 
 
 ONCE = 1e6  # [s] for ``CommandTerm.resample_s``: longer than any episode, so the goal is drawn only at the reset

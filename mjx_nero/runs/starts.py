@@ -74,7 +74,7 @@ def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Mak
     If the task has no usable expert, it returns nothing and says why in a line.
 
     Args:
-        new: the run begins with a new policy. A run that begins with a file's policy imitates no expert, as it knows more.
+        new: the run begins with a new policy. A run from a policy file imitates no expert: that policy knows more.
     """
     env, imitates = learner.env, new and getattr(learner, "imitates", False)
     begins = isinstance(env, wrappers.ExpertStarts)

@@ -33,8 +33,8 @@ class FixtureCfg:
 
     Attributes:
         file: a fixture of the package by name (``assets/fixtures``), or a folder with ``model.xml``, MJCF as in a robot's folder.
-        pos: place of its origin in the world, before the reset events [m].
-        quat: orientation there, wxyz.
+        pos: place of the fixture's origin in the world, before the reset events [m].
+        quat: orientation before the reset events, wxyz.
     """
 
     file: str = "cabinet"

@@ -21,7 +21,7 @@ class DriveCfg:
     """PD position drives of a group of joints. All tuples have the order of ``joints``.
 
     Attributes:
-        joints: names in the model.
+        joints: names of the joints in the model.
         stiffness: [N m/rad] or [N/m].
         damping: [N m s/rad] or [N s/m].
         effort: force limits [N m] or [N].
@@ -62,7 +62,7 @@ class GripperCfg(DriveCfg):
 
     Attributes:
         open: targets that open the gripper [rad] or [m].
-        close: targets that close it [rad] or [m].
+        close: targets that close the gripper [rad] or [m].
         gap: ``positions [n] -> distance between the fingers' pads [m]``; None: unknown. The default suits two opposed slides.
         positions: inverse of ``gap``.
     """
@@ -85,22 +85,22 @@ class RobotCfg:
         arm, gripper: drives.
         ee_site: site at the grasp point.
         down: orientation of ``ee_site`` when the gripper points straight down and its fingers open along y, wxyz.
-        gravity_compensation: the drives carry the links' weight, as most robots' own controllers do. False if a robot's recipe
-            does without.
+        gravity_compensation: True: the drives carry the links' weight, as most robots' own controllers do. False: they do not, as
+            in some recipes.
         max_step: longest physics step at which the drives are stable [s]; 0: no limit.
         workspace: box that ``ee_site`` can reach everywhere, ranges of x, y and z in the unrotated base frame [m]. Reach tasks
             draw their commands from it by default.
         floor: height of the floor under a robot beside the table [m]; 0: the robot stands on the table.
         opening: distance between the pads of the open gripper, along the line on which the pads close [m]; 0: unknown.
-        closed: the same of the closed gripper [m].
+        closed: distance between the pads of the closed gripper [m].
         pad: size of a pad along the approach, across it, and along the opening [m]; zeros: unknown.
         grip: centre of a held cube in the frame of ``ee_site`` [m].
         pick: box over the table that ``ee_site`` can reach everywhere with the gripper pointing down (see ``lean``), in the
-            unrotated base frame [m]. Its lowest height is where to grasp a cube that fits the gripper (``sim.grasp``).
+            unrotated base frame [m]. Its lowest height is the grasp height of a cube that fits the gripper (``sim.grasp``).
         lean: largest angle from straight down that the gripper needs in ``pick`` [rad]; 0: it points down everywhere.
-        turns: in ``pick`` the gripper can be turned about the vertical so that its fingers open along y.
-        hold: box above ``pick`` to which the gripper can bring an object, in the same frame [m]. Lift tasks draw their objects
-            from ``pick`` and their goals from ``hold`` by default.
+        turns: True: everywhere in ``pick`` the gripper can turn about the vertical so that its fingers open along y.
+        hold: box above ``pick`` to which the gripper can bring an object, in the unrotated base frame [m]. Lift tasks draw their
+            objects from ``pick`` and their goals from ``hold`` by default.
         folder: folder of an imported robot, which holds ``model.xml``; empty for the package's own.
         mjcf: text of the model, in place of a file.
     """

@@ -26,28 +26,28 @@ from mjx_nero.types import Key, ObstacleView, View
 
 @dataclasses.dataclass(frozen=True)
 class SceneCfg:
-    """Table, objects and goal marker. Lengths in m.
+    """Table, objects and goal marker.
 
     The table top is the plane z = 0, because a plane costs the fewest contacts. Its drawn edges matter only to the termination
     that counts an object beyond them as fallen.
 
     Attributes:
-        table_center: centre of the drawn table top, along x and y.
-        table_size: size of the drawn table top, along x and y.
+        table_center: centre of the drawn table top, along x and y [m].
+        table_size: size of the drawn table top, along x and y [m].
         table: False draws the table but lets nothing touch it; without contacts the physics is several times faster.
         objects: free bodies by name.
         obstacles: fixed boxes by name. The whole arm collides with them, and ``sim.touch`` measures the contact forces.
         fixtures: fixtures by name, such as cabinets, perhaps with joints of their own (``sim.fixtures``).
         robots: further robots by name, besides the task's own (``sim.team``).
-        self_collision: a robot's links collide with one another; ``sim.touch`` measures those forces, too.
-        sensors: names of ``Sim.readings`` besides ``touch``. ``hand``: the force with which robots press objects; ``wrist`` and
-            ``fingers``: force and torque between arm and hand, and the forces at the pads, of the task's own robot.
+        self_collision: a robot's links collide with one another; ``sim.touch`` also measures these forces.
+        sensors: names of ``Sim.readings`` besides ``touch``. ``hand``: the force with which robots press objects. ``wrist``:
+            force and torque between the arm and the hand of the task's own robot. ``fingers``: the forces at its pads.
         goal: shape of the goal marker: ``sphere``, ``frame`` (a sphere with axes), ``cube``, ``none``, or the name of an object
             whose shape it takes.
-        goal_edge: edge of the ``cube`` marker.
-        look_at: point that the cameras for people look at.
-        view_distance: distance of these cameras from that point.
-        view_from: direction from that point to the camera ``front``.
+        goal_edge: edge of the ``cube`` marker [m].
+        look_at: point that the cameras for people look at [m].
+        view_distance: distance of the cameras for people from ``look_at`` [m].
+        view_from: direction from ``look_at`` to the camera ``front``.
         distractors: number of things without collisions that cameras may see (``mdp.looks.places`` places them).
         backdrop: adds a wall behind the robot, which only cameras see.
         photographs: folder with the user's pictures (PNG, JPEG), which ``mdp.looks.photographs`` shows; empty: none.

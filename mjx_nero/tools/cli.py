@@ -10,7 +10,6 @@ import os
 import pathlib
 import re
 import sys
-import textwrap
 import traceback
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -111,17 +110,17 @@ class Parser(argparse.ArgumentParser):
         self,
         argv: Sequence[str],
         prefixes: Sequence[str] | Callable[[], Sequence[str]] = (),
-        cfgs: Callable[[argparse.Namespace], Mapping[str, Any]] | None = None,
+        fields: Callable[[argparse.Namespace], str] | None = None,
     ) -> tuple[argparse.Namespace, dict[str, dict[str, str]]]:
         """Parses flags, and dotted flags by prefix: ``--env.sim.dt 0.005`` -> ``{"env": {"sim.dt": "0.005"}}``.
 
         Args:
             prefixes: names, or a function that returns them. It is called after outside code is loaded, which may add some.
-            cfgs: returns the configs for the other flags; the help lists their fields at its end.
+            fields: returns the end of the help for the other flags, such as ``tools.config_help.of_environment``.
         """
-        if cfgs and {"-h", "--help"} & set(argv):
+        if fields and {"-h", "--help"} & set(argv):
             others, _ = self.parse([word for word in argv if word not in ("-h", "--help")], prefixes)
-            self.epilog = fields_help(cfgs(others))
+            self.epilog = fields(others)
         self._refuse_empty(argv)
         args, rest = self.parse_known_args(argv)
         if hasattr(args, "load"):
@@ -211,17 +210,6 @@ def listed(title: str, meanings: Mapping[str, str]) -> str:
     """Lists names and their meanings, one per line, for a help text."""
     width = max(map(len, meanings))
     return "\n".join([f"{title}:", *(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())])
-
-
-def fields_help(cfgs: Mapping[str, Any]) -> str:
-    """Lists the dotted flags of the configs, each with its default and description, for the end of a help text."""
-    lines = ["any config field, with its default:"]
-    for prefix, cfg in cfgs.items():
-        about = config.describe(cfg)
-        for name, value in config.flatten(cfg).items():
-            lines.append(f"  --{prefix}.{name} {value!r}")
-            lines += textwrap.wrap(about[name], 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
-    return "\n".join(lines)
 
 
 def run(main: Callable[[Sequence[str]], None]) -> NoReturn:

@@ -14,7 +14,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.runs import console, videos
 from mjx_nero.runs.evaluation_cfg import EvalCfg, controller_of
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 
 if TYPE_CHECKING:
     from mjx_nero.runs.evaluation import Played
@@ -24,7 +24,7 @@ RECORDED = 1000  # maximum number of episodes that --failures searches
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
-    args, dotted = _parser().parse(argv, ("env", "control"), _cfgs)
+    args, dotted = _parser().parse(argv, ("env", "control"), _fields)
     if args.view and (args.video or args.failures or args.json):
         raise UserError("--view only shows: leave out --video, --failures and --json")
     if args.view:
@@ -67,11 +67,11 @@ def main(argv: Sequence[str]) -> None:
         draw(played, args.video, video)
 
 
-def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """Returns the configs whose fields ``--help`` lists."""
+def _fields(args: argparse.Namespace) -> str:
+    """Lists the config fields for ``--help``."""
     env = registry.env_cfg(args.env, args.preset, args.robot)
     name = controller_of(args.controller or args.agent or "policy", env.controllers) or ""
-    return {"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})}
+    return config_help.listed({"env": env, **({"control": control.CONTROLLERS[name][1]} if name in control.CONTROLLERS else {})})
 
 
 def _parser() -> cli.Parser:

@@ -44,12 +44,7 @@ def main(argv: Sequence[str]) -> None:
         tested = self_test.run(robot)
         console.line(screen, tested.line, "green" if tested.passed else "yellow")
     if args.render:
-        import imageio.v3 as imageio
-
-        image = picture(robot, cfg)
-        with files.whole(args.render) as part:
-            imageio.imwrite(part, image)
-        console.wrote(screen, "picture", args.render)
+        _draw(screen, "picture", args.render, picture(robot, cfg))
     if args.cameras:
         if cfg is None:
             parser.error("--cameras needs an environment whose states it can show: name one")
@@ -88,31 +83,31 @@ def _parser() -> cli.Parser:
 
 
 def _thing(args) -> None:
-    import imageio.v3 as imageio
-
     from mjx_nero.tools.inspection import things
 
     found, screen = things.of(args.object, args.scale), console.screen()
     for view in things.tables(found):
         screen.print(view)
     if args.render:
-        image = things.picture(found)
-        with files.whole(args.render) as part:
-            imageio.imwrite(part, image)
-        console.wrote(screen, "picture", args.render)
+        _draw(screen, "picture", args.render, things.picture(found))
     if args.json:
         files.write_json(args.json, dataclasses.asdict(found))
         console.wrote(screen, "json", args.json)
 
 
 def _see(cfg: EnvCfg, path: pathlib.Path) -> None:
-    import imageio.v3 as imageio
-
     from mjx_nero.tools.inspection import cameras
 
     cli.setup_jax()
     seen, screen = cameras.see(cfg), console.screen()
     screen.print(cameras.table(seen))
+    _draw(screen, "cameras", path, cameras.sheet(seen))
+
+
+def _draw(screen: console.Console, what: str, path: pathlib.Path, image: Any) -> None:
+    """Writes a picture and says where it is."""
+    import imageio.v3 as imageio
+
     with files.whole(path) as part:
-        imageio.imwrite(part, cameras.sheet(seen))
-    console.wrote(screen, "cameras", path)
+        imageio.imwrite(part, image)
+    console.wrote(screen, what, path)

@@ -2,19 +2,18 @@
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
 
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.learn import learner
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
-    args, dotted = parser.parse(argv, lambda: ("env", *learner.names()), _cfgs)
+    args, dotted = parser.parse(argv, lambda: ("env", *learner.names()), _fields)
     from mjx_nero.learn import machines  # not needed for help
 
     cli.setup_jax()
@@ -26,11 +25,11 @@ def main(argv: Sequence[str]) -> None:
     train_run.start(args, dotted, parser.given(argv))
 
 
-def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """Returns the configs whose fields ``--help`` lists."""
+def _fields(args: argparse.Namespace) -> str:
+    """Lists the config fields for ``--help``."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
     name = _learner(args, cfg)
-    return {"env": cfg, name: learner.cfg_for(name, args.preset, cfg.training)}
+    return config_help.listed({"env": cfg, name: learner.cfg_for(name, args.preset, cfg.training)})
 
 
 def _learner(args: argparse.Namespace, cfg: EnvCfg) -> str:

@@ -18,7 +18,7 @@ from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
 from mjx_nero.urdf.workspace import Box
 
 STARTS = 48  # number of descents to the middle of the workspace
-CALM = 0.5  # [m/rad] ``calm`` of those descents
+CALM = 0.5  # [m/rad] the descents' ``calm``
 CLEAR = 0.01  # [m] least height above the table
 MARGIN = 0.15  # share of a joint's range beyond which distance from its limits no longer counts
 AGILE = 0.15  # least singular value of the Jacobian (in arm lengths) beyond which more no longer counts

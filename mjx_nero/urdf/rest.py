@@ -12,10 +12,10 @@ from mjx_nero.urdf.tree import Body, Points, Pose, body_of
 
 SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal on the floor beside the table
 UPRIGHT = 0.99  # least cosine of a base's tilt on the table
-TILTED = 0.5  # ... and of a base that stands at all
+TILTED = 0.5  # least cosine of the tilt of a base that stands at all
 HANGS = (0.3, 0.9)  # range of a hanging arm's shoulder height above the table, in arm lengths
 TALL = 0.6  # [m] a robot stands on the floor if its shoulder is higher than this ...
-SHARE = 0.4  # ... and than this share of the arm's length
+SHARE = 0.4  # ... and higher than this share of the arm's length
 BELOW = 0.3  # depth of the table below the shoulder in that case, in arm lengths
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model_checks import cobotta_down
 
 from mjx_nero import math
 from mjx_nero.control import ik
@@ -210,16 +211,11 @@ def test_one_pose_as_in_a_batch():
 
 
 def test_closed_form_of_the_cobotta_with_the_gripper_straight_down():
-    """The flange at (x, y, z), turned by Rz(psi) Ry(pi); links 0.51 and 0.39 m, shoulder 0.05 m up, 0.12 m sideways offset."""
+    """The flange at (x, y, z), turned by Rz(psi) Ry(pi)."""
     rng = np.random.default_rng(0)
     x, y, z = rng.uniform([0.3, -0.4, 0.15], [0.6, 0.4, 0.5], (N, 3)).T
     psi = rng.uniform(-1.0, 1.0, N)
-    rho = np.hypot(x, y)
-    r, h = np.sqrt(rho**2 - 0.12**2), z - 0.05
-    q1 = np.arctan2(y, x) - np.arcsin(0.12 / rho)
-    q3 = np.arccos((r**2 + h**2 - 0.51**2 - 0.39**2) / (2 * 0.51 * 0.39))
-    q2 = np.arctan2(r, h) - np.arctan2(0.39 * np.sin(q3), 0.51 + 0.39 * np.cos(q3))
-    exact = np.stack([q1, q2, q3, np.zeros(N), np.pi - q2 - q3, q1 - psi], axis=1)
+    exact = cobotta_down(x, y, z, psi)
     pos = jnp.array(np.stack([x, y, z], axis=1), jnp.float32)
     quat = jnp.array(np.stack([0 * psi, -np.sin(psi / 2), np.cos(psi / 2), 0 * psi], axis=1), jnp.float32)
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from model_checks import cobotta_down
 
 from mjx_nero.control import rmp, rmpflow_config
 from mjx_nero.control.rmp import Rmp
@@ -35,16 +36,6 @@ def cobotta() -> RmpFlow:
 @pytest.fixture(scope="session")
 def nero() -> RmpFlow:
     return RmpFlow(NERO)
-
-
-def down(x: float, y: float, z: float) -> np.ndarray:
-    """The Cobotta's joints with its flange at a point, straight down: closed form, from the lengths of its links."""
-    rho, h = np.hypot(x, y), z - 0.05
-    r = np.sqrt(rho**2 - 0.12**2)
-    q1 = np.arctan2(y, x) - np.arcsin(0.12 / rho)
-    q3 = np.arccos((r**2 + h**2 - 0.51**2 - 0.39**2) / (2 * 0.51 * 0.39))
-    q2 = np.arctan2(r, h) - np.arctan2(0.39 * np.sin(q3), 0.51 + 0.39 * np.cos(q3))
-    return np.array([q1, q2, q3, 0, np.pi - q2 - q3, q1])
 
 
 # Leaves
@@ -330,7 +321,7 @@ SPHERE, POST, AWAY = ((0.5, 0, 0.45), (0.5, 0, 0.45), 0.08), ((0.6, 0, 0), (0.6,
 
 @pytest.fixture(scope="session")
 def cobotta_runs(cobotta):
-    left = down(0.5, -0.3, 0.45)
+    left = cobotta_down(0.5, -0.3, 0.45)
     runs = {  # start, centre and radius of the target's circle, obstacle
         "zeros": (np.zeros(6), (0.5, 0, 0.5), 0.0, AWAY),
         "place": (HOME, (-0.3, 0.6, 0.45), 0.0, AWAY),

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from views import STILL, blank
 
 from mjx_nero import UserError
 from mjx_nero.mdp import fixtures, holes, towers
 from mjx_nero.types import FixtureStart, FixtureView, ObjectView, Start, View
 
-STILL = jnp.array([1.0, 0.0, 0.0, 0.0])
 # A peg of 6 cm in a hole whose ground is at (0.4, 0.1, 0); the goal says 2 mm farther along x.
 PLACE = towers.Place(
     tower=("socket/hole", "peg"),
@@ -26,26 +26,12 @@ IN, OVER, BESIDE = (0.4, 0.1, 0.03), (0.4, 0.1, 0.07), (0.44, 0.1, 0.05)
 
 
 def view(peg, hand=(0.0, 0.0, 0.5), fingers=(0.0, 0.0), speed=0.0) -> View:
-    zero = jnp.zeros(3)
     at = {"hole": jnp.array([0.4, 0.1, 0.0])}
     socket = FixtureView(at["hole"], STILL, {}, {}, {}, at, {"hole": STILL})
-    return View(
-        joint_pos=zero,
-        joint_vel=zero,
-        default_joint_pos=zero,
-        ctrl=zero,
+    return blank(
         ee_pos_w=jnp.array(hand),
-        ee_quat_w=STILL,
-        objects={"peg": ObjectView(jnp.array(peg), STILL, jnp.array([speed, 0.0, 0.0]), zero)},
-        root_pos_w=zero,
-        command=zero,
+        objects={"peg": ObjectView(jnp.array(peg), STILL, jnp.array([speed, 0.0, 0.0]), jnp.zeros(3))},
         goal_pos_w=jnp.array([0.402, 0.1, 0.03]),
-        goal_quat_w=STILL,
-        goal_linvel_w=zero,
-        action=zero,
-        last_action=zero,
-        step=jnp.zeros((), jnp.int32),
-        time=jnp.zeros(()),
         fixtures={"socket": socket},
         readings={} if fingers is None else {"fingers": jnp.array(fingers)},
     )

@@ -1,11 +1,10 @@
 """What an episode looks like: the terms' ranges, and a camera as real ones are."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from views import blank
 
 from mjx_nero.mdp import images, looks
 from mjx_nero.mdp.randomization import Model
@@ -13,7 +12,7 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim import scene
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.tasks import registry
-from mjx_nero.types import Picture, UserError, View
+from mjx_nero.types import Picture, UserError
 
 MODEL = Model(
     {
@@ -80,11 +79,8 @@ def test_a_look_names_what_is_there():
 
 def view(value):
     """A view with a picture that is all of one value."""
-    others = {
-        field.name: None for field in dataclasses.fields(View) if field.default is field.default_factory is dataclasses.MISSING
-    }
     rgb = jnp.full((4, 4, 3), value, jnp.uint8)
-    return View(**others, cameras={"front": Picture(rgb=rgb, depth=jnp.full((4, 4), value / 100))})
+    return blank(cameras={"front": Picture(rgb=rgb, depth=jnp.full((4, 4), value / 100))})
 
 
 def seen(lens, values):

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from views import blank
 
 from mjx_nero.mdp import actions, pushes, sensors
-from mjx_nero.types import FixtureView, ObjectView, View
+from mjx_nero.types import FixtureView, ObjectView
 
 ZERO, UP = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
 KEYS = jax.random.split(jax.random.PRNGKey(0), 500)
@@ -14,11 +15,9 @@ KEYS = jax.random.split(jax.random.PRNGKey(0), 500)
 
 def view(x=0.4, time=0.0, bias=None):
     cube = ObjectView(pos_w=jnp.array([x, 0.0, 0.1]), quat_w=UP, linvel_w=ZERO, angvel_local=ZERO)
+    joints = dict.fromkeys(("joint_pos", "joint_vel", "default_joint_pos", "ctrl"), jnp.array([0.5, -0.5]))
     root = jnp.array([0.1, 0.0, 0.0])
-    two, action = jnp.array([0.5, -0.5]), jnp.zeros(2)
-    return View(
-        two, two, two, two, ZERO, UP, {"cube": cube}, root, ZERO, ZERO, UP, ZERO, action, action, 0, jnp.asarray(time), bias, 100
-    )
+    return blank(**joints, objects={"cube": cube}, root_pos_w=root, time=jnp.asarray(time), encoder_bias=bias, max_steps=100)
 
 
 def seen(sensor, views, keys=KEYS):

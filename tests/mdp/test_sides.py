@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from views import blank
 
 from mjx_nero import UserError
 from mjx_nero import math as quats
@@ -24,25 +25,13 @@ def about(axis: int, degrees: float):
 
 
 def view(quat, height=0.02, side=X, hand=(0.3, 0.0, 0.1), fingers=(0.0, 0.0), told=(0.05, -0.05), spin=0.0) -> View:
-    zero = jnp.zeros(3)
-    box = ObjectView(jnp.array([0.3, 0.0, height]), jnp.asarray(quat), zero, jnp.array([0.0, spin, 0.0]))
-    return View(
-        joint_pos=zero,
-        joint_vel=zero,
-        default_joint_pos=zero,
+    box = ObjectView(jnp.array([0.3, 0.0, height]), jnp.asarray(quat), jnp.zeros(3), jnp.array([0.0, spin, 0.0]))
+    return blank(
         ctrl=jnp.array([0.7, *told]),
         ee_pos_w=jnp.array(hand),
         ee_quat_w=about(0, 180),
         objects={"box": box},
-        root_pos_w=zero,
         command=jnp.array(side),
-        goal_pos_w=zero,
-        goal_quat_w=about(0, 0),
-        goal_linvel_w=zero,
-        action=zero,
-        last_action=zero,
-        step=jnp.zeros((), jnp.int32),
-        time=jnp.zeros(()),
         readings={} if fingers is None else {"fingers": jnp.array(fingers)},
     )
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model_checks import cobotta_down
 
 from mjx_nero import env_cfg
 from mjx_nero.sim import scene
@@ -17,17 +18,8 @@ LEAD = np.array(ARM.lead)
 EDGE = CFG.scene.objects["cube"].size[0]
 
 
-def top_down(x: float, y: float, z: float) -> np.ndarray:
-    """Arm joints that put the grasp point at a place, looking straight down: closed form, from the lengths of the links."""
-    rho, h = np.hypot(x, y), z + 0.26 - 0.05
-    r = np.sqrt(rho**2 - 0.12**2)
-    q1 = np.arctan2(y, x) - np.arcsin(0.12 / rho)
-    q3 = np.arccos((r**2 + h**2 - 0.51**2 - 0.39**2) / (2 * 0.51 * 0.39))
-    q2 = np.arctan2(r, h) - np.arctan2(0.39 * np.sin(q3), 0.51 + 0.39 * np.cos(q3))
-    return np.array([q1, q2, q3, 0, np.pi - q2 - q3, q1])
-
-
-LOW, HIGH = top_down(0.5, 0.0, 0.0258), top_down(0.5, 0.0, 0.3)
+FLANGE = 0.26  # from the grasp point up to the flange [m]
+LOW, HIGH = cobotta_down(0.5, 0.0, 0.0258 + FLANGE), cobotta_down(0.5, 0.0, 0.3 + FLANGE)
 SWING = np.array([1.06, 0, 0, 0, 0, 0])  # of joint_1 [rad]
 
 

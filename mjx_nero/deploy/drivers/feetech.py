@@ -13,6 +13,7 @@ from mjx_nero.deploy.arm import ArmError
 
 BAUD = 1_000_000
 MODEL = 777  # STS3215
+_TRIES = 2  # number of times to send a request whose answer is wrong or missing
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 EVERYONE = 0xFE
 # Name -> (address, bytes).
@@ -85,11 +86,10 @@ class Bus:
 
     Args:
         port: has ``write``, ``read(count)``, which returns fewer bytes on a timeout, ``reset_input_buffer`` and ``close``.
-        tries: number of times to send a request whose answer is wrong or missing.
     """
 
-    def __init__(self, port: Any, tries: int = 2):
-        self._port, self._tries = port, tries
+    def __init__(self, port: Any):
+        self._port = port
 
     def close(self) -> None:
         """Closes the port; the servos keep holding."""
@@ -138,7 +138,7 @@ class Bus:
 
     def _ask(self, servos: Sequence[int], request: bytes, size: int) -> dict[int, bytes]:
         """Sends a request and returns the answers by servo; repeats it if an answer is damaged."""
-        for left in reversed(range(self._tries)):
+        for left in reversed(range(_TRIES)):
             self._send(request)
             try:
                 return {servo: self._answer(servo, size) for servo in servos}
@@ -180,7 +180,7 @@ def _ram(name: str) -> int:
     return REGISTERS[name][0]
 
 
-def registers(data: bytes, names: Iterable[str], first: int = STATE[0]) -> dict[str, int]:
-    """Decodes registers from a block that begins at address ``first``."""
-    places = {name: (REGISTERS[name][0] - first, REGISTERS[name][1]) for name in names}
+def registers(data: bytes, names: Iterable[str]) -> dict[str, int]:
+    """Decodes registers from the block ``STATE``."""
+    places = {name: (REGISTERS[name][0] - STATE[0], REGISTERS[name][1]) for name in names}
     return {name: decode(name, data[at : at + size]) for name, (at, size) in places.items()}

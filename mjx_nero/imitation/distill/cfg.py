@@ -21,10 +21,8 @@ class DistillCfg:
     learning_rate: Annotated[float, Bounds(0.0, 1.0, above=True)] = 1e-3  # initial learning rate of Adam
     last_rate: Share = 0.1  # final learning rate, as a share of the initial one
     max_grad_norm: Positive = 1.0  # maximum norm of the gradient
-    teacher_share: Share = (
-        0.1  # final share of environments where the teacher acts, which shows states that the student never reaches
-    )
-    teacher_first: Annotated[int, Bounds(0, 1_000_000)] = 20  # iterations in which that share falls from 1
+    teacher_share: Share = 0.1  # final share of environments where the teacher acts and shows states that the student misses
+    teacher_first: Annotated[int, Bounds(0, 1_000_000)] = 20  # iterations in which the teacher's share falls from 1
     noise: NonNegative = 0.05  # standard deviation of noise on the student's actions
     max_action: Positive = 1.0  # bound on labels, beyond which nothing changes
     truth_cost: NonNegative = 0.1  # weight of the loss of predicted object positions, in units of their deviation

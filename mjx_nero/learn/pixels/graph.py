@@ -37,9 +37,9 @@ def build(policy: Policy, graph: Graph) -> None:
     """Adds the student to a graph. Its inputs are ``observations`` and those of ``pictures``, its output is ``actions``."""
     normalizer, variables = policy.params
     params, shapes = variables["params"], pictures(policy.meta)
-    x = graph.apply("Sub", "observations", graph.constant("mean", normalizer.mean["state"]))
-    x = graph.apply("Div", x, graph.constant("std", normalizer.std["state"]))
-    sensed = graph.apply("Clip", x, graph.constant("least", -networks.MOST), graph.constant("most", networks.MOST))
+    sensed = graph.apply(
+        "Clip", graph.normalized(normalizer), graph.constant("least", -networks.MOST), graph.constant("most", networks.MOST)
+    )
     features = [_eye(graph, params[f"eye_{name.removeprefix('picture_')}"], name, *shapes[name]) for name in sorted(shapes)]
     x = graph.apply("Concat", *features, sensed, axis=-1)
     hidden = sorted((n for n in params if n.startswith("Dense_")), key=lambda n: int(n.rpartition("_")[2]))

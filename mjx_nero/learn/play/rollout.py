@@ -172,8 +172,9 @@ class Runner:
         return compile
 
 
-def wilson(successes: float, n: int, z: float = 1.96) -> tuple[float, float]:
+def wilson(successes: float, n: int) -> tuple[float, float]:
     """Computes Wilson's 95% interval of a proportion (Wilson 1927)."""
+    z = 1.96
     p, zz = successes / n, z * z / n
     middle, half = (p + zz / 2) / (1 + zz), z * math.sqrt(p * (1 - p) / n + zz / (4 * n)) / (1 + zz)
     return max(0.0, middle - half), min(1.0, middle + half)

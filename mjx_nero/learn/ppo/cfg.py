@@ -101,12 +101,12 @@ class PpoCfg:
     entropy_cost: NonNegative = 0.01  # weight of the entropy bonus, which keeps the policy exploring
     change_cost: NonNegative = 0.0  # weight of the squared change of mean actions between steps, which keeps the policy calm
     imitation: NonNegative = 0.0  # weight of the distance from the expert's actions, until half of the episodes succeed
-    imitation_lasts: bool = False  # that weight goes by the share of episodes that fail, to the end of training
-    demonstrations: Annotated[int, Bounds(1, 4_096)] = DEMONSTRATIONS  # episodes that the expert plays to be imitated
+    imitation_lasts: bool = False  # ``imitation`` is weighted by the share of episodes that fail, to the end of training
+    demonstrations: Annotated[int, Bounds(1, 4_096)] = DEMONSTRATIONS  # number of the expert's episodes to imitate
     critic_first: Annotated[int, Bounds(0, 10_000)] = 0  # iterations in which an imitating policy waits for its critic
     min_std: NonNegative = 0.2  # minimum standard deviation of actions, so that exploration lasts; 0: none
     max_std: NonNegative = 1.0  # maximum standard deviation, since noise costs nothing where targets saturate; 0: none
-    averaging: Annotated[float, Bounds(0.0, 0.9999)] = 0.0  # share of the past in the mean policy, which is played; 0: no mean
+    averaging: Annotated[float, Bounds(0.0, 0.9999)] = 0.0  # share of the past in the mean policy that plays; 0: no mean
     value_loss: NonNegative = 1.0  # weight of the critic's loss
     max_grad_norm: Positive = 1.0  # maximum norm of the gradient
     reward_scaling: Positive = 1.0  # factor of rewards

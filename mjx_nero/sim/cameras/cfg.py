@@ -21,9 +21,9 @@ class CameraCfg:
     """A pinhole camera, fixed in the world or on a link.
 
     Attributes:
-        link: body that carries it; empty: fixed in the world.
+        link: body that carries the camera; empty: fixed in the world.
         pos: place in the frame of the link or the world [m].
-        quat: orientation there, wxyz. A camera looks along its -z axis; y points up in the picture.
+        quat: orientation in that frame, wxyz. A camera looks along its -z axis; y points up in the picture.
         fovy: vertical field of view [deg].
         size: width and height [pixels].
         kinds: one or more of ``rgb``, ``depth`` and ``segmentation``.

@@ -19,7 +19,7 @@ _HANGS = 0.5  # cosine of a base's tilt, beyond which the robot hangs from a pla
 
 
 def add(spec: mujoco.MjSpec, scene: "SceneCfg", goal, robot: RobotCfg) -> None:
-    """Adds what is only drawn of a scene, for people and for the task's cameras; ``goal`` is the body of the goal's marker.
+    """Adds the parts of a scene that are only drawn, for people and for the task's cameras; ``goal`` is the marker's body.
 
     Raises:
         UserError: the scene lacks a camera's link, or its photographs cannot be read.

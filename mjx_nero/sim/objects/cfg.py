@@ -28,17 +28,17 @@ class ObjectCfg:
             cylinder and everything else as the capsule inside it: a flat pad touches a cylinder's side at a single point that
             jumps about, and MJX-JAX finds no contact there.
         size: edges of a box; radius of a sphere; radius and length of a cylinder, or of a capsule without its ends [m].
-        mass: mass [kg]; that of a mesh follows from ``density``.
+        mass: mass [kg]; a mesh gets its mass from ``density``.
         friction: sliding [1], spinning and rolling [m].
         condim: contact dimension: 3 slides, 4 also spins, 6 also rolls. Of two geoms, the larger one counts.
         pos: place before the reset events: x, y, and height above the table [m].
-        quat: orientation there, wxyz.
+        quat: orientation before the reset events, wxyz.
         rgba: colour.
         file: for a ``mesh``: an OBJ, STL or GLB file, a folder with an ``object.yaml``, or one of the package's objects by name.
             The mesh is cut into convex parts; its origin is its centre of mass.
-        bank: further files; in each episode the object has one of all these shapes (``sim.meshes.bank``).
+        bank: further mesh files; in each episode the object has one of all these shapes (``sim.meshes.bank``).
         scale: factor of a mesh's lengths.
-        density: density of a mesh [kg/m3], which gives its mass; 0: that of its ``object.yaml``, or else 500.
+        density: density of a mesh, which gives its mass [kg/m3]; 0: the density in its ``object.yaml``, or else 500.
     """
 
     shape: Annotated[str, OneOf(*SHAPES, "mesh")] = "box"

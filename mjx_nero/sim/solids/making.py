@@ -18,7 +18,7 @@ from mjx_nero.types import UserError
 
 MAX_DRAWN = 40_000  # triangles
 COARSE = 2_500  # triangles of a mesh to cut into pieces
-SECONDS = {"careful": 12, "quick": 14}  # of CPU, for the cutting: what the first does not finish, the second tries
+SECONDS = {"careful": 12, "quick": 14}  # CPU time for cutting [s]; the quick search follows if the careful one does not finish
 MAX_LOOSE = 300  # disconnected pieces
 FLAT = 1e-4  # least thickness, as a share of the length
 HOLE = 1.0  # greatest length of a hole's edge that is filled, as a share of the length; the rim of a cup is three times it

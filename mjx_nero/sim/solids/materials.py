@@ -1,6 +1,6 @@
 """The materials that an OBJ file names, of which one colour and one texture are drawn. The files may be untrusted.
 
-Scans and archives often come without them. What is not there is left out, and said.
+Scans and archives often come without their materials. Missing ones are left out, and ``Look.missing`` names the first.
 """
 
 import dataclasses

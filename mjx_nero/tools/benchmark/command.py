@@ -16,7 +16,7 @@ from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.runs import console
 from mjx_nero.sim.physics import impls
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 from mjx_nero.tools.benchmark import SIZES, machine, plot
 from mjx_nero.tools.benchmark.machine import Row
 
@@ -51,7 +51,7 @@ _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the ta
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = _parser()
-    args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    args, dotted = parser.parse(argv, lambda: ("env", *learners.names()), _fields)
     from mjx_nero.tools.benchmark import jobs  # with Brax and MJX, which help does without
 
     args.learner = args.learner or registry.env_cfg(args.env, args.preset, args.robot).learner
@@ -142,11 +142,11 @@ def _parser() -> cli.Parser:
     return parser
 
 
-def _cfgs(args: argparse.Namespace) -> dict[str, Any]:
-    """Returns the configs whose fields ``--help`` lists."""
+def _fields(args: argparse.Namespace) -> str:
+    """Lists the config fields for ``--help``."""
     cfg = registry.env_cfg(args.env, args.preset, args.robot)
     name = args.learner or cfg.learner
-    return {"env": cfg, name: run_cfg.learner_cfg(cfg, args.preset, name)}
+    return config_help.listed({"env": cfg, name: run_cfg.learner_cfg(cfg, args.preset, name)})
 
 
 def begin() -> None:
@@ -155,7 +155,7 @@ def begin() -> None:
     from mjx_nero.tools.benchmark import jobs, start
 
     imported, spawned, argv = time.time(), float(sys.argv[1]), sys.argv[2:]
-    args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _cfgs)
+    args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _fields)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     impl, sizes = resolve_impl(args.impl), args.num_envs or [0]

@@ -11,8 +11,9 @@ from mjx_nero.sim import render
 from mjx_nero.tools.benchmark.program import Row, spread
 
 
-def measure_render(env: ManipulationEnv, count: int, repeats: int, width: int = 640, height: int = 480) -> Row:
+def measure_render(env: ManipulationEnv, count: int, repeats: int) -> Row:
     """Draws the first states of ``count`` episodes one by one, ``repeats`` times. Without OpenGL the row says so."""
+    width, height = 640, 480
     row = {"what": "render", "gl": os.environ.get("MUJOCO_GL", "default"), "width": width, "height": height, "frames": count}
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
     qpos, scenery = jax.device_get((states.pipeline_state.qpos, jax.vmap(env.scenery)(states)))

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from mjx_nero.data import Episode, writer
 from mjx_nero.errors import UserError
 from mjx_nero.runs import console
-from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 from mjx_nero.tools.demos.cfg import DemosCfg
 
 _LOG = "write a log of 'deploy --log' on a real arm as an episode, instead of simulated ones; give successful runs; repeatable"
@@ -41,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
         "--episode", type=cli.number(int), default=0, help="with --replay: index of the episode, from 0 (default: %(default)s)"
     )
     parser.add_argument("--video", type=cli.output(".mp4"), help="with --replay: write a video of the episode")
-    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    args, dotted = parser.parse(argv, ("env",), config_help.of_environment)
     asked = [name for name in ("out", "inspect", "replay") if getattr(args, name)]
     if len(asked) != 1:
         raise UserError("demos takes exactly one of --out DIR (write), --inspect DIR (show) and --replay DIR (play again)")

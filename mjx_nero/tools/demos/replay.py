@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 
-from mjx_nero.data import Dataset, Episode, open_dataset, units
+from mjx_nero.data import Dataset, Episode, open_with, units
 from mjx_nero.data import episode as names
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.errors import UserError
@@ -27,9 +27,7 @@ def show(path: pathlib.Path, index: int, video: pathlib.Path | None) -> None:
     Raises:
         UserError: there is no such episode, or the data set is not from an environment.
     """
-    found = open_dataset(path)
-    if not 0 <= index < len(found):
-        raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
+    found = open_with(path, index)
     env, episode = making.env_of(found.schema, drives=True), _episode(found, index)
     qpos, scenery = again(env, found, episode)
     off = np.abs(qpos - episode.arrays[names.QPOS]).max()

@@ -31,7 +31,7 @@ class Seen:
     shares: dict[tuple[str, str], tuple[float, float]]
 
 
-def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
+def see(cfg: EnvCfg) -> Seen:
     """Draws states of random episodes through the task's cameras, or through default cameras for its robot if it has none.
 
     Raises:
@@ -44,15 +44,13 @@ def see(cfg: EnvCfg, seed: int = 0, impl: str = "native") -> Seen:
     sensors = {name: term for name, term in cfg.sensors.items() if not isinstance(term.made, Lens)}
     seen = dataclasses.replace(cfg.scene, cameras=found)
     cfg = dataclasses.replace(cfg, scene=seen, observations=told, sensors=sensors)
-    env = ManipulationEnv(cfg, impl=impl, num_envs=WORLDS)
+    env = ManipulationEnv(cfg, impl="native", num_envs=WORLDS)
     step, draw = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(lambda state: env.view(state).cameras))
-    state, shots = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(seed), WORLDS)), []
+    state, shots = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS)), []
     aim: Any = None
     for i in range(_STEPS + 1):
         if i % _EVERY == 0:
-            aim = env.home_action + jax.random.uniform(
-                jax.random.PRNGKey(seed + i), (WORLDS, env.action_size), minval=-0.5, maxval=0.5
-            )
+            aim = env.home_action + jax.random.uniform(jax.random.PRNGKey(i), (WORLDS, env.action_size), minval=-0.5, maxval=0.5)
             shots.append(jax.device_get(draw(state)))
         state = step(state, aim)
     pictures: dict[str, Any] = jax.tree.map(lambda *x: np.concatenate(x), *shots)

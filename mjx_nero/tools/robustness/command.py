@@ -13,7 +13,7 @@ from mjx_nero import config, files
 from mjx_nero.errors import UserError
 from mjx_nero.runs import console
 from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 from mjx_nero.tools.robustness import sweeps
 
 STEP = "physics step [factor]"
@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--beside", type=cli.path(".json"), help="with --plot: results of another policy (from --json) to plot as well"
     )
-    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    args, dotted = parser.parse(argv, ("env",), config_help.of_environment)
     if args.beside and not args.plot:
         raise UserError("--beside adds curves to the plot: pass --plot, too")
     other = read(args.beside) if args.beside else None

@@ -22,8 +22,9 @@ from mjx_nero.mdp.terms import Term
 from mjx_nero.sim.cameras.look import Look
 from mjx_nero.sim.fields import Randomization, nominal
 from mjx_nero.sim.physics import make_physics
+from mjx_nero.tasks import sim2real
 from mjx_nero.tools.robustness import seen
-from mjx_nero.tools.robustness.sweeps import LONGEST, Point, varied
+from mjx_nero.tools.robustness.sweeps import LONGEST, Point
 from mjx_nero.types import LOOK
 
 
@@ -44,7 +45,7 @@ class Bench:
         own = {name: term for name, term in cfg.actions.items() if name != "delay"}  # ours replaces the task's own delay
         late = {"delay": Term(actions.Delay, params={"steps": (0, LONGEST)})}
         told = {name: Term(sensors.ObjectPosition, params={"object": name}) for name in self._told}
-        wanted = varied(cfg).randomization
+        wanted = sim2real.randomized(cfg).randomization
         cfg = dataclasses.replace(cfg.uncorrupted(), actions={**late, **own}, sensors={**cfg.sensors, **told})
         self.env = ManipulationEnv(cfg, impl=impl, num_envs=episodes)
         # All fields that any setting changes, so that one program plays every setting.

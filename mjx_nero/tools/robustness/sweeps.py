@@ -47,14 +47,9 @@ _OFFSETS = (0.0, 0.005, 0.01, 0.02)
 LONGEST = max(_DELAYS)
 
 
-def varied(cfg: EnvCfg) -> EnvCfg:
-    """Returns the task with everything that the preset ``sim2real`` randomizes."""
-    return sim2real.randomized(cfg)
-
-
 def sweeps(cfg: EnvCfg) -> dict[str, list[tuple[float, Point]]]:
     """Returns (value, setting) by parameter, for the parameters that a task has, and for all at once over the ranges' width."""
-    terms, things = varied(cfg).randomization, list(cfg.scene.objects)
+    terms, things = sim2real.randomized(cfg).randomization, list(cfg.scene.objects)
     out: dict[str, list[tuple[float, Point]]] = {}
     for name, (term, parameter, values) in _FIELDS.items():
         if (term := term.format(object=(things or [""])[0])) in terms:

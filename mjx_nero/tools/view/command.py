@@ -4,8 +4,7 @@ import pathlib
 from collections.abc import Sequence
 
 from mjx_nero.errors import UserError
-from mjx_nero.tasks import registry
-from mjx_nero.tools import cli
+from mjx_nero.tools import cli, config_help
 
 
 def main(argv: Sequence[str]) -> None:
@@ -49,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_seed(1)
     parser.add_address()
-    args, dotted = parser.parse(argv, ("env",), lambda args: {"env": registry.env_cfg(args.env, args.preset, args.robot)})
+    args, dotted = parser.parse(argv, ("env",), config_help.of_environment)
     if args.episode is not None and not args.demos:
         raise UserError("--episode selects an episode of a data set: pass --demos DIR, too")
     given = parser.given(argv)  # flags that are not given follow the run

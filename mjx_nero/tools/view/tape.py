@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_nero.data import Schema, open_dataset
+from mjx_nero.data import Schema, open_with
 from mjx_nero.data import episode as names
 from mjx_nero.errors import UserError
 from mjx_nero.tools.view.session import Frame
@@ -35,9 +35,7 @@ def of_dataset(path: pathlib.Path, index: int, frame: Frame) -> Iterator[Frame]:
     Raises:
         UserError: there is no such episode, or the data set is from another scene.
     """
-    found = open_dataset(path)
-    if not 0 <= index < len(found):
-        raise UserError(f"{path} has {len(found)} episodes: --episode takes a number from 0 to {len(found) - 1}")
+    found = open_with(path, index)
     if missing := {names.QPOS, names.ENVIRONMENT} - set(found.schema.features):
         raise UserError(f"{path} has no {' and no '.join(sorted(missing))}: give a data set written by demos with --holds all")
     size = found.schema.features[names.QPOS].size
