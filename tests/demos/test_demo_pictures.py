@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+import types
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.imitation.recording import pictures
+from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.tasks import registry
 
 
@@ -60,3 +62,12 @@ def test_each_caller_at_a_time_has_a_drawer_of_its_own(monkeypatch):
         assert list(pool.map(lambda i: several(i, None), range(6))) == [[i] for i in range(6)]
     several.close()
     assert len(made) == 3 and closed == made
+
+
+def test_the_ray_tracer_is_prepared_for_all_sizes_before_threads_draw():
+    """A graph that is captured at a first call, in a thread, fails if another thread's physics runs on the same stream."""
+    prepared = []
+    seen = types.SimpleNamespace(draw=types.SimpleNamespace(prepare=prepared.append))
+    cfg = types.SimpleNamespace(scene=types.SimpleNamespace(cameras={"front": CameraCfg(size=(64, 64))}))
+    drawer = pictures._Traced(types.SimpleNamespace(cfg=cfg, draw_by=lambda own, renderer: seen), "front", (64, 64))
+    assert prepared == list(drawer._draw._sizes) and len(prepared) > 1

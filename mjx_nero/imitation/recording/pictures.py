@@ -166,7 +166,10 @@ class _Traced:
         seen = env.draw_by({name: camera}, "warp")
         draw = jax.jit(jax.vmap(lambda shown: seen(*shown)[name].rgb))
         episodes = max(1, min(EPISODES, PIXELS // (TOGETHER * size[0] * size[1])))
-        self._draw = Batches(draw, sorted({1, TOGETHER, episodes * TOGETHER}), PageLocked(TOGETHER))
+        sizes = sorted({1, TOGETHER, episodes * TOGETHER})
+        for rows in sizes:  # now, because a graph cannot be captured while another thread's physics runs on the device
+            seen.draw.prepare(rows)
+        self._draw = Batches(draw, sizes, PageLocked(TOGETHER))
 
     def __call__(self, qpos: np.ndarray, scenery: Scenery) -> Iterable[np.ndarray]:
         return self._draw((qpos, scenery))
