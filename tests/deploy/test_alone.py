@@ -118,7 +118,7 @@ def test_a_log_that_another_run_writes_is_left_alone(lift, told, tmp_path):
 def test_a_second_deploy_ends_in_one_line_and_the_first_goes_on(call, lift, told, tmp_path):
     policy = shutil.copy(lift / "policy.onnx", tmp_path / "policy.onnx")
     with emulators.started("so101", {"model": str(lift / "scene.mjb")}, told) as arm:
-        flags = ["--port", arm["port"], "--calibration", arm["calibration"], "--object", "0.2,0,0.015", "--seconds", "3"]
+        flags = ["--port", arm["port"], "--calibration", arm["calibration"], "--object", "0.2,0,0.015", "--seconds", "10"]
         command = [sys.executable, "-m", "mjx_nero", "deploy", str(policy), "--arm", "so101", *flags]
         log = tmp_path / "log.csv"
         first = subprocess.Popen([*command, "--log", str(log)], stdout=subprocess.PIPE, text=True, env=children.environment())

@@ -70,7 +70,8 @@ def test_logs_become_a_data_set_once(call, tmp_path):
     ("text", "message"),
     [
         ("", "needs exactly one column time"),
-        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "needs exactly one column target.wrist_roll"),
+        (table(ROWS).replace("target.wrist_roll", "torque.wrist_roll"), "needs exactly one column target.wrist_roll"),
+        (table(ROWS).replace("target.wrist_roll", "target.wrist"), "has columns of 'wrist', which so_arm101 lacks: pass"),
         (table(ROWS[:4]), "has 0 policy steps, and an episode needs two: give a log of 'deploy --log'"),
         (table(ROWS).replace("0.4,0.4", "0.4,nan"), "log.csv line 10 takes a number up to 10000, got 'nan'"),
         (table(ROWS).replace("0.4,0.4", "0.4,", 1), "log.csv line 10 takes a number up to 10000, got ''"),
