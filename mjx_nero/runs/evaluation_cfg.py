@@ -14,6 +14,11 @@ EXPERT = "expert"  # the task's first controller
 BACKENDS = ("auto", "mjx", "mujoco")
 
 
+def expert_of(able: Iterable[str]) -> str:
+    """Returns the name of the expert, which is the first of a task's controllers ``able``; ``EXPERT`` if there are none."""
+    return next(iter(able), EXPERT)
+
+
 def controller_of(agent: str, able: Iterable[str]) -> str | None:
     """Returns the name of the controller that an agent's name means; None if the agent is not a controller.
 
@@ -22,7 +27,7 @@ def controller_of(agent: str, able: Iterable[str]) -> str | None:
     """
     if agent in AGENTS:
         return None
-    return next(iter(able), EXPERT) if agent == EXPERT else agent
+    return expert_of(able) if agent == EXPERT else agent
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from mjx_nero.envs.task import EnvCfg, for_controllers
 from mjx_nero.learn import device_memory
 from mjx_nero.runs import cfg as run_cfg
 from mjx_nero.runs import compiled, evaluation
-from mjx_nero.runs.evaluation_cfg import EXPERT
+from mjx_nero.runs.evaluation_cfg import expert_of
 from mjx_nero.sim.physics import impls, resolve_impl
 from mjx_nero.tools import cli
 from mjx_nero.tools.benchmark import SIZES, drawing, inverse_kinematics, learning, start, throughput
@@ -83,7 +83,7 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace, make_
         make = functools.partial(throughput.training, learner, iterations)
         about = {"learner": args.learner} if args.learner != "ppo" else {}
     elif what == "control":
-        name = next(iter(env.cfg.controllers), EXPERT)
+        name = expert_of(env.cfg.controllers)
         make = functools.partial(throughput.controlled, env, evaluation.controller(name, env, args.env))
         about = {"controller": name}
     else:

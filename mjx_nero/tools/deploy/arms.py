@@ -136,7 +136,8 @@ def spec(args: argparse.Namespace, metadata: Mapping[str, Any], options: Mapping
     kept = {name: metadata[name] for name in KEPT}
     dry, out = getattr(args, "dry_run", False), str(log.absolute()) if log else ""
     safety = dataclasses.asdict(safety_of(args))
-    return Spec(args.arm, options, kept, safety, fence, out, dry, (f"robot: {metadata['robot']}", note), tuple(offsets)), delay
+    notes = f"robot: {metadata['robot']}", note  # the first as ``identify.log.ROBOT``, which would import JAX here
+    return Spec(args.arm, options, kept, safety, fence, out, dry, notes, tuple(offsets)), delay
 
 
 @contextlib.contextmanager

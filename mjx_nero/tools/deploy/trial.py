@@ -17,6 +17,7 @@ from mjx_nero.deploy.observe import Observer, no_pictures
 from mjx_nero.deploy.safety import Fault
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.identify.excitation import sweeps
+from mjx_nero.identify.log import ROBOT
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
@@ -81,7 +82,7 @@ def recorded(path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, sec
     plant.faults = faults
     guard: Any = Guard(arm, setup.safety_of(told), clock)
     guard.start(anywhere=True)
-    guard.log = Log(path, arm.joints, targets[0], clock.now(), 0, (f"robot: {robot.name}", "emulated"))
+    guard.log = Log(path, arm.joints, targets[0], clock.now(), 0, (f"{ROBOT}{robot.name}", "emulated"))
     fault, limited = play(guard, targets, clock, lambda: None)
     assert fault is None, fault
     guard.log.close()
