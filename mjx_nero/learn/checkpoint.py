@@ -114,6 +114,8 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
 def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = None) -> Tree:
     """Reads the arrays as a tree like ``template``, whose leaves need only shape and dtype.
 
+    A float32 of the template may be bfloat16 in the file (``learner.Kind.stored``).
+
     Args:
         held: prefix of a name in ``template`` -> its prefix in the file, if the file holds a larger tree.
 
@@ -126,11 +128,12 @@ def load(path: pathlib.Path, template: Tree, held: Mapping[str, str] | None = No
     wanted = dict(zip(names, jax.tree.leaves(template), strict=True))
     for name, want in wanted.items():  # checked before reading: the file may be larger than the memory
         kind, shape = there.get(name, (str(want.dtype), want.shape))
-        if (kind, shape) != (str(want.dtype), want.shape):
+        if (kind, str(want.dtype)) != ("bfloat16", "float32") and kind != str(want.dtype) or shape != want.shape:
             raise UserError(f"{path} does not fit: {name} is {kind}{shape}, expected {want.dtype}{want.shape}")
     try:
         with safe_open(path, framework="numpy") as file:
-            leaves = jax.device_put([file.get_tensor(name) for name in wanted])  # jnp.asarray compiles a program for each
+            arrays = [file.get_tensor(name).astype(want.dtype, copy=False) for name, want in wanted.items()]
+            leaves = jax.device_put(arrays)  # jnp.asarray compiles a program for each
     except (SafetensorError, OSError):
         raise UserError(f"{path} does not fit this environment and these networks, or it is damaged: give another file") from None
     return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -21,6 +21,7 @@ DTYPES = {  # a safetensors file's name of a type -> numpy's
     "F64": "float64",
     "F32": "float32",
     "F16": "float16",
+    "BF16": "bfloat16",
     "I64": "int64",
     "I32": "int32",
     "I16": "int16",

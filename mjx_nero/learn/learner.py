@@ -93,6 +93,7 @@ class Kind:
         presets: its config for each preset of an environment; ``default`` for the others. A config is a frozen dataclass with at
             least ``num_envs`` and ``num_timesteps``, where 0 means chosen for the machine.
         policy: description in a policy's file -> (template of the policy's parameters, act function).
+        stored: (policy's parameters, description) -> the parameters as a file holds them: fewer bytes, the same actions.
         envs: default number of environments on a CPU, and on a GPU.
         pace: speed of a GPU, shown to users who train without one.
         fit: (config, devices at the run's start) -> the config with what their number decides, which the run keeps.
@@ -106,6 +107,7 @@ class Kind:
     make: Callable[["Env", Any, int], Learner]
     presets: Mapping[str, Any]
     policy: Callable[[Mapping[str, Any]], tuple[Params, Act]]
+    stored: Callable[[Params, Mapping[str, Any]], Params] = lambda params, meta: params
     envs: tuple[int, int] = (256, 8192)
     pace: str = "an NVIDIA H200 makes 60 M steps of 8,192 environments in half a minute"
     fit: Callable[[Any, int], Any] = lambda cfg, _: cfg

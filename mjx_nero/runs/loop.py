@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_nero.errors import UserError
-from mjx_nero.learn import checkpoint, machines, waiting
+from mjx_nero.learn import checkpoint, learner, machines, waiting
 from mjx_nero.learn.play import figures
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.checkpoints import Checkpoints
@@ -199,13 +199,14 @@ class Loop:
 
     def _save(self, state: Any) -> None:
         tally, policy = self.tally, self.made.learner.policy(state)
+        policy = learner.find(self.run.learner).stored(policy, self.meta)
         meta = {**self.meta, "env_steps": tally.steps, "tally": dataclasses.asdict(tally)}
         self.checkpoints.save(state, policy, meta, tally.steps, tally.best_steps)
 
     def _row(self, metrics: dict[str, float]) -> dict[str, float]:
         """Turns sums over an iteration into figures per episode."""
-        learner = self.made.learner
-        per, length = learner.steps_per_iteration, learner.env.unwrapped.episode_length
+        env, per = self.made.learner.env.unwrapped, self.made.learner.steps_per_iteration
+        length = env.episode_length
         sums = {name.removeprefix("sum/"): value for name, value in metrics.items() if name.startswith("sum/")}
         row = {
             "steps_per_s": self.tally.steps_per_s,
@@ -215,7 +216,7 @@ class Loop:
         }
         episodes = max(sums.get("episodes", 0.0), 1e-9)
         row |= {f"train/{n}": sums[n] / episodes for n in ("success", "dropped", "final_distance", "visited", LEVEL) if n in sums}
-        terms = learner.env.unwrapped.cfg.metrics
+        terms = env.cfg.metrics
         row |= {f"train/{name}": value for name, value in figures.of_sums(terms, sums, episodes)}
         row |= {name: value / per * length for name, value in sums.items() if name.startswith("reward/")}
         return row | {f"{self.run.learner}/{name}": value for name, value in metrics.items() if not name.startswith("sum/")}

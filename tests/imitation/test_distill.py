@@ -13,7 +13,7 @@ from mjx_nero import ManipulationEnv, UserError
 from mjx_nero.envs import wrappers
 from mjx_nero.imitation.distill import teachers
 from mjx_nero.imitation.distill.cfg import DistillCfg, StudentCfg
-from mjx_nero.learn import learner, policy
+from mjx_nero.learn import checkpoint, learner, policy
 from mjx_nero.tasks import registry
 
 CFG = DistillCfg(
@@ -100,6 +100,23 @@ def test_a_student_trains_is_resumed_and_played(quick, call, tmp_path):
     play = ["eval", "--policy", "run/policy.safetensors", "--episodes", 2, "--backend", "mujoco", "--env.episode_length_s", 0.2]
     code, out, err = call(*play, "--preset", "rgb_fixed")
     assert code == 0 and "success rate" in out, err
+
+
+def test_a_file_in_the_convolutions_format_acts_the_same(quick, tmp_path):
+    """It takes half the bytes for them."""
+    cfg = dataclasses.replace(CFG, student=dataclasses.replace(CFG.student, precision="bfloat16"))
+    made, kind = make(cfg), learner.find("distill")
+    state = jax.jit(made.init)(jax.random.PRNGKey(0))
+    params, meta = made.policy(state), policy.describe(made.env.unwrapped, "nero_lift", "rgb_fixed", "distill", made.describe())
+    whole, stored = tmp_path / "whole.safetensors", tmp_path / "stored.safetensors"
+    checkpoint.save(whole, params, meta)
+    checkpoint.save(stored, kind.stored(params, meta), meta)
+    one, other = policy.load(whole), policy.load(stored)
+    assert {x.dtype for x in jax.tree.leaves(other.params[1])} == {np.dtype("float32")}
+    np.testing.assert_array_equal(jax.jit(one.act)(state.env_state.obs), jax.jit(other.act)(state.env_state.obs))
+    eyes = sum(x.size for name, layer in params[1]["params"].items() if name.startswith("eye_") for x in jax.tree.leaves(layer))
+    assert eyes > 0
+    assert whole.stat().st_size - stored.stat().st_size == pytest.approx(2 * eyes, abs=100)  # the header's names of types
 
 
 def test_a_policy_knows_what_size_its_pictures_have():

@@ -160,6 +160,21 @@ def test_other_shapes_types_and_names_are_refused(path, template, message):
         checkpoint.load(path, template)
 
 
+def test_bfloat16_is_read_as_float32(path):
+    """What a file holds in bfloat16 comes back as float32, and nothing else does."""
+    held = {"a": jnp.arange(6.0, dtype=jnp.bfloat16).reshape(2, 3) / 3}
+    checkpoint.save(path, held, META)
+    read = checkpoint.load(path, {"a": jnp.zeros((2, 3))})["a"]
+    assert read.dtype == jnp.float32
+    np.testing.assert_array_equal(read, held["a"].astype(jnp.float32))
+    for other in (jnp.float16, jnp.int32):
+        with pytest.raises(UserError, match=r"is bfloat16\(2, 3\), expected "):
+            checkpoint.load(path, {"a": jnp.zeros((2, 3), other)})
+    checkpoint.save(path, {"a": jnp.zeros((2, 3), jnp.float16)}, META)
+    with pytest.raises(UserError, match=r"is float16\(2, 3\), expected float32"):
+        checkpoint.load(path, {"a": jnp.zeros((2, 3))})
+
+
 def test_a_pickle_runs_no_code(tmp_path):
     """A file that would run code on unpickling is merely no policy."""
 

@@ -25,7 +25,18 @@ from mjx_nero.learn import device_memory
 from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.pixels import graph
 from mjx_nero.learn.pixels.cfg import ENVS, PRESETS, PixelsCfg
-from mjx_nero.learn.pixels.networks import SEEN, SENSED, TRUTH, Student, apply, away, from_meta, init_variables, seen_bytes
+from mjx_nero.learn.pixels.networks import (
+    SEEN,
+    SENSED,
+    TRUTH,
+    Student,
+    apply,
+    away,
+    from_meta,
+    init_variables,
+    seen_bytes,
+    stored,
+)
 from mjx_nero.learn.ppo import learner as ppo
 from mjx_nero.learn.ppo.cfg import fit
 from mjx_nero.types import Key
@@ -160,4 +171,14 @@ def _part(normalizer: Any, names: tuple[str, ...]) -> Any:
 _PACE = "with two cameras of 32 x 32 pixels an NVIDIA H100 makes 10 M steps of 4,096 environments in a minute"
 _HELD = {"[0]": ".normalizer", "[1]": ".params.policy['student']"}
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, envs=ENVS, pace=_PACE, fit=fit, held=_HELD, graph=graph)
+KIND = Kind(
+    make=Learner,
+    presets=PRESETS,
+    policy=from_meta,
+    stored=stored,
+    envs=ENVS,
+    pace=_PACE,
+    fit=fit,
+    held=_HELD,
+    graph=graph,
+)

@@ -8,6 +8,7 @@ import mjx_nero.sim.quiet  # noqa: F401
 # isort: split
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training.acme import running_statistics, specs
 from flax import linen
 
@@ -82,6 +83,17 @@ def apply(net: Student, params: tuple[Any, Any], obs: Observation) -> tuple[jax.
     sensed = running_statistics.normalize(obs[SENSED], of_sensed, max_abs_value=MOST)
     found: Any = net.apply(variables, sensed, obs[SEEN])
     return found
+
+
+def stored(params: tuple[Any, Any], meta: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Returns parameters as a file holds them: those of the convolutions in the number format in which they compute."""
+    normalizer, variables = params
+    kind = jnp.dtype(meta["student"]["precision"])
+    layers = {
+        name: jax.tree.map(lambda x: np.asarray(x).astype(kind), layer) if name.startswith("eye_") else layer
+        for name, layer in variables["params"].items()
+    }
+    return normalizer, {**variables, "params": layers}
 
 
 def away(where: jax.Array, truth: jax.Array, normalizer: Any) -> tuple[jax.Array, jax.Array]:
