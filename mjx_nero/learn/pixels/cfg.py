@@ -25,7 +25,7 @@ class StudentCfg:
     """
 
     channels: tuple[int, ...] = (32, 64, 64, 64)
-    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 64
+    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 128
     layers: tuple[int, ...] = (256, 128)
     precision: Annotated[str, OneOf("bfloat16", "float32")] = "bfloat16"
 
