@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
@@ -114,18 +114,14 @@ class GraspThing(PickUp):
         seen = view.objects[self.cfg.object]
         return jnp.linalg.norm(view.ee_pos_w - seen.pos_w - math.rotate(seen.quat_w, memory.middle))
 
-    def again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
-        """Plans again for a lost thing, turning the hand as little as possible, without a search."""
+    def again(self, memory: PickUpMemory, view: View) -> PickUpMemory:
         assert isinstance(memory, GraspThingMemory)
         middles, angles, gaps, costs = self._ways(view)
         off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
         best = jnp.argmin(jnp.abs(off) + _COST_COUNTS * costs)
         yaw = memory.yaw + off[best]
-        pick = self._over(view, middles[best], yaw, gaps[best])
-        above = self.ik.local(pick + self._up, self.hand(yaw), memory.above).q
-        new = {"pick": pick, "yaw": yaw, "above": above, "opened": self._open(gaps[best])}
-        new["middle"] = self._local(view, middles[best])
-        return dataclasses.replace(memory, **{name: jnp.where(lost, new[name], getattr(memory, name)) for name in new})
+        pick, middle = self._over(view, middles[best], yaw, gaps[best]), self._local(view, middles[best])
+        return dataclasses.replace(memory, pick=pick, yaw=yaw, opened=self._open(gaps[best]), middle=middle)
 
     def _ways(self, view: View) -> tuple[Array, Array, Array, Array]:
         """Middles of the pads in the world, turns of the hand, gaps and costs of all grasps that fit the thing's resting pose."""

@@ -147,7 +147,32 @@ class InverseKinematics:
         """``solve`` for many poses at once. Faster than ``vmap``: the starts go to the poses that are still unsolved."""
         return self._solve(pos, quat, q0, key, self.cfg.restarts, self.cfg.orientation_weight)
 
-    def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int, weight: Array) -> Solution:
+    def each(
+        self, pos: Float[Array, "m 3"], quat: Float[Array, "m 4"], q0: Float[Array, "m nj"], weight: Array | None = None
+    ) -> Solution:
+        """Solves a few poses as ``local`` does, one after another. They share one solver, which compiles faster than several.
+
+        Args:
+            weight: orientation weights [m/rad], one per pose; None: the config's.
+        """
+        weight = jnp.full(len(pos), self.cfg.orientation_weight) if weight is None else weight
+        return jax.lax.map(lambda one: self.local(*one), (pos, quat, q0, weight))
+
+    def solve_path(self, pos: Float[Array, "m b 3"], quat: Float[Array, "m b 4"], q0: Float[Array, "b nj"], key: Key) -> Solution:
+        """Solves b paths of m poses: the first poses as ``solve_batch`` does, each later one only from the one before.
+
+        All steps of the paths share one solver.
+        """
+        restarts = np.array([self.cfg.restarts] + [0] * (len(pos) - 1))
+
+        def follow(q, pose):
+            pos, quat, restarts = pose
+            found = self._solved(pos, quat, q, key, restarts if self.cfg.restarts else 0, self.cfg.orientation_weight)
+            return found.q, found
+
+        return jax.lax.scan(follow, q0, (pos, quat, restarts))[1]
+
+    def _solved(self, pos: Array, quat: Array, q0: Array, key: Key, restarts: int | Array, weight: Array) -> Solution:
         # On a GPU the default precision of products is too coarse for kinematics.
         with jax.default_matmul_precision("highest"):
             norm = jnp.linalg.norm(quat, axis=-1)
@@ -157,7 +182,7 @@ class InverseKinematics:
             q0 = self._within(jnp.where(jnp.isfinite(q0), q0, self._center))
             return self._search(_Poses(pos, quat, q0, valid, weight), key, restarts)
 
-    def _search(self, poses: _Poses, key: Key, restarts: int) -> Solution:
+    def _search(self, poses: _Poses, key: Key, restarts: int | Array) -> Solution:
         b, valid = len(poses.pos), poses.valid
         nothing = Solution(poses.q0, jnp.zeros(b, bool), jnp.full(b, jnp.inf), jnp.full(b, jnp.inf))
         found = self._descents(poses.q0, jnp.arange(b), poses, ~valid, nothing)
@@ -174,7 +199,7 @@ class InverseKinematics:
             start = self._starts(jax.random.fold_in(key, restart), *poses.of(target))
             return restart + 1, self._descents(start, target, poses, solved, found)
 
-        if restarts:
+        if not isinstance(restarts, int) or restarts:
             _, found = jax.lax.while_loop(unsolved, again, (0, found))
         return jax.tree.map(lambda x, none: jnp.where(valid.reshape(b, *[1] * (x.ndim - 1)), x, none), found, nothing)
 

@@ -1,6 +1,7 @@
 """Picks an object up from above, with the hand turned to fit it, and holds it at the goal."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -144,9 +145,9 @@ class PickUp:
     ) -> tuple[Float[Array, "n nj"], Float[Array, " n"]]:
         """Returns the joints over each grasp, and the way there from ``q`` [rad]; the way to what is out of reach is longer."""
         starts = jnp.broadcast_to(q, (len(picks), self._n))
-        over = self.ik.solve_batch(picks + self._up, quats, starts, jax.random.PRNGKey(0))
-        low = jax.vmap(self.ik.local)(picks, quats, over.q)
-        return over.q, jnp.linalg.norm(over.q - q, axis=1) + UNREACHABLE * ~(over.success & low.success)
+        path = jnp.stack([picks + self._up, picks]), jnp.stack([quats, quats])
+        found = self.ik.solve_path(*path, starts, jax.random.PRNGKey(0))
+        return found.q[0], jnp.linalg.norm(found.q[0] - q, axis=1) + UNREACHABLE * ~jnp.all(found.success, axis=0)
 
     def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
         """Computes the targets of all drives."""
@@ -162,7 +163,7 @@ class PickUp:
         far = jnp.linalg.norm(way)
         pos = jnp.where(phase == ABOVE, over, memory.pos + way * jnp.minimum(1.0, self.cfg.speed * self.dt / (far + 1e-6)))
         upright = jnp.where(phase == CARRY, min(_HELD, self.cfg.ik.orientation_weight), self.cfg.ik.orientation_weight)
-        found = self.ik.local(pos, self.hand(memory.yaw), memory.q, upright).q
+        found, anew = self.solved(memory, view, pos, self.hand(memory.yaw), upright)
         waits = (phase == DOWN) & (jnp.max(jnp.abs(found - memory.q)) > _BEHIND)
         pos = jnp.where(waits, memory.pos, pos)
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
@@ -179,7 +180,7 @@ class PickUp:
         gripped = jnp.all(view.joint_vel[self._n :] * self._closing <= _STILL * self._closing**2)
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w + held - meant - wanted), arrived, gripped)
         memory = dataclasses.replace(
-            self.again(memory, view, lost | falls),
+            jax.tree.map(functools.partial(jnp.where, lost | falls), anew, memory),
             phase=jnp.where(lost, ABOVE, phase + ended),
             count=jnp.where(lost | ended, 0, memory.count + 1),
             q=q,
@@ -217,15 +218,21 @@ class PickUp:
             False,
         )
 
-    def again(self, memory: PickUpMemory, view: View, lost: Bool[Array, ""]) -> PickUpMemory:
-        """Plans again for a lost object, turning the hand as little as possible, without a search."""
+    def solved(
+        self, memory: PickUpMemory, view: View, pos: Float[Array, "3"], quat: Float[Array, "4"], weight: float | Array
+    ) -> tuple[Float[Array, " nj"], PickUpMemory]:
+        """Solves a pose of the hand from the set-point, and beside it the plan for a lost object: one solver compiles faster."""
+        anew = self.again(memory, view)
+        each = (pos, anew.pick + self._up), (quat, self.hand(anew.yaw)), (memory.q, memory.above)
+        found = self.ik.each(*map(jnp.stack, each), jnp.array([weight, self.cfg.ik.orientation_weight])).q
+        return found[0], dataclasses.replace(anew, above=found[1])
+
+    def again(self, memory: PickUpMemory, view: View) -> PickUpMemory:
+        """Plans again for a lost object, turning the hand as little as possible, without a search. Leaves the joints over it."""
         angles = self._angles(view)
         off = jnp.mod(angles - memory.yaw + jnp.pi, 2 * jnp.pi) - jnp.pi
         yaw = memory.yaw + off[jnp.argmin(jnp.abs(off))]
-        pick = self._pick(view, yaw)
-        new = pick, yaw, self.ik.local(pick + self._up, self.hand(yaw), memory.above).q
-        pick, yaw, above = (jnp.where(lost, a, b) for a, b in zip(new, (memory.pick, memory.yaw, memory.above), strict=True))
-        return dataclasses.replace(memory, pick=pick, yaw=yaw, above=above)
+        return dataclasses.replace(memory, pick=self._pick(view, yaw), yaw=yaw)
 
     @property
     def _up(self) -> Float[Array, "3"]:

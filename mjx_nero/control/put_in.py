@@ -1,6 +1,7 @@
 """Picks an object up and puts it into a hole or over a post, from above. It searches if the hole is not where it should be."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -157,7 +158,8 @@ class PutIn:
         yaw = pick.yaw + jnp.where(steers, turn, 0.0)
         pos, sought = self._position(memory, view, grip, end)
 
-        found = self._pick.ik.local(pos, math.quat_mul(upright, self._pick.hand(yaw)), pick.q).q
+        quat, weight = math.quat_mul(upright, self._pick.hand(yaw)), self._pick.cfg.ik.orientation_weight
+        found, anew = self._pick.solved(pick, view, pos, quat, weight)
         wanted = jnp.where(stage == OPEN, pick.q, found)
         fastest = jnp.where(stage == AWAY, setpoint.FASTEST, self._pick.gentle)
         q, qd = setpoint.follow(pick.q, pick.qd, wanted, jnp.asarray(self._speed), self.dt, fastest)
@@ -168,7 +170,7 @@ class PutIn:
         ended = self._ended(memory, way, off)
         following = jnp.where(lost, PICK, jnp.where(ended, stage + 1, jnp.where(again, OVER, stage)))
         pick = dataclasses.replace(
-            self._pick.again(pick, view, lost),
+            jax.tree.map(functools.partial(jnp.where, lost), anew, pick),
             phase=jnp.where(lost, ABOVE, pick.phase),
             count=jnp.where(lost, 0, pick.count),
             q=q,
