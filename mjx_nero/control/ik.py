@@ -163,11 +163,11 @@ class InverseKinematics:
 
         All steps of the paths share one solver.
         """
-        restarts = np.array([self.cfg.restarts] + [0] * (len(pos) - 1))
+        restarts, weight = np.array([self.cfg.restarts] + [0] * (len(pos) - 1)), jnp.asarray(self.cfg.orientation_weight)
 
         def follow(q, pose):
             pos, quat, restarts = pose
-            found = self._solved(pos, quat, q, key, restarts if self.cfg.restarts else 0, self.cfg.orientation_weight)
+            found = self._solved(pos, quat, q, key, restarts if self.cfg.restarts else 0, weight)
             return found.q, found
 
         return jax.lax.scan(follow, q0, (pos, quat, restarts))[1]

@@ -181,6 +181,24 @@ def test_local_never_restarts(arm):
     assert np.mean(same[alone.success]) > 0.98
 
 
+def test_a_path_goes_from_pose_to_pose_and_each_pose_stands_alone():
+    """A path's first poses are found with restarts, its later ones only from the ones before, as ``local`` finds them."""
+    solver = ik.InverseKinematics(NERO, cfg=ik.IkCfg(restarts=2))
+    q = np.random.default_rng(3).uniform(-0.2, 0.2, (2, 3, len(NERO.arm.joints))).astype(np.float32) + np.array(
+        NERO.arm.home, np.float32
+    )
+    pos, quat = (x[..., 0, :] for x in jax.vmap(jax.vmap(solver.chain.poses))(jnp.asarray(q)))
+    home, key = jnp.tile(jnp.array(NERO.arm.home), (3, 1)), jax.random.PRNGKey(0)
+    path = jax.jit(solver.solve_path)(pos, quat, home, key)
+    first = jax.jit(solver.solve_batch)(pos[0], quat[0], home, key)
+    second = jax.jit(solver.each)(pos[1], quat[1], first.q)
+    third = jax.jit(jax.vmap(solver.local))(pos[1], quat[1], first.q)
+    assert first.success.any() and second.success.any()
+    for found in (second, third):
+        np.testing.assert_array_equal(path.success, [first.success, found.success])
+        np.testing.assert_allclose(path.q[:, found.success], jnp.stack([first.q, found.q])[:, found.success], atol=2e-3)
+
+
 def test_a_hand_that_cannot_be_turned_so_still_has_its_point_in_place():
     """Five joints, and poses turned by 0.4 rad from ones that they meet: by its frame alone the point is 3 mm beside."""
     arm, point = Arm(SO_ARM100), (0.02, 0.0, 0.0)
