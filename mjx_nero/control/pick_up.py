@@ -224,7 +224,8 @@ class PickUp:
         """Solves a pose of the hand from the set-point, and beside it the plan for a lost object: one solver compiles faster."""
         anew = self.again(memory, view)
         each = (pos, anew.pick + self._up), (quat, self.hand(anew.yaw)), (memory.q, memory.above)
-        found = self.ik.each(*map(jnp.stack, each), jnp.array([weight, self.cfg.ik.orientation_weight])).q
+        poses, quats, starts = map(jnp.stack, each)
+        found = self.ik.each(poses, quats, starts, jnp.array([weight, self.cfg.ik.orientation_weight])).q
         return found[0], dataclasses.replace(anew, above=found[1])
 
     def again(self, memory: PickUpMemory, view: View) -> PickUpMemory:
