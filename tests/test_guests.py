@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import pytest
 
-from mjx_nero import UserError, list_envs, make, register
+from mjx_nero import UserError, env_cfg, list_envs, list_presets, make, register
 from mjx_nero.sim import physics
 from mjx_nero.sim.physics import Footprint
 from mjx_nero.tasks import registry
@@ -97,6 +97,11 @@ def test_fields_of_a_guest_are_overridden_by_dotted_name(drag):
         ("1 +\n", r"^cannot load .*guest.py: SyntaxError: invalid syntax \(guest.py, line 1\)$"),
         ("import mjx_nero\nmjx_nero.register(envs={'nero_lift': (None, {'a': len})})\n", "there is already an env 'nero_lift'"),
         ("import mjx_nero\nmjx_nero.register(envs={'new': (None, {})})\n", "the environment 'new' has no preset"),
+        (
+            "import mjx_nero\nfrom mjx_nero.learn.learner import Kind\n"
+            "mjx_nero.register(learners={'new': Kind(make=None, presets={'mine': 1}, policy=None)})\n",
+            "the learner 'new' has no preset 'default'",
+        ),
         ("import mjx_nero\nmjx_nero.register(controllers={'ik': (None, None)})\n", "there is already a controller 'ik'"),
         ("import mjx_nero\nmjx_nero.register(physics_backends={'jax': None})\n", "there is already a physics 'jax'"),
     ],
@@ -107,6 +112,13 @@ def test_what_a_guest_does_wrong_is_one_line(call, tmp_path, text, message):
     code, _, err = call("mjx_nero", "list-envs", "--load", path)
     assert code == 2 and err.count("\n") == 1
     assert re.search(message, err.removeprefix("error: ").strip())
+
+
+def test_an_environment_without_a_preset_default_takes_its_first():
+    robot, presets = registry.ENVS["nero_reach"]
+    register(envs={"env_of_others": (robot, {"still": presets["isaac"], "moving": presets["default"]})})
+    assert list_presets("env_of_others") == ("default", "still", "moving")
+    assert env_cfg("env_of_others") == env_cfg("nero_reach", "isaac") != env_cfg("nero_reach")
 
 
 def test_a_guest_that_is_not_there_is_one_line(call, tmp_path):

@@ -31,7 +31,7 @@ def register(
         learners: name -> learner, for ``--learner``.
 
     Raises:
-        UserError: a name is taken.
+        UserError: a name is taken, or an environment or a learner lacks a preset.
     """
     for robot in robots:
         registry.ROBOTS.add(robot.name, robot)
@@ -42,4 +42,4 @@ def register(
     for name, backend in (physics_backends or {}).items():
         physics.BACKENDS.add(name, backend)
     for name, kind in (learners or {}).items():
-        learner.KINDS.add(name, kind)
+        learner.add(name, kind)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from mjx_nero import config
 from mjx_nero.config.registry import Registry
+from mjx_nero.errors import UserError
 
 if TYPE_CHECKING:
     import jax
@@ -134,6 +135,17 @@ _OWN = {
     "pixels": "mjx_nero.learn.pixels",
 }
 KINDS: Registry[Kind | str] = Registry("learner", _OWN)
+
+
+def add(name: str, kind: Kind) -> None:
+    """Adds a learner.
+
+    Raises:
+        UserError: the name is taken, or the learner has no config for presets that it does not name.
+    """
+    if "default" not in kind.presets:
+        raise UserError(f"the learner {name!r} has no preset 'default': give it the config for presets that it does not name")
+    KINDS.add(name, kind)
 
 
 def names() -> tuple[str, ...]:

@@ -29,12 +29,14 @@ ENVS = Registry("env", {**_OWN, **fitted.ENVS})  # with those for any robot that
 def add_env(name: str, robot: RobotCfg | None, presets: Presets) -> None:
     """Adds an environment: its robot (None: for any) and its presets, the default first.
 
+    Every environment has a preset ``default``, which commands take if none is named. If none has that name, it is the first.
+
     Raises:
         UserError: the name is taken, or there is no preset.
     """
     if not presets:
         raise UserError(f"the environment {name!r} has no preset: give at least one")
-    ENVS.add(name, (robot, presets))
+    ENVS.add(name, (robot, {"default": next(iter(presets.values())), **presets}))
 
 
 def list_envs() -> tuple[str, ...]:
