@@ -9,7 +9,6 @@ names. ``fovy`` is the vertical field of view of the whole picture [deg]. The po
 training.
 """
 
-import json
 import math
 import pathlib
 import threading
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.deploy.arm import Feedback
 from mjx_nero.deploy.places import Lost
 from mjx_nero.errors import UserError
@@ -49,11 +49,11 @@ def opened(source: int | str, period: float = 0.0) -> Source:
 
     path = pathlib.Path(source) if isinstance(source, str) else None
     if path and path.is_dir():
-        files = iter(sorted(each for each in path.iterdir() if each.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp")))
+        found = iter(sorted(each for each in path.iterdir() if each.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp")))
 
         def shown() -> np.ndarray | None:
             time.sleep(period)
-            return cv2.imread(str(each)) if (each := next(files, None)) else None
+            return cv2.imread(str(each)) if (each := next(found, None)) else None
 
         return shown, lambda: None
     capture = cv2.VideoCapture(source)
@@ -198,16 +198,12 @@ def read(path: pathlib.Path, told: Mapping[str, Any]) -> dict[str, tuple[int | s
     Raises:
         UserError: the file does not exist, or is invalid.
     """
+    found = files.read_json(path)
     try:
-        text = path.read_bytes()[:100_000]
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    try:
-        found = json.loads(text)
         if set(found) != set(told):
             raise ValueError
         return {name: _camera(found[name], told[name]) for name in told}
-    except (TypeError, KeyError, ValueError, AttributeError, RecursionError):
+    except (TypeError, KeyError, ValueError, AttributeError):
         wanted = 'must be JSON with a "camera", and optionally its "fovy" in degrees, for each of'
         raise UserError(f"{path} {wanted} {', '.join(told)}") from None
 

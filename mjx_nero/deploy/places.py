@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.errors import UserError
 
 LONGEST = 4096  # maximum bytes of a message
@@ -135,18 +136,17 @@ class FromFile(Known):
     def __init__(self, path: pathlib.Path):
         super().__init__()
         self._path, self._stamp = path, -1
+        content = files.read_bytes(path, LONGEST)
         try:
-            parse(path.read_bytes())
-        except OSError as error:
-            raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+            parse(content)
         except ValueError as error:
             raise UserError(f"{path} does not hold the position of an object: {error}") from None
 
     def find(self, name: str, now: float) -> Place:
         """See ``Places``."""
-        with contextlib.suppress(OSError):  # it is being replaced
+        with contextlib.suppress(OSError, UserError):  # it is being replaced
             if (stamp := self._path.stat().st_mtime_ns) != self._stamp:
-                self.say(self._path.read_bytes(), now)
+                self.say(files.read_bytes(self._path, LONGEST), now)
                 self._stamp = stamp
         return super().find(name, now)
 

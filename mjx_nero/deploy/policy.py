@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.deploy.executor import Executor, Joints, numbers
+from mjx_nero.errors import UserError
 
+MAX_BYTES = 100_000_000
 MAX_TEXT = 1_000_000  # maximum characters of the metadata
 MOST_PIXELS = 2048  # maximum edge of a picture
 
@@ -26,7 +29,7 @@ class Policy:
         actions: size of an action.
 
     Raises:
-        ValueError: the file's metadata are not what ``export`` writes; one line.
+        UserError: the file cannot be read, or is not what ``export`` writes.
     """
 
     def __init__(self, path: pathlib.Path | str):
@@ -34,14 +37,26 @@ class Policy:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        content = files.read_bytes(pathlib.Path(path), MAX_BYTES)
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            self._describe()
+        except Exception as error:  # ONNX Runtime has its own kinds, and tells how a network was cut by any of Python's
+            raise UserError(f"{path} is not a policy written by export, or it is damaged: {error}") from None
+        self.reset()
+
+    def _describe(self) -> None:
+        """Reads the metadata.
+
+        Raises:
+            Exception: they are not what ``export`` writes.
+        """
         self.metadata = _read(self._session.get_modelmeta().custom_metadata_map)
         (taken, *seen), (given,) = self._session.get_inputs(), self._session.get_outputs()
         self.cameras = _cameras(self.metadata, {each.name: tuple(each.shape[1:]) for each in seen})
         _check(self.metadata, taken.shape[-1], given.shape[-1])
         self.names = tuple(term["name"] for term in self.metadata["observations"])
         self.actions = int(given.shape[-1])
-        self.reset()
 
     def reset(self) -> None:
         """Forgets the observations of the previous episode."""

@@ -13,7 +13,6 @@ the pose of the object's center in the tag's frame: x to the right and y down as
 
 import contextlib
 import dataclasses
-import json
 import pathlib
 import threading
 import time
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.deploy.body import matrix, transform
 from mjx_nero.deploy.places import FRESH, Known, Lost, Place
 from mjx_nero.errors import UserError
@@ -58,8 +58,8 @@ def read(path: pathlib.Path) -> Camera | None:
         UserError: the file has a ``camera``, but something else is wrong.
     """
     try:
-        found = json.loads(path.read_bytes()[:100_000])
-    except (OSError, ValueError, RecursionError):
+        found = files.read_json(path)
+    except UserError:
         return None
     if not isinstance(found, Mapping) or "camera" not in found:
         return None

@@ -128,7 +128,7 @@ def test_a_file_is_read_again_when_it_changes(tmp_path):
     assert source.find("ball", 0.0).position[0] == 0.25
     with pytest.raises(UserError, match="does not hold the position of an object: not JSON"):
         places.of(str(path))
-    with pytest.raises(UserError, match="cannot read"):
+    with pytest.raises(UserError, match="there is no file"):
         places.of(str(tmp_path / "none.json"))
 
 

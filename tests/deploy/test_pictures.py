@@ -98,5 +98,5 @@ def test_a_file_says_what_each_camera_is(tmp_path):
     assert pictures.read(tmp_path / "c.json", TOLD) == {"front": ("/dev/video2", 60.0)}
     (tmp_path / "c.json").write_text(json.dumps({"front": {"camera": 1}}))
     assert pictures.read(tmp_path / "c.json", TOLD) == {"front": (1, 45.0)}
-    with pytest.raises(UserError, match="cannot read"):
+    with pytest.raises(UserError, match="there is no file"):
         pictures.read(tmp_path / "none.json", TOLD)

@@ -12,7 +12,6 @@ a gripper from 0 (closed) to 100 (open). If an arm differs, ``--calibration`` is
 
 import contextlib
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.deploy.arm import ArmError, Clock, Feedback
 from mjx_nero.errors import UserError
 
@@ -46,12 +46,10 @@ def motors_of(metadata: Mapping[str, Any], path: pathlib.Path | None) -> list[Mo
             grips = name in metadata["gripper"]
             out.append(Motor(name, (high - low) / 100, low) if grips else Motor(name, math.pi / 180, 0.0))
         return out
+    found = files.read_json(path)
     try:
-        found = json.loads(path.read_bytes()[:100_000])
         made = [Motor(str(found[j]["motor"]), float(found[j]["scale"]), float(found[j]["offset"])) for j in own["names"]]
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         raise UserError(f"{path} needs motor, scale and offset for each of {', '.join(own['names'])}") from None
     if not all(math.isfinite(m.scale) and math.isfinite(m.offset) and m.scale for m in made):
         raise UserError(f"{path}: scale takes a finite number other than 0, and offset a finite number")

@@ -6,13 +6,13 @@ middle is taken as the middle of the model's range.
 """
 
 import dataclasses
-import json
 import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from mjx_nero import files
 from mjx_nero.deploy.arm import ArmError, Clock, Feedback
 from mjx_nero.deploy.drivers import feetech
 from mjx_nero.errors import UserError
@@ -39,16 +39,13 @@ def read_calibration(path: pathlib.Path, joints: tuple[str, ...]) -> dict[str, S
     Raises:
         UserError: it does not exist, or is for another arm.
     """
+    found = files.read_json(path)
     try:
-        text = path.read_bytes()[:100_000]
-        found = json.loads(text)
         if missing := [name for name in joints if name not in found]:
             raise UserError(f"{path} has no joint {', '.join(missing)}: it has {', '.join(map(str, found))[:200]}")
         out = {name: Servo(*(_count(found[name][field]) for field in FIELDS)) for name in joints}
         driven = {name: _count(found[name].get("drive_mode", 0)) for name in joints}
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path} is not a calibration file of LeRobot: each joint needs {', '.join(FIELDS)}") from None

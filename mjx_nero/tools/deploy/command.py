@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from mjx_nero import files
 from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import drivers
 from mjx_nero.deploy.arm import ArmError
@@ -89,13 +88,7 @@ def _brain(args: argparse.Namespace) -> Any:
     from mjx_nero.deploy import setup
     from mjx_nero.deploy.loop import Brain
 
-    files.read_bytes(args.policy, 100_000_000)
-    try:
-        brain = Brain(args.policy)
-    except ModuleNotFoundError:
-        raise
-    except Exception as error:  # ONNX Runtime has its own kinds
-        raise UserError(f"{args.policy} is not a policy written by export: {error}") from None
+    brain = Brain(args.policy)
     setup.check(brain.metadata)
     drivers.check(args.arm, brain.metadata)
     brain.warm()
