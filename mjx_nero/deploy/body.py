@@ -193,6 +193,11 @@ class Body:
             quat = product(quat, turn if joint < 0 else np.append(np.cos(half[joint]), np.sin(half[joint]) * turn))
         return (self.forward(q)[0, node] @ fixed)[:3, 3], quat
 
+    def hands(self, q: np.ndarray) -> np.ndarray:
+        """Computes the end effector's positions in the world [k, 3] [m]."""
+        node, fixed = self._ee
+        return (self.forward(q)[:, node] @ fixed)[:, :3, 3]
+
     def shapes(self, q: np.ndarray) -> np.ndarray:
         """Computes the frames of all shapes [k, shapes, 4, 4]."""
         return self.forward(q)[:, self._owner] @ self._frames

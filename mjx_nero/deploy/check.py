@@ -17,6 +17,7 @@ from mjx_nero.deploy.guard import Guarded
 from mjx_nero.deploy.loop import Stop
 from mjx_nero.deploy.safety import Fault, Limits
 
+MARK = "# From deploy --check on a "  # begins the file that ``yaml_of`` makes
 ANGLE, SHARE = 0.1, 0.2  # size of a move [rad]; share of the speeds
 SLIDE = 0.02  # size of a move of a slide [m]
 _REST, _SAMPLE = 0.4, 0.005  # time at rest at each end; time between readings [s]
@@ -187,7 +188,7 @@ def yaml_of(robot: str, found: list[Joint], arm: Sequence[str]) -> str:
     delays = sorted(joint.delay for joint in mine)
     middle = delays[len(delays) // 2]
     lines = [
-        f"# From deploy --check on a {robot}: offsets [rad or m], and the delay [s], which includes the drives' own.",
+        f"{MARK}{robot}: offsets [rad or m], and the delay [s], which includes the drives' own.",
         f"robot: {robot}",
         f"delay: {{value: {middle:.4f}, low: {delays[0]:.4f}, high: {delays[-1]:.4f}}}",
         "joints:",

@@ -1,7 +1,7 @@
 """Makes the safety layer of an arm from the metadata of an exported policy."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ Ranges = tuple[np.ndarray, np.ndarray]
 USUAL, USUAL_FENCE = SafetyCfg(), FenceCfg()
 _FAR, _FAST, _SLOW = 20.0, 12.0, 0.2  # [rad or m], [rad/s or m/s], [s]: larger values are a mistake or an attack
 NEEDED = ("env", "preset", "robot", "control_dt", "observations", "joints", "gripper", "base", "body", "command", "objects")
+NEAR, POSTURES = 0.15, 10_000  # how near to a goal some of so many postures come [m]
 MOST = {"bodies": 150, "shapes": 150, "couplings": 100}  # the fence compares all pairs of shapes
 
 
@@ -73,6 +74,25 @@ def safety_of(
         fence = dataclasses.replace(fence, box=room_for(metadata, body, fence.room))
     arm = tuple(name for name, mine in zip(limits.names, limits.arm, strict=True) if mine)
     return Safety(limits, Fence(body, arm, limits.home, (limits.lower, limits.upper), fence), cfg)
+
+
+def check_reach(metadata: Mapping[str, Any], body: Body, flag: str, point: Sequence[float], table: float = 0.0) -> None:
+    """Checks that the hand can come near a point, by random postures that keep it above the table.
+
+    Args:
+        flag: names the point in the message.
+        point: position in the robot's root frame [m].
+        table: height of the table top in the world [m].
+
+    Raises:
+        UserError: no posture brings the hand within ``NEAR``.
+    """
+    own, where = Joints.of(metadata), np.asarray(point, float) + body.base
+    hands = body.hands(np.random.default_rng(0).uniform(own.lower, own.upper, (POSTURES, len(own.names))))
+    above = hands[hands[:, 2] > table]
+    least = float(np.linalg.norm((above if len(above) else hands) - where, axis=1).min())
+    if not least <= NEAR:
+        raise UserError(f"{flag} is out of reach: the hand of {metadata['robot']} comes no nearer to it than {least:.2f} m")
 
 
 def room_for(metadata: Mapping[str, Any], body: Body, room: float) -> Box:

@@ -49,6 +49,7 @@ from mjx_nero.types import (
 
 MAX_SPEED = 1e3  # [rad/s, m/s] beyond it the physics has diverged, even if it is still finite
 _LONGEST = 1_000_000  # control steps of an episode
+_SLACK = 1e-3  # of a home beyond its joint's range, as written with fewer digits [rad or m]
 # Folded into an episode's key, so that a draw of one part does not change those of the others.
 _FIELDS, _MEMORY, _SENSORS, _FOLLOWING, _VISITED, _LOOK = 0xF1E1D5, 0x3E3087, 0x5E4504, 0xF0110E, 0x715173D, 0x1004
 
@@ -128,6 +129,10 @@ class ManipulationEnv(Env):
             open, close = (getattr(cfg, end, cfg.home) for end in ("open", "close"))
             home, speed, open, close, lag = (np.array(x, np.float32) for x in (cfg.home, cfg.speed, open, close, cfg.lead))
             low, high = self._range[:, own]
+            out = (low < high) & ((home < low - _SLACK) | (home > high + _SLACK))
+            if out.any():
+                i = int(np.argmax(out))
+                raise UserError(f"home of {cfg.joints[i]} is {home[i]:g}, outside of its range from {low[i]:g} to {high[i]:g}")
             groups[name] = Drives(home, low, high, speed, open, close, lag, self.dt, cfg.joints)
         return groups
 

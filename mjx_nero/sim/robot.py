@@ -117,9 +117,9 @@ class RobotCfg:
     max_step: NonNegative = 0.0
     workspace: Box | None = None
     floor: float = 0.0
-    opening: float = 0.0
+    opening: NonNegative = 0.0
     closed: NonNegative = 0.0
-    pad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pad: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     grip: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pick: Box | None = None
     lean: NonNegative = 0.0

@@ -3,9 +3,13 @@
 import copy
 import itertools
 
+import arms
+import pytest
+
 from mjx_nero import UserError
 from mjx_nero.deploy import loop, policy, setup
 from mjx_nero.deploy.loop import Brain
+from mjx_nero.tasks import registry
 
 ODD = (None, True, 3, -1, 0, 1e300, float("nan"), "x", "", [], [None], [[1.0]], {}, {"x": 1}, 10**9, [0.0, 0.0, 0.0], [0.0] * 4)
 
@@ -83,3 +87,11 @@ def test_too_many_shapes(lift, told):
 def test_an_arm_that_calls_itself_a_gripper(lift, told):
     """A gripper's joints may be blocked and press; an arm's may not."""
     assert "all joints" in tried(Brain(lift / "policy.onnx"), {**told, "gripper": told["joints"]["names"]})
+
+
+@pytest.mark.parametrize("env", ["nero_lift", "cobotta_reach", "so100_lift", "so101_reach", "piper_reach"])
+def test_every_corner_of_a_tasks_own_region_is_within_reach(env):
+    cfg = registry.env_cfg(env)
+    told = arms.metadata(cfg.robot.name)
+    for corner in itertools.product(*(cfg.command.params[axis] for axis in "xyz")):
+        setup.check_reach(told, setup.body_of(told), "--goal", corner)

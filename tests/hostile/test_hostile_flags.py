@@ -46,6 +46,8 @@ FLAGS = {
     "robot without a name": f"{EVAL} --env.robot.name=",
     "fewer joints than gains": f"{EVAL} --env.robot.arm.joints (joint1,)",
     "a joint twice": f"{EVAL} --env.robot.gripper.joints (joint1,joint2)",
+    "home out of a joint's range": f"{EVAL} --env.robot.arm.home (9,0,0,0,0,0,0)",
+    "negative opening": f"{EVAL} --env.robot.opening -1",
     "no way down": f"{EVAL} --env.robot.down (0,0,0,0)",
     "a policy and another agent": f"{EVAL} --policy p --agent zero",
     "a scale of no object": "inspect nero --scale 2",

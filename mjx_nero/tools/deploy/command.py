@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 from mjx_nero.config.bounds import Bounds
-from mjx_nero.deploy import drivers
+from mjx_nero.deploy import check, drivers
 from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.pictures import summary
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import arms
 
+NOTE = ", policy "  # of the note in a log's head
 FAULT = 3  # exit status of a run that ended in a fault
 
 
@@ -68,10 +69,10 @@ def _parser() -> cli.Parser:
     add("--go-home", action="store_true", help="first move the arm home, slowly, in a straight line in joint space")
     add("--dry-run", action="store_true", help="read the arm and show what would be sent, but send nothing")
     text = "instead of running the policy, move each joint a little, ask what you saw, and write offsets and delay"
-    add("--check", type=cli.output(".yaml", ".yml", marks=("offset:",)), metavar="FILE", help=text)
+    add("--check", type=cli.output(".yaml", ".yml", marks=(check.MARK,)), metavar="FILE", help=text)
     add(
         "--log",
-        type=cli.output(".csv", marks=("target.",)),
+        type=cli.output(".csv", marks=(NOTE,)),
         help="write a table of everything read and sent, which identify reads",
     )
     add("--alive", type=cli.path(), metavar="FILE", help="hold unless this file is touched at least every half second")
@@ -95,6 +96,14 @@ def _brain(args: argparse.Namespace) -> Any:
     return brain
 
 
+def _point(text: str | None) -> list[float] | None:
+    """Returns the position in a flag that starts with three numbers; None: it names something else."""
+    with contextlib.suppress(ValueError):
+        x, y, z = (float(part) for part in (text or "").split(",")[:3])
+        return [x, y, z]
+    return None
+
+
 def _run(args: argparse.Namespace) -> bool:
     """Runs the policy or the check; returns whether it ended in a fault."""
     from mjx_nero.deploy import setup
@@ -114,11 +123,15 @@ def _run(args: argparse.Namespace) -> bool:
     with contextlib.ExitStack() as stack:
         places, options = stack.enter_context(places_and_options(args, metadata))
         pictures = stack.enter_context(pictures_of(args, metadata, places))
-        observer: Any = Observer(metadata, setup.body_of(metadata), goal, places, pictures)
+        body = setup.body_of(metadata)
+        observer: Any = Observer(metadata, body, goal, places, pictures)
+        for flag, text in (("--goal", args.goal), ("--object", args.object)):
+            if point := _point(text):
+                setup.check_reach(metadata, body, flag, point, args.table)
         if simulated := args.arm == "sim" or args.emulate:
             observer = Witness(observer, places, scene_of(args, metadata), metadata["joints"]["names"])
         arms.warn(args)
-        note = f"{metadata['env']} on {args.arm}{' (emulated)' if args.emulate else ''}, policy {args.policy.name}"
+        note = f"{metadata['env']} on {args.arm}{' (emulated)' if args.emulate else ''}{NOTE}{args.policy.name}"
         spec, delay = arms.spec(args, metadata, options, args.log, note)
         remote = Remote(spec)
         stack.callback(remote.close)

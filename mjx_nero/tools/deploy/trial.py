@@ -3,9 +3,9 @@
 import pathlib
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from mjx_nero import identify
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.emulators import timeless
 from mjx_nero.deploy.emulators.eyes import Eyes
@@ -16,11 +16,11 @@ from mjx_nero.deploy.loop import Brain, run
 from mjx_nero.deploy.observe import Observer, no_pictures
 from mjx_nero.deploy.safety import Fault
 from mjx_nero.envs.task import EnvCfg
+from mjx_nero.identify import Drives
 from mjx_nero.identify.excitation import sweeps
 from mjx_nero.identify.log import ROBOT
 from mjx_nero.sim import scene
 from mjx_nero.sim.robot import RobotCfg
-from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools.identification.arm import metadata_of, play
 
 _NEAR = 0.02  # distance to the goal that counts as success [m]
@@ -72,12 +72,18 @@ def lifts(
     return good / episodes, ended
 
 
-def recorded(path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, seconds: float) -> dict[str, int]:
-    """Logs an emulated arm during identification's movement; returns how often each limit was reached."""
+def recorded(
+    path: pathlib.Path, robot: RobotCfg, kind: str, faults: Faults, seconds: float, drives: Drives | None = None
+) -> dict[str, int]:
+    """Logs an emulated arm during identification's movement; returns how often each limit was reached.
+
+    Args:
+        drives: the arm's drives; None: the model's own. Their offsets and delay do not count.
+    """
     told, clock, swings = metadata_of(robot), timeless.Clock(), sweeps(robot, seconds)
     targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
-    model: mujoco.MjModel = scene.build(robot, SceneCfg(objects={}), SimCfg(), visuals=False)
-    plant = Plant(model, told["joints"]["names"], targets[0], clock, told["base"]["position"])
+    real = identify.Plant(robot, identify.usual_step(robot))
+    plant = Plant(real.with_drives(drives or real.nominal), told["joints"]["names"], targets[0], clock, told["base"]["position"])
     arm, unplug = timeless.engaged(kind, told, plant, clock)
     plant.faults = faults
     guard: Any = Guard(arm, setup.safety_of(told), clock)

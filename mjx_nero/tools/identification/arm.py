@@ -16,11 +16,13 @@ from mjx_nero.deploy.remote import Remote
 from mjx_nero.deploy.safety import Fault, Limits
 from mjx_nero.deploy.stop import operator
 from mjx_nero.identify.excitation import RATE, sweeps
+from mjx_nero.identify.plant import usual_step
 from mjx_nero.interop import description
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.scene import SceneCfg, SimCfg
 from mjx_nero.tools.deploy import arms
 from mjx_nero.tools.deploy.world import World
+from mjx_nero.tools.identification.report import MOVEMENT
 
 
 def metadata_of(robot: RobotCfg) -> dict[str, Any]:
@@ -58,11 +60,11 @@ def record_arm(args: argparse.Namespace, robot: RobotCfg) -> bool:
     swings = sweeps(robot, args.seconds, args.amplitude)
     targets = np.concatenate([swings, np.tile(robot.gripper.home, (len(swings), 1))], axis=1)
     limits = dataclasses.replace(Limits.of(metadata, arms.safety_of(args)), home=targets[0])
-    world = functools.partial(World, robot, SceneCfg(objects={}), SimCfg(), {})
+    world = functools.partial(World, robot, SceneCfg(objects={}), SimCfg(dt=usual_step(robot)), {})
     with contextlib.ExitStack() as stack:
         options = stack.enter_context(arms.options_of(args, metadata, world))
         arms.warn(args)
-        note = f"{robot.name} by {args.arm}{' (emulated)' if args.emulate else ''}, identification's movement"
+        note = f"{robot.name} by {args.arm}{' (emulated)' if args.emulate else ''}, {MOVEMENT}"
         remote = Remote(arms.spec(args, metadata, options, args.out, note)[0])
         stack.callback(remote.close)
         remote.ready()

@@ -16,7 +16,7 @@ from mjx_nero.runs import console
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import FAULT, arms
-from mjx_nero.tools.identification.report import save, save_plot, table
+from mjx_nero.tools.identification.report import MARK, MOVEMENT, SIMULATED, save, save_plot, table
 
 _ARM = {"port", "gripper", "calibration", "emulate", "identified", "speed", "table", "workspace", "apart", "hottest"}
 _SIMULATED = {"noise", "resolution", "scatter", "offset", "delay", "seed", "rate", "dt"}
@@ -35,7 +35,7 @@ def record_main(argv: Sequence[str]) -> None:
     arms.add_limits(parser)
     parser.add_argument(
         "--out",
-        type=cli.output(".csv", marks=("target.",)),
+        type=cli.output(".csv", marks=(SIMULATED, MOVEMENT)),
         required=True,
         help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
@@ -57,7 +57,7 @@ def record_main(argv: Sequence[str]) -> None:
     log, truth = record(plant, cfg)
     notes = [
         f"{logs.ROBOT}{plant.robot.name}",
-        "simulated; its parameters:",
+        SIMULATED,
         *(f"{name}: {value}" for name, value in _plain(truth).items()),
     ]
     logs.write(args.out, log, plant.robot.arm.joints, notes)
@@ -93,7 +93,7 @@ def identify_main(argv: Sequence[str]) -> None:
     _add_robot(parser)
     parser.add_argument(
         "--out",
-        type=cli.output(".yaml", ".yml", marks=("offset:",)),
+        type=cli.output(".yaml", ".yml", marks=(MARK,)),
         help="write the drives as YAML, for make(identified=...) and --env.identified",
     )
     parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the remaining error")

@@ -13,8 +13,10 @@ from mjx_nero.identify.log import Log
 from mjx_nero.identify.plant import POSITIVE, Drives
 from mjx_nero.runs.console import Table
 
-_HEAD = """\
-# Drives of {robot}, identified from {log}: values with 95% intervals if the arm follows the equation of identify.
+SIMULATED, MOVEMENT = "simulated; its parameters:", "identification's movement"  # notes in the heads of logs
+MARK = ", identified from "  # in the head of the file that ``save`` writes
+_HEAD = f"""\
+# Drives of {{robot}}{MARK}{{log}}: values with 95% intervals if the arm follows the equation of identify.
 # For make(identified=FILE) and --env.identified FILE.
 # stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], armature [kg m2 or kg], friction [N m or N], delay [s];
 # offset [rad or m]: encoder reading minus joint position, to be subtracted on the real arm.

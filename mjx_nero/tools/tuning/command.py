@@ -9,7 +9,7 @@ from mjx_nero.sim.scene import SimCfg
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.tuning.proposal import tune
-from mjx_nero.tools.tuning.report import save_gains, save_plot, table
+from mjx_nero.tools.tuning.report import MARK, save_gains, save_plot, table
 
 
 def main(argv: Sequence[str]) -> None:
@@ -20,7 +20,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_load()
     parser.add_argument("--robot", required=True, help="name of a robot, or folder of an imported one")
     parser.add_argument(
-        "--out", type=cli.output(".yaml", ".yml", marks=("effort:",)), help="write the gains as YAML, for import-urdf --gains"
+        "--out", type=cli.output(".yaml", ".yml", marks=(MARK,)), help="write the gains as YAML, for import-urdf --gains"
     )
     parser.add_argument("--plot", type=cli.output(".png", ".pdf", ".svg"), help="write a picture of the step responses")
     parser.add_argument(

@@ -10,6 +10,8 @@ from mjx_nero.identify.response import SECONDS
 from mjx_nero.runs.console import Table
 from mjx_nero.tools.tuning.proposal import Tuning, gains
 
+MARK = ": stiffness [N m/rad"  # in the head of the file that ``save_gains`` writes
+
 
 def table(tuning: Tuning) -> tuple[Table, Table]:
     """Makes tables of the gains and of the step responses, before -> after."""
@@ -80,6 +82,6 @@ def save_plot(tuning: Tuning, path: pathlib.Path) -> None:
 
 def save_gains(tuning: Tuning, path: pathlib.Path) -> None:
     """Writes the proposed gains as YAML."""
-    units = "stiffness [N m/rad or N/m], damping [N m s/rad or N s/m], effort [N m or N], speed [rad/s or m/s]"
-    text = f"# Drives of {tuning.robot.name}: {units}\n{yaml.safe_dump(gains(tuning.tuned), sort_keys=False)}"
+    units = " or N/m], damping [N m s/rad or N s/m], effort [N m or N], speed [rad/s or m/s]"
+    text = f"# Drives of {tuning.robot.name}{MARK}{units}\n{yaml.safe_dump(gains(tuning.tuned), sort_keys=False)}"
     files.write(path, text.encode())
