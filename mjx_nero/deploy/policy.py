@@ -33,11 +33,11 @@ class Policy:
     """
 
     def __init__(self, path: pathlib.Path | str):
-        import onnxruntime  # of the extra ``onnx``
+        content = files.read_bytes(pathlib.Path(path), MAX_BYTES)
+        import onnxruntime  # of the extra ``onnx``; writes to the user's folders as it starts
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        content = files.read_bytes(pathlib.Path(path), MAX_BYTES)
         try:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             self._describe()
