@@ -248,3 +248,15 @@ def test_intervals_count_the_error_of_the_physics_step():
     log, _ = record(Plant(stiff(), 0.0003125), RecordCfg(seconds=12.0, noise=1e-4, resolution=1e-4, scatter=1.2, delay=0.02))
     fit = identify(Plant(stiff(), 0.005), log)
     assert ((fit.high.stiffness - fit.drives.stiffness) / fit.drives.stiffness > 0.01).all()
+
+
+@pytest.mark.parametrize(("noise", "factor"), [(0.0, fitting._ALIKE), (2e-3, 1.0)])
+def test_intervals_are_wider_where_rounding_is_all_the_noise(noise, factor):
+    """Noise of a count or more makes roundings independent of the motion."""
+    count, times, rng = 1.5e-3, np.arange(2000) / 100, np.random.default_rng(0)
+    path = np.sin(times)[:, None] * [0.5, 0.3]
+    readings = count * np.round((path + noise * rng.standard_normal(path.shape)) / count)
+    log = Log(times[:1], path[:1], times, readings)
+    assert fitting._count(log) == pytest.approx(count, rel=1e-3)
+    assert fitting._alike(log, path - readings) == factor
+    assert fitting._noise(log) == pytest.approx(count / np.sqrt(12), rel=1e-3)
