@@ -312,10 +312,10 @@ def test_degrees_are_lerobots(told):
 
 
 BAD = [
-    ("", "not a calibration file of LeRobot"),
+    ("", "c.json is not JSON"),
     ("[]", "not a calibration file of LeRobot|has no joint"),
     ("{}", "has no joint shoulder_pan"),
-    ('{"id": 1', "not a calibration file of LeRobot"),
+    ('{"id": 1', "c.json is not JSON"),
 ]
 
 
