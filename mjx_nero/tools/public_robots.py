@@ -136,7 +136,7 @@ def _failure(command: str, *words: object) -> str:
 
 def _imported(out: pathlib.Path, folder: pathlib.Path) -> dict[str, Any]:
     """Collects what an import says of the gripper, its warnings and its self-test."""
-    robot, report = files.read_yaml(out / "robot.yaml"), figures(out / "report.json")
+    robot, report = files.read_yaml(out / "robot.yaml"), files.read_json(out / "report.json")
     return {
         "gripper": list(robot["gripper"] or ()),
         "opening": robot["opening"],

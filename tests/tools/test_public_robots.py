@@ -66,6 +66,14 @@ def test_a_robot_that_fails_stands_in_the_table_with_its_reason(tmp_path):
     )
 
 
+@pytest.mark.slow
+def test_a_robot_that_imports_has_a_row_of_its_self_test(tmp_path, monkeypatch):
+    monkeypatch.setattr(public_robots, "TRIES", 1)
+    urdf_files.write(tmp_path / "a+b", urdf_files.arm(3), "arm.urdf")
+    row = public_robots.trial(public_robots.Public("a/b", "arm.urdf"), tmp_path)
+    assert row["gripper"] == [] and row["self_test"]["line"].startswith("self-test: ")
+
+
 def test_the_table_counts_robots_that_mostly_succeed():
     robots = {"A": public_robots.Public("a/b", "a.urdf", "--arg x:=1", ("c+d/e",)), "B": public_robots.Public("a/b", "b.urdf")}
     row = {"gripper": ["jaw"], "opening": 0.08, "warnings": ["B: small"]}
