@@ -4,6 +4,7 @@ import functools
 import os
 import pathlib
 import re
+import shlex
 import stat
 import urllib.parse
 from collections.abc import Iterator, Mapping
@@ -25,8 +26,16 @@ class Missing(Exception):
     """A file that cannot be used; the message says why. The importer continues without it."""
 
 
-class Absent(Missing):
+class Shared(Missing):
+    """A file that rarely lacks alone; one warning names all files of one such kind."""
+
+
+class Absent(Shared):
     """A file that does not exist."""
+
+
+class Foreign(Shared):
+    """A mesh in a format that is not read."""
 
 
 class Roots:
@@ -193,8 +202,14 @@ class Roots:
         except (OSError, RuntimeError, ValueError):  # absent, forbidden, a loop of links, or too long a name
             real, regular = pathlib.Path(os.path.normpath(path)), False
         if not any(real.is_relative_to(folder) for folder in self.folders):
-            raise UserError(f"{name!r} lies outside the URDF's folder: name its folder with --package NAME=DIR, if you trust it")
+            raise UserError(f"{name!r} lies outside the URDF's folder: pass {self._flag(real)}, if you trust that folder")
         return real if regular else None
+
+    def _flag(self, outside: pathlib.Path) -> str:
+        """Writes the flag that names a file's folder: the one beside the URDF's folder, or beside one above it, that holds the file."""
+        shared = pathlib.Path(os.path.commonpath((self.here, outside)))
+        folder = shared / outside.relative_to(shared).parts[0] if outside.parent != shared else shared
+        return f"--package {folder.name or 'NAME'}={shlex.quote(str(folder))}"
 
 
 def package_name(folder: pathlib.Path) -> str:

@@ -85,12 +85,12 @@ class Looks:
         drawn = {(s.file, s.size) for n in tree.links.values() for s in n.visuals or n.collisions if s.kind == "mesh"}
         self._files = drawing.MeshFiles(len(drawn), self._work.spend, notes)
         self.spans: dict[tuple[str, tuple[float, ...]], float] = {}
-        self._absent: dict[str, str] = {}  # name of a mesh -> where it was searched for
+        self._shared: dict[type[files.Shared], dict[str, str]] = {}  # name of a mesh -> why it is not read
         seen = [b.links for b in parts.values() if any(tree.links[n].visuals for n in b.links)]
         self._beside = {n for links in seen for n in links}  # links of bodies with visuals: a link without its own is hidden
         self.of = {name: self._look(link) for name, link in tree.links.items()}
-        if self._absent:
-            notes.add("warning", "robot", tree.name, _told(self._absent))
+        for lost in self._shared.values():
+            notes.add("warning", "robot", tree.name, _told(lost))
         for body in parts.values():
             for name in body.links:
                 link, look = tree.links[name], self.of[name]
@@ -110,15 +110,15 @@ class Looks:
         """
         loaded: dict[str, list[_Loaded]] = {"visual": [], "collision": []}
         failed: dict[str, list[str]] = {"visual": [], "collision": []}
-        kind = "note"  # absent files share one warning
+        kind = "note"  # files that share a warning
         for tag, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for shape in shapes:
                 try:
                     loaded[tag].append((shape, *self._load(shape)))
                 except files.Missing as error:
                     failed[tag].append(f"{shape.file!r}: {error}")
-                    if isinstance(error, files.Absent):
-                        self._absent[shape.file] = str(error)
+                    if isinstance(error, files.Shared):
+                        self._shared.setdefault(type(error), {})[shape.file] = str(error)
                     else:
                         kind = "warning"
         if any(failed.values()) and not any(loaded.values()):
@@ -212,9 +212,9 @@ def _solid(kind: str, size: tuple[float, ...]) -> trimesh.Trimesh:
     return capsule.apply_translation(-capsule.bounds.mean(0))
 
 
-def _told(absent: Mapping[str, str]) -> str:
-    """Writes one line about missing meshes."""
-    names, reasons = list(absent), list(dict.fromkeys(absent.values()))
+def _told(lost: Mapping[str, str]) -> str:
+    """Writes one line about meshes that are missing, or in a format that is not read."""
+    names, reasons = list(lost), list(dict.fromkeys(lost.values()))
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     lines = "; ".join(reasons[:3]) + ", ..." * (len(reasons) > 3)
     which = f"mesh {names[0]!r}" if len(names) == 1 else f"{len(names)} meshes, {', '.join(map(repr, names[:3]))}{more}"

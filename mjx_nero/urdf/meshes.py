@@ -12,7 +12,7 @@ from lxml import etree
 
 from mjx_nero.files import parse_xml, read_bytes
 from mjx_nero.types import UserError
-from mjx_nero.urdf.files import Missing, Roots
+from mjx_nero.urdf.files import Foreign, Missing, Roots
 
 KINDS = {"stl": 100_000_000, "obj": 40_000_000, "dae": 30_000_000}  # bytes
 MAX_BYTES = 300_000_000  # all meshes of a robot together
@@ -52,7 +52,7 @@ class Meshes:
     def _parsed(self, path: pathlib.Path) -> list[Part] | Missing:
         kind = path.suffix[1:].lower()
         if kind not in KINDS:
-            return Missing(f"is a .{kind[:10]} file: only {', '.join(KINDS)} are read")
+            return Foreign(f"a .{kind[:10]} file: only {', '.join(KINDS)} are read")
         content = read_bytes(path, KINDS[kind])
         self._bytes += len(content)
         if self._bytes > MAX_BYTES:

@@ -258,6 +258,30 @@ def test_unusable_meshes(tmp_path, name, why):
     assert any("stand-in" in w or "in place of" in w for w in report.notes.of("link", "e"))
 
 
+def test_the_folder_that_a_refusal_names(tmp_path):
+    """Assemblies take meshes from folders beside their own: passing the flag that the message names is enough."""
+    base = tmp_path.resolve() / "robots"
+    make.box(base / "arms" / "one arm" / "meshes" / "e.stl", (0, 0, 0), (0.1, 0.1, 0.1))
+    text = make.arm(2, with_mesh("../../arms/one arm/meshes/e.stl"), make.joint("j", "l2", "e"))
+    urdf = make.write(base / "assembly" / "both", text)
+    with pytest.raises(UserError) as caught:
+        import_urdf(urdf, tmp_path / "out")
+    assert f"pass --package arms={base / 'arms'}, if" in str(caught.value)
+    assert not any("mesh" in w for w in import_urdf(urdf, tmp_path / "out", {"arms": base / "arms"}).warnings)
+
+
+def test_meshes_of_an_unread_format_share_a_warning(tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("l0", "l1", "l2"):
+        (tmp_path / "in" / f"{name}.glb").write_bytes(b"glTF")
+    links = [make.link(f"l{i}", make.inertial(0.1), make.mesh(f"l{i}.glb", "visual"), make.mesh("no.stl")) for i in range(3)]
+    text = make.robot(*links, make.joint("a", "l0", "l1"), make.joint("b", "l1", "l2"))
+    report = import_urdf(make.write(tmp_path / "in", text), tmp_path / "out")
+    told = [w for w in report.warnings if "only stl, obj, dae are read" in w]
+    assert len(told) == 1 and "3 meshes" in told[0]
+    assert len([w for w in report.warnings if "there is no such file" in w]) == 1
+
+
 def test_meshes_that_name_files(tmp_path, secret, monkeypatch):
     """Materials and textures of other files are not opened."""
     solid = make.box(tmp_path / "in" / "m.obj", (0, 0, 0), (0.1, 0.1, 0.1))
