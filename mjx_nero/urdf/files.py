@@ -206,7 +206,7 @@ class Roots:
         return real if regular else None
 
     def _flag(self, outside: pathlib.Path) -> str:
-        """Writes the flag that names a file's folder: the one beside the URDF's folder, or beside one above it, that holds the file."""
+        """Writes the flag for a file's folder: the one beside the URDF's folder, or beside one above, that holds it."""
         shared = pathlib.Path(os.path.commonpath((self.here, outside)))
         folder = shared / outside.relative_to(shared).parts[0] if outside.parent != shared else shared
         return f"--package {folder.name or 'NAME'}={shlex.quote(str(folder))}"
