@@ -13,6 +13,7 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.imitation.recording import pictures
 from mjx_nero.sim.cameras.cfg import CameraCfg
 from mjx_nero.tasks import registry
+from mjx_nero.tools.demos import making
 
 
 @pytest.mark.slow
@@ -71,3 +72,14 @@ def test_the_ray_tracer_is_prepared_for_all_sizes_before_threads_draw():
     cfg = types.SimpleNamespace(scene=types.SimpleNamespace(cameras={"front": CameraCfg(size=(64, 64))}))
     drawer = pictures._Traced(types.SimpleNamespace(cfg=cfg, draw_by=lambda own, renderer: seen), "front", (64, 64))
     assert prepared == list(drawer._draw._sizes) and len(prepared) > 1
+
+
+def test_an_environment_whose_pictures_come_later_asks_for_their_renderer_alone(monkeypatch):
+    """A machine that draws by one renderer need not have the other."""
+    cfg = registry.env_cfg("nero_lift", "rgb_fixed")
+    for available, renderer in ((True, "warp"), (False, "mujoco")):
+        monkeypatch.setattr(pictures, "warp_available", lambda available=available: available)
+        for asked in ("auto", renderer):
+            blind = making.blind(cfg, asked)
+            assert blind.scene.renderer == renderer and blind.scene.cameras == cfg.scene.cameras
+            assert set(blind.observations) == {"state", "teacher"} < set(cfg.observations)

@@ -49,6 +49,17 @@ SENTENCES = {  # by the end of an environment's name, longest first
 }
 
 
+def blind(cfg: EnvCfg, renderer: str) -> EnvCfg:
+    """Returns the config of an environment that observes no pictures. It draws nothing as it steps.
+
+    Args:
+        renderer: renderer of the pictures that are drawn afterwards; the other one may be missing.
+    """
+    kept = {name: group for name, group in cfg.observations.items() if name in ("state", teachers.GROUP)}
+    scene = dataclasses.replace(cfg.scene, renderer=pictures.chosen(renderer))  # pictures that no term reads are not drawn
+    return dataclasses.replace(cfg, observations=kept, scene=scene)
+
+
 def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     """Returns the schema of the data set and the player of its episodes.
 
@@ -62,11 +73,7 @@ def prepare(cfg: DemosCfg) -> tuple[Schema, Player]:
     size = min(cfg.side_by_side, cfg.episodes)
     drives = not acts and cfg.through == "drives"
     told = not cfg.policy and teachers.GROUP in env_cfg.observations  # the agent is told what others must see
-    if not acts or told:  # pictures that no term reads are not drawn
-        kept = {name: env_cfg.observations[name] for name in ("state", teachers.GROUP) if name in env_cfg.observations}
-        # While an agent plays, nothing is drawn, so the other renderer may be missing.
-        scene = dataclasses.replace(env_cfg.scene, renderer=pictures.chosen(cfg.renderer))
-        env_cfg = dataclasses.replace(env_cfg, observations=kept, scene=scene)
+    env_cfg = blind(env_cfg, cfg.renderer) if not acts or told else env_cfg
     env = ManipulationEnv(for_controllers(env_cfg) if drives else env_cfg, impl="native", num_envs=size)
     if acts and told:
         teacher = teachers.find(env)

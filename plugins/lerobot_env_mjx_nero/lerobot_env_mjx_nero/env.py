@@ -1,6 +1,5 @@
 """One environment for LeRobot's commands. It takes joint targets and returns states, in the units of a ``demos`` data set."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -45,8 +44,7 @@ class Programs:
     ):
         cli.setup_jax()  # its cache lets the processes that LeRobot starts compile only once
         cfg = registry.env_cfg(task, preset, robot).uncorrupted()
-        cfg = dataclasses.replace(cfg, observations={"state": cfg.observations["state"]})  # pictures are rendered here
-        self.env = env = ManipulationEnv(making.by_drives(cfg, through), impl="native")
+        self.env = env = ManipulationEnv(making.by_drives(making.blind(cfg, renderer), through), impl="native")
         names = [name for name in cameras.split(",") if name]
         self.cameras = Cameras(env, names, size, renderer) if names else None
         self.units = making.units_of(env, units)
