@@ -196,7 +196,7 @@ def _clutter(setup: ClutterSetup) -> EnvCfg:
             "colors": Term(randomization.color, params={"geoms": names}),
         },
         rewards=carrying(held, **commanded),
-        training=SHOWN,
+        training={**SHOWN, "averaging": 0.9},
         budget=Budget(steps=45_000_000),
         terminations={
             "time_out": DoneTerm(terminations.time_out, time_out=True),
