@@ -36,7 +36,8 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
     "thousand": (1000, (640, 360), 5, 45),
 }
 
-SEEING = ("nero_lift", "cobotta_lift", "piper_lift", "so101_lift", "cobotta_place", "cobotta_stack")  # have bundled policies of the preset rgb
+# Environments with bundled policies of the preset rgb.
+SEEING = ("nero_lift", "cobotta_lift", "piper_lift", "so101_lift", "cobotta_place", "cobotta_stack")
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
