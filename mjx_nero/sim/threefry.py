@@ -2,10 +2,11 @@
 
 JAX draws with Threefry (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011). For CPUs it lowers the hash to a
 loop over five groups of rounds. LLVM unrolls the loop's kernels over short rows of numbers, and they were two thirds of the code
-of an evaluation. Without a loop, the rounds are one small kernel, as on a GPU. All of it is integers, so no bit can change.
+of an evaluation. Here the rounds are one small kernel, as on a GPU. All of it is integers, so no bit can change.
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import threefry2x32_p
 from jax.interpreters import mlir
@@ -27,4 +28,19 @@ def bits(key1: jax.Array, key2: jax.Array, x: jax.Array, y: jax.Array) -> tuple[
     return x, y
 
 
-mlir.register_lowering(threefry2x32_p, mlir.lower_fun(bits, multiple_results=True), platform="cpu")
+def apart(key1: jax.Array, key2: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Computes ``bits`` in a kernel of its own.
+
+    Otherwise XLA fuses the rounds with the numbers made of them, and these then depend in their last bits on the size of a batch.
+    XLA drops barriers before it fuses, so this is a loop of one turn whose end it cannot foresee.
+    """
+    shape = jnp.broadcast_shapes(*map(jnp.shape, (key1, key2, x, y)))
+    if 0 in shape:
+        return bits(key1, key2, x, y)
+    going = jnp.ravel(key1)[0] | np.uint32(1)
+    first = (going, jnp.broadcast_to(x, shape), jnp.broadcast_to(y, shape))
+    _, x, y = jax.lax.while_loop(lambda c: c[0] != 0, lambda c: (jnp.zeros_like(c[0]), *bits(key1, key2, *c[1:])), first)
+    return x, y
+
+
+mlir.register_lowering(threefry2x32_p, mlir.lower_fun(apart, multiple_results=True), platform="cpu")
