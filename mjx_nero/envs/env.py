@@ -8,8 +8,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import mjx_nero.sim.quiet
-import mjx_nero.sim.threefry  # noqa: F401
+import mjx_nero.sim.quiet  # noqa: F401
 
 # isort: split
 import jax

@@ -5,7 +5,8 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
-from mjx_nero.files import YamlLoader, read_yaml
+from mjx_nero.files import read_yaml
+from mjx_nero.files.yaml_loader import YamlLoader
 from mjx_nero.urdf.xacro.budget import Budget, Fault, Value
 from mjx_nero.urdf.xacro.evaluate import evaluate
 from mjx_nero.urdf.xacro.functions import MATH, dictionary
