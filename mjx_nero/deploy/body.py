@@ -187,11 +187,10 @@ class Body:
 
     def ee(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Computes position [m] and orientation (wxyz) of the end effector in the world, for one posture."""
-        node, fixed = self._ee
         half, quat = self._all(np.atleast_2d(np.asarray(q, float)))[0] / 2, STILL
         for joint, turn in self._turns:
             quat = product(quat, turn if joint < 0 else np.append(np.cos(half[joint]), np.sin(half[joint]) * turn))
-        return (self.forward(q)[0, node] @ fixed)[:3, 3], quat
+        return self.hands(q)[0], quat
 
     def hands(self, q: np.ndarray) -> np.ndarray:
         """Computes the end effector's positions in the world [k, 3] [m]."""

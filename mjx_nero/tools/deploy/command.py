@@ -96,8 +96,8 @@ def _brain(args: argparse.Namespace) -> Any:
     return brain
 
 
-def _point(text: str | None) -> list[float] | None:
-    """Returns the position in a flag that starts with three numbers; None: it names something else."""
+def _position(text: str | None) -> list[float] | None:
+    """Returns the position that ``--object`` gives in numbers; None: it names a source of positions, or nothing."""
     with contextlib.suppress(ValueError):
         x, y, z = (float(part) for part in (text or "").split(",")[:3])
         return [x, y, z]
@@ -125,9 +125,9 @@ def _run(args: argparse.Namespace) -> bool:
         pictures = stack.enter_context(pictures_of(args, metadata, places))
         body = setup.body_of(metadata)
         observer: Any = Observer(metadata, body, goal, places, pictures)
-        for flag, text in (("--goal", args.goal), ("--object", args.object)):
-            if point := _point(text):
-                setup.check_reach(metadata, body, flag, point, args.table)
+        for flag, point in (("--goal", goal), ("--object", _position(args.object))):
+            if point is not None:
+                setup.check_reach(metadata, body, flag, point[:3], args.table)
         if simulated := args.arm == "sim" or args.emulate:
             observer = Witness(observer, places, scene_of(args, metadata), metadata["joints"]["names"])
         arms.warn(args)
