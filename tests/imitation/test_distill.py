@@ -119,6 +119,23 @@ def test_a_file_in_the_convolutions_format_acts_the_same(quick, tmp_path):
     assert whole.stat().st_size - stored.stat().st_size == pytest.approx(2 * eyes, abs=100)  # the header's names of types
 
 
+def test_a_student_of_other_widths_says_which_flags_it_needs(quick, call, tmp_path):
+    """Only ``rgb`` was run with 128 features; distillation and PPO agree there, since PPO goes on from a student."""
+    for preset, features in (("rgb", 128), ("rgb_fixed", 64), ("depth", 64), ("sim2real_rgb", 64)):
+        for name in ("distill", "pixels"):
+            assert learner.cfg_for(name, preset, {}).student.features == features
+    made = make(dataclasses.replace(CFG, student=dataclasses.replace(CFG.student, layers=(16, 32))))
+    params, meta = made.policy(jax.jit(made.init)(jax.random.PRNGKey(0))), made.describe()
+    meta = policy.describe(made.env.unwrapped, "nero_lift", "rgb_fixed", "distill", meta)
+    checkpoint.save(tmp_path / "other.safetensors", params, meta)
+    flags = ["--preset", "rgb_fixed", "--num-envs", 8, "--no-video", "--restore", "other.safetensors", "--out", "run"]
+    flags += [x for name, value in SMALL.items() for x in (f"--env.{name}", value)]
+    code, _, err = call("train", *flags)
+    wanted = "--distill.student.channels '8,8' --distill.student.features 32 --distill.student.layers '16,32'"
+    assert code == 2 and f"its networks differ: pass {wanted}" in err, err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_policy_knows_what_size_its_pictures_have():
     metas = []
     for size in ((16, 16), (32, 16)):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Share
 from mjx_nero.config.values import hints, read
-from mjx_nero.learn.pixels.cfg import StudentCfg
+from mjx_nero.learn.pixels.cfg import RGB, StudentCfg
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,4 +34,4 @@ class DistillCfg:
                 read(kind, getattr(self, name), f"distill.{name}")
 
 
-PRESETS = {"default": DistillCfg()}  # by preset of the environment
+PRESETS = {"default": DistillCfg(), "rgb": DistillCfg(student=RGB)}  # by preset of the environment

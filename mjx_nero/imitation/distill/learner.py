@@ -30,7 +30,7 @@ from mjx_nero.imitation.distill.cfg import PRESETS, DistillCfg
 from mjx_nero.learn import device_memory, learner
 from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
 from mjx_nero.learn.pixels import graph
-from mjx_nero.learn.pixels.cfg import ENVS
+from mjx_nero.learn.pixels.cfg import ENVS, differing
 from mjx_nero.learn.pixels.networks import SEEN, SENSED, TRUTH, Student, apply, away, from_meta, init_params, seen_bytes, stored
 from mjx_nero.types import Bank, Key, Shown
 
@@ -198,4 +198,14 @@ class Learner(learner.Learner):
 
 _PACE = "with two cameras an NVIDIA H100 makes 6 M steps of 4,096 environments in a minute, two CPU cores about 100 per second"
 
-KIND = Kind(make=Learner, presets=PRESETS, policy=from_meta, stored=stored, envs=ENVS, pace=_PACE, held=HELD, graph=graph)
+KIND = Kind(
+    make=Learner,
+    presets=PRESETS,
+    policy=from_meta,
+    stored=stored,
+    envs=ENVS,
+    pace=_PACE,
+    held=HELD,
+    differing=differing,
+    graph=graph,
+)

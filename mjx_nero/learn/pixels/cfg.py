@@ -1,10 +1,12 @@
 """Hyperparameters of policies that act on pictures, and of PPO for them: plain data, readable without importing Brax."""
 
 import dataclasses
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
+from mjx_nero import config
 from mjx_nero.config.bounds import Bounds, NonNegative, OneOf
-from mjx_nero.config.values import short
+from mjx_nero.config.values import read, short
 from mjx_nero.errors import UserError
 from mjx_nero.learn.header import MAX_LAYERS, MAX_WIDTH
 from mjx_nero.learn.ppo.cfg import PpoCfg
@@ -25,7 +27,7 @@ class StudentCfg:
     """
 
     channels: tuple[int, ...] = (32, 64, 64, 64)
-    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 128
+    features: Annotated[int, Bounds(1, MAX_WIDTH)] = 64
     layers: tuple[int, ...] = (256, 128)
     precision: Annotated[str, OneOf("bfloat16", "float32")] = "bfloat16"
 
@@ -34,6 +36,17 @@ class StudentCfg:
             given = getattr(self, name)
             if not 1 <= len(given) <= MAX_LAYERS or not all(1 <= width <= MAX_WIDTH for width in given):
                 raise UserError(f"student.{name} takes 1 to {MAX_LAYERS} layers of 1 to {MAX_WIDTH}, got {short(given)}")
+
+
+def differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the fields in which two files' students differ, by dotted name, with the first file's values.
+
+    ``precision`` is ignored: it changes no weight's shape.
+    """
+    if "student" not in there:  # the file is damaged, which its reader says
+        return {}
+    own, other = (config.flatten(read(StudentCfg, meta["student"], "student")) for meta in (there, here))
+    return {f"student.{name}": x for name, x in own.items() if name != "precision" and x != other[name]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,4 +58,5 @@ class PixelsCfg(PpoCfg):
     student: StudentCfg = StudentCfg()
 
 
-PRESETS = {"default": PixelsCfg()}
+RGB = StudentCfg(features=128)  # of distillation in the preset rgb, the only one that was run with so many
+PRESETS = {"default": PixelsCfg(), "rgb": PixelsCfg(student=RGB)}  # PPO in rgb goes on from such a student

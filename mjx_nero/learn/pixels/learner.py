@@ -24,7 +24,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory
 from mjx_nero.learn.learner import Kind, Observation
 from mjx_nero.learn.pixels import graph
-from mjx_nero.learn.pixels.cfg import ENVS, PRESETS, PixelsCfg
+from mjx_nero.learn.pixels.cfg import ENVS, PRESETS, PixelsCfg, differing
 from mjx_nero.learn.pixels.networks import (
     SEEN,
     SENSED,
@@ -180,5 +180,6 @@ KIND = Kind(
     pace=_PACE,
     fit=fit,
     held=_HELD,
+    differing=differing,
     graph=graph,
 )
