@@ -115,18 +115,31 @@ def test_a_log_that_another_run_writes_is_left_alone(lift, told, tmp_path):
     first.close()
 
 
-def test_a_second_deploy_ends_in_one_line_and_the_first_goes_on(call, lift, told, tmp_path):
-    policy = shutil.copy(lift / "policy.onnx", tmp_path / "policy.onnx")
+@pytest.fixture
+def command(lift, told, tmp_path):
+    """``deploy`` to an emulated arm, the port it is at, and its log."""
+    policy, log = shutil.copy(lift / "policy.onnx", tmp_path / "policy.onnx"), tmp_path / "log.csv"
     with emulators.started("so101", {"model": str(lift / "scene.mjb")}, told) as arm:
         flags = ["--port", arm["port"], "--calibration", arm["calibration"], "--object", "0.2,0,0.015", "--seconds", "10"]
-        command = [sys.executable, "-m", "mjx_nero", "deploy", str(policy), "--arm", "so101", *flags]
-        log = tmp_path / "log.csv"
-        first = subprocess.Popen([*command, "--log", str(log)], stdout=subprocess.PIPE, text=True, env=children.environment())
-        while not (log.exists() and log.read_text().count("\n") > 20):  # it moves
-            assert first.poll() is None
-            time.sleep(0.02)
-        status, out, err = call("mjx_nero", "deploy", policy, "--arm", "so101", *flags)
-        assert status == 2 and err == f"error: {arm['port']} {IN_USE}\n"
-        said = first.communicate(timeout=60)[0]
+        yield ["mjx_nero", "deploy", policy, "--arm", "so101", *flags, "--log", log], arm["port"], log
+
+
+def test_deploy_to_an_arm_that_is_in_use_ends_in_one_line(call, command):
+    words, port, log = command
+    first = alone(port)
+    status, _, err = call(*words)
+    assert status == 2 and err == f"error: {port} {IN_USE}\n" and not log.exists()
+    first.close()
+
+
+def test_a_deploy_keeps_its_arm_and_goes_on_when_another_program_wants_it(command):
+    words, port, log = command
+    first = subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, text=True, env=children.environment())
+    while not log.exists():  # the arm is taken before
+        assert first.poll() is None
+        time.sleep(0.02)
+    with pytest.raises(UserError, match=IN_USE):
+        alone(port)
+    said = first.communicate(timeout=60)[0]
     assert "servo" not in said and "bus" not in said  # what else this machine does may cost it deadlines
     assert first.returncode == 0 or "late" in said or "ms old" in said, said
