@@ -22,6 +22,8 @@ from mjx_nero.types import Picture, UserError
 
 _TYPES = {"rgb": np.uint8, "depth": np.float32, "segmentation": np.int32}
 _FAR = 0.999  # share of the farthest distance beyond which a pixel counts as empty
+_NEAR = 1e-3  # distance [m] within which OpenGL draws nothing: the ray tracer draws all, also an object that touches a camera
+_SQUARES = 8  # along each edge of a box: OpenGL lights their corners alone, the ray tracer every pixel
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # switched off: the ray tracer has neither
 
 
@@ -31,6 +33,8 @@ class OpenGL(Drawer):
     def __init__(self, model: mujoco.MjModel, cfg: Mapping[str, CameraCfg], fields: Sequence[str]):
         self._model, self._cfg = copy.copy(model), dict(cfg)
         self._model.vis.quality.offsamples = 0  # one sample per pixel, as in the ray tracer
+        self._model.vis.map.znear = _NEAR / model.stat.extent
+        self._model.vis.quality.numquads = _SQUARES
         screen = self._model.vis.global_
         screen.offwidth = max(screen.offwidth, *(c.size[0] for c in cfg.values()))
         screen.offheight = max(screen.offheight, *(c.size[1] for c in cfg.values()))
