@@ -32,7 +32,10 @@ NUM_ENVS, ROUNDS = 128, 5
 class Still:
     """Physics that does nothing: what is left of a step is the MDP."""
 
-    compiler_options = fusion()  # as the other programs are compiled
+    @property
+    def compiler_options(self):
+        """Those of the other programs."""
+        return fusion()
 
     def step(self, sim, ctrl):
         return sim, jnp.zeros(())
@@ -40,10 +43,13 @@ class Still:
 
 @pytest.fixture(scope="module")
 def optimised():
-    """XLA's optimisations, which the other tests do without."""
+    """XLA's optimisations and its fusion, which the other tests do without."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace("fusion_emitters=0", "fusion_emitters=false"))
+        assert fusion() or not OLD
+        yield
     jax.config.update("jax_disable_most_optimizations", before)
 
 
