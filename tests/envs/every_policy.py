@@ -26,8 +26,8 @@ def test_it_succeeds_where_everything_differs(name):
 
 
 @pytest.mark.parametrize("name", SIGHT)
-def test_it_succeeds_by_sight(name):
+def test_it_succeeds_by_sight(name, episodes=16):
     """Every episode looks different. MuJoCo Warp's ray tracer draws, as in training: OpenGL in software would take minutes."""
     fields = {"scene.renderer": "warp"}
-    cfg = evaluation.EvalCfg(name, preset="rgb", agent="policy", episodes=16, backend="mujoco", env_fields=fields)
+    cfg = evaluation.EvalCfg(name, preset="rgb", agent="policy", episodes=episodes, backend="mujoco", env_fields=fields)
     assert evaluation.play(cfg).result["success_rate"] >= 0.7

@@ -221,7 +221,7 @@ def test_products_are_exact_whatever_the_program_has_set():
     """Matrix products in the environment's program ask for full precision, though the program's default is less."""
     turn = ObservationTerm(lambda view: jnp.eye(3) @ view.ee_pos_w)
     env = make("nero_lift", impl="native", observations={"state": ObservationGroup({"turned": turn})})
-    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    state = env.state_shape
     with jax.default_matmul_precision("default"):
         for program in (
             jax.jit(env.reset).lower(jax.random.PRNGKey(0)),

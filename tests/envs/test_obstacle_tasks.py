@@ -110,7 +110,7 @@ def test_names_that_the_scene_lacks_are_refused():
 
 def _shapes(cfg):
     env = evaluation.ManipulationEnv(cfg, impl="native")
-    return jax.eval_shape(env.reset, jax.random.PRNGKey(0)), jnp.zeros(env.action_size)
+    return env.state_shape, jnp.zeros(env.action_size)
 
 
 @pytest.mark.parametrize(("robot", "x", "y"), [("nero", 0.33, -0.2), ("cobotta_pro_900", 0.5, 0.27)])

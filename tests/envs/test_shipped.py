@@ -57,8 +57,7 @@ def test_it_fits(name, preset):
     env = make(name, preset, impl="native")
     trained = policy.load_for(env, name, None, preset=preset)
     assert trained.meta["preset"] == preset and trained.meta["robot"] == env.cfg.robot.name and trained.meta["fingerprint"]
-    seen = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
-    assert jax.eval_shape(trained.act, seen).shape == (env.action_size,)
+    assert jax.eval_shape(trained.act, env.state_shape.obs).shape == (env.action_size,)
 
 
 @pytest.mark.slow
@@ -74,4 +73,4 @@ def test_it_succeeds_where_everything_differs():
 
 @pytest.mark.slow
 def test_it_succeeds_by_sight():
-    every_policy.test_it_succeeds_by_sight("nero_lift")
+    every_policy.test_it_succeeds_by_sight("nero_lift", episodes=8)
