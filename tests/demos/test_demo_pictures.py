@@ -50,7 +50,7 @@ def test_each_caller_at_a_time_has_a_drawer_of_its_own(monkeypatch):
 
         def __call__(self, qpos, scenery):
             assert self.busy.acquire(blocking=False)
-            meet.wait(30)
+            meet.wait(120)
             self.busy.release()
             return [qpos]
 

@@ -1,8 +1,8 @@
 """The Piper and the Nero over an emulated bus: frames byte for byte, faults, and that nothing ever drops the arm."""
 
 import pathlib
+import select
 import threading
-import time
 
 import arms
 import numpy as np
@@ -162,8 +162,11 @@ def adapter(bench):
     port.close()
 
 
-def test_a_serial_adapter_is_another_bus(bench, adapter, told, kind):
-    """In real time, as the lines of a terminal are."""
+def test_a_serial_adapter_is_another_bus(bench, adapter, told, kind, monkeypatch):
+    """In real time, as the lines of a terminal are; whoever reads them may have to wait for a processor."""
+    send = Slcan.send
+    monkeypatch.setattr(Slcan, "send", lambda bus, frame, timeout: send(bus, frame))
+    monkeypatch.setattr(agilex, "_WAIT", 60.0)
     over = threading.Event()
     thread = threading.Thread(target=adapter.serve, args=(over.is_set,), daemon=True)
     bench.plant._clock = clock = WallClock()
@@ -193,7 +196,7 @@ def test_a_damaged_line_of_an_adapter_ends_in_hold(bench, adapter, told, kind, l
     slcan = Slcan(adapter.name.partition(":")[2], sleep_after_open=0, timeout=0)
     adapter._line.write(line)
     monkeypatch.setattr(bench.arm, "_bus", slcan)
-    time.sleep(0.05)  # the terminal carries it
+    assert select.select([slcan.fileno()], [], [], 60.0)[0]  # the terminal carries it
     bench.guard.read()
     assert bench.guard.fault.kind == "bus" and "the CAN bus fails" in bench.guard.fault.text
     monkeypatch.undo()

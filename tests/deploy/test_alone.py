@@ -140,6 +140,6 @@ def test_a_deploy_keeps_its_arm_and_goes_on_when_another_program_wants_it(comman
         time.sleep(0.02)
     with pytest.raises(UserError, match=IN_USE):
         alone(port)
-    said = first.communicate(timeout=60)[0]
+    said = first.communicate(timeout=300)[0]
     assert "servo" not in said and "bus" not in said  # what else this machine does may cost it deadlines
     assert first.returncode == 0 or "late" in said or "ms old" in said, said

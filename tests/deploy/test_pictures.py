@@ -51,7 +51,8 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_pictures_of_a_folder_come_in_turn_and_old_ones_are_a_fault(folder):
+def test_pictures_of_a_folder_come_in_turn_and_old_ones_are_a_fault(folder, monkeypatch):
+    monkeypatch.setattr(pictures, "FRESH", 1.0)  # whoever reads them may have to wait for a processor
     film = pictures.Cameras({"front": (str(folder), 45.0)}, TOLD, 0.02)
     shades, kind = [], ""
     try:

@@ -1,6 +1,7 @@
 """The arm's own process: what becomes of the arm when the policy's process is killed or frozen, and when its own is."""
 
 import csv
+import dataclasses
 import json
 import os
 import pathlib
@@ -8,12 +9,11 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 
 import arms
 import numpy as np
 import pytest
+from arms import wait_for
 
 from mjx_nero.deploy import server
 from mjx_nero.deploy.arm import ArmError
@@ -22,6 +22,7 @@ from mjx_nero.deploy.safety import Fault
 from mjx_nero.deploy.server import Spec
 from mjx_nero.errors import UserError
 
+BUSY = 0.05  # a policy's process that wakes so late may be silent for too long by itself [s]
 # A policy's process that swings a joint until it is killed.
 SWING = """
 import json, sys, time
@@ -57,13 +58,6 @@ def rows(spec):
         return list(csv.DictReader(line for line in file if not line.startswith("#")))
 
 
-def wait_for(what, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def gone(pid):
     try:
         return pathlib.Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
@@ -81,31 +75,19 @@ def swinging(spec):
     wait_for(lambda: gone(arm))
 
 
-@pytest.fixture
-def late():
-    """By how much this machine wakes sleepers late while a test runs, at worst [s]: what a busy one adds to any deadline."""
-    worst, over = [0.0], threading.Event()
-
-    def sleeper():
-        while not over.is_set():
-            begun = time.monotonic()
-            time.sleep(0.005)
-            worst[0] = max(worst[0], time.monotonic() - begun - 0.005)
-
-    thread = threading.Thread(target=sleeper, daemon=True)
-    thread.start()
-    yield lambda: worst[0]
-    over.set()
-    thread.join()
-
-
 def targets(table):
     return [float(row["target.shoulder_pan"]) for row in table if row["target.shoulder_pan"]]
 
 
+def at_rest(table):
+    """True once the arm holds and was told the same target twice."""
+    held = [row for row in table if row["held"]]
+    return held and np.ptp(targets(table)[-2:]) < 1e-4
+
+
 def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec, late):
     process, arm = swinging
-    time.sleep(0.6)
+    wait_for(lambda: len(targets(rows(spec))) > 30 or gone(arm))
     process.kill()
     wait_for(lambda: gone(arm))  # it left by itself
     table = rows(spec)
@@ -119,26 +101,27 @@ def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec, lat
 
 def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swinging, spec, late):
     process, arm = swinging
-    time.sleep(0.6)
+    wait_for(lambda: len(targets(rows(spec))) > 30 or gone(arm))
     process.send_signal(signal.SIGSTOP)
-    wait_for(lambda: any(row["held"] for row in rows(spec)))
-    time.sleep(0.4)
+    wait_for(lambda: at_rest(rows(spec)))
     table = rows(spec)
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
     first = next(float(row["time"]) for row in table if row["held"])
     assert first - last < 0.1 + late()
-    assert not gone(arm) and targets(table)[-1] == pytest.approx(targets(table)[-2], abs=1e-4)
+    assert not gone(arm) or late() > BUSY
+    assert targets(table)[-1] == pytest.approx(targets(table)[-2], abs=1e-4)
     process.send_signal(signal.SIGCONT)  # nothing resumes
     assert process.stdout.readline() == "fault silence\n"
-    process.wait(10)
+    process.wait(60)
     assert targets(rows(spec))[-1] == targets(table)[-1]
 
 
-def test_ctrl_c_does_not_reach_the_arms_process(swinging):
+def test_ctrl_c_does_not_reach_the_arms_process(swinging, spec, late):
     process, arm = swinging
     os.kill(arm, signal.SIGINT)
-    time.sleep(0.3)
-    assert not gone(arm) and process.poll() is None
+    told = len(rows(spec))
+    wait_for(lambda: len(rows(spec)) > told + 20 or gone(arm))
+    assert not gone(arm) or late() > BUSY
 
 
 def test_an_arm_whose_process_is_killed_is_said(spec):
@@ -147,9 +130,7 @@ def test_an_arm_whose_process_is_killed_is_said(spec):
     remote.start()
     os.kill(remote.pid, signal.SIGKILL)
     with pytest.raises(ArmError, match="the drives hold their last target"):
-        for _ in range(10):
-            remote.read()
-            time.sleep(0.02)
+        wait_for(lambda: remote.read() is None)
     remote.close()
 
 
@@ -161,6 +142,7 @@ def test_an_arms_process_that_does_not_end_is_said(spec, monkeypatch):
     with pytest.raises(ArmError, match=f"the arm's process {remote.pid} does not end: cut the arm's power"):
         remote.close()
     os.kill(remote.pid, signal.SIGCONT)
+    monkeypatch.undo()
     remote.close()  # it was told to end meanwhile
 
 
@@ -181,7 +163,7 @@ def test_an_arm_that_answers_too_late_is_let_go(spec, monkeypatch, kind):
 
 
 def test_a_fault_is_told_and_stays(spec):
-    remote = Remote(spec)
+    remote = Remote(dataclasses.replace(spec, safety={"silence": 60.0}))
     remote.ready()
     at = remote.start().position
     remote.hold(Fault("stop", "enough"))

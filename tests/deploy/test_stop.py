@@ -2,6 +2,7 @@
 
 import csv
 import os
+import select
 import shutil
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import termios
 import time
 
+import arms
 import numpy as np
 import pytest
 
@@ -31,7 +33,7 @@ def keyboard(monkeypatch):
     """Types at this program's terminal."""
     ours, theirs = os.openpty()
     monkeypatch.setattr(sys, "stdin", os.fdopen(theirs, "r", closefd=False))
-    yield lambda keys: (os.write(ours, keys), time.sleep(0.02))
+    yield lambda keys: (os.write(ours, keys), select.select([theirs], [], [], 60.0))
     for end in (ours, theirs):
         os.close(end)
 
@@ -68,13 +70,14 @@ def test_a_file_that_nobody_touches_stops(tmp_path, age, holds):
 
 def test_a_signal_ends_a_run_in_hold(lift, tmp_path):
     policy, log = shutil.copy(lift / "policy.onnx", tmp_path / "policy.onnx"), tmp_path / "log.csv"
-    command = [sys.executable, "-m", "mjx_nero", "deploy", policy, "--arm", "sim", "--seconds", "60", "--log", log]
+    code = arms.PATIENT + "from mjx_nero.__main__ import program; program()"
+    command = [sys.executable, "-c", code, "deploy", policy, "--arm", "sim", "--seconds", "600", "--log", log]
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True, env=children.environment())
     while not (log.exists() and log.read_text().count("\n") > 40):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
-    said = process.communicate(timeout=50)[0]
+    said = process.communicate(timeout=300)[0]  # long before its minutes are over
     assert process.returncode == 0 and "the arm holds: SIGTERM arrived" in said
     with open(log) as file:
         rows = [row for row in csv.DictReader(line for line in file if line[0] != "#") if row["target.shoulder_pan"]]

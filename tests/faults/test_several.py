@@ -20,7 +20,7 @@ def test_seeds_of_the_same_second(tmp_path):
         for seed in range(SEEDS)
     ]
     for run in runs:
-        said, _ = run.communicate(timeout=300)
+        said, _ = run.communicate(timeout=900)
         assert run.returncode == 0, said.decode()
     folders = list((tmp_path / "runs").iterdir())
     seeds = sorted(json.loads((folder / "config.json").read_text())["seed"] for folder in folders)

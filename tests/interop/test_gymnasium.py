@@ -43,7 +43,7 @@ def test_a_registered_environment_passes_gymnasiums_check():
 @pytest.mark.slow
 def test_ids_without_an_import_of_ones_own():
     code = "import gymnasium as g; print(g.make('mjx_nero.interop.gymnasium:mjx_nero/so100_reach-v0', impl='native').spec.id)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert done.stdout.strip() == "mjx_nero/so100_reach-v0", done.stderr
     done.check_returncode()
     ids = {name for name in gymnasium.registry if name.startswith("mjx_nero/")}
@@ -233,6 +233,6 @@ def test_torch_shares_memory(reach):
 def test_the_example_tells_a_rate(tmp_path):
     program = pathlib.Path(__file__).resolve().parents[2] / "examples" / "gymnasium_rate.py"
     command = [sys.executable, program, "--env", "nero_reach", "--num-envs", "4", "--steps", "3"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     assert re.search(r"4 x nero_reach, jax: [\d,]+ env steps/s", done.stdout)

@@ -202,7 +202,7 @@ for row, position in zip(rows, data["positions"]):
 np.save("targets.npy", out)
 """
     argv = f"import sys; sys.argv = ['run_policy.py', 'policy.onnx']\n{drive}"
-    done = subprocess.run([sys.executable, "-c", argv], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", argv], cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     assert env.cfg.robot.joints[0] in done.stdout  # what the page prints
     np.testing.assert_allclose(np.load(tmp_path / "targets.npy"), np.stack(want), atol=2e-5)

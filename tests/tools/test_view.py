@@ -163,7 +163,8 @@ def test_checkpoints_of_a_training_play_too(tmp_path, reach):
 
 @pytest.mark.slow
 def test_a_training_writes_what_the_view_follows(call, tmp_path):
-    assert call("train", "--env", "nero_reach", "--num-envs", 32, "--num-timesteps", 3072, "--no-video", "--out", "run")[0] == 0
+    sizes = ["--num-envs", 64, "--num-timesteps", 1536]  # test_wheel's, so that one of the two finds its programs compiled
+    assert call("train", "--env", "nero_reach", *sizes, "--no-video", "--out", "run")[0] == 0
     followed = opening.open_view(run=tmp_path / "run", port=18100)
     try:
         followed.follow()
@@ -246,6 +247,7 @@ def test_in_a_browser(browser):
         for _ in range(4):
             mouse = mouse.move_by_offset(0, -8).pause(0.2)
         mouse.pause(0.5).release().perform()
+        wait(lambda: page.session.frame.scenery.goal_pos_w[0, 2] > 0.27 + 0.03)
         time.sleep(2)  # its last messages
         moved = page.session.frame.scenery.goal_pos_w[0]
         assert moved[2] > 0.27 + 0.03 and abs(moved[1] - 0.1) < 0.03  # up, as the mouse

@@ -35,7 +35,7 @@ def serves_a_normal_client(shown):
     session, named = shown.session, controls(shown)
     assert session.failure is None and shown._thread.is_alive() and shown._orders._thread.is_alive()
     with talk(shown) as client:
-        assert client.recv(timeout=30)  # what there is to see
+        assert client.recv(timeout=120)  # what there is to see
         look(shown, client)
         uuid, curve = named["Curve"]
         for option in (curve.options[-1], curve.options[0]):
@@ -108,8 +108,8 @@ def test_odd_frames_end_their_own_connection_alone(lift):
                     continue
                 with pytest.raises(ConnectionClosed):
                     while True:
-                        client.recv(timeout=20)
-        assert other.ping().wait(20)
+                        client.recv(timeout=120)
+        assert other.ping().wait(120)
     serves_a_normal_client(lift)
 
 
@@ -131,7 +131,7 @@ def test_the_server_opens_no_tunnel(lift, monkeypatch):
     assert not [kind for kind in handlers if "share" in kind.__name__.lower()]
     loop = lift.server._event_loop
     for share in (_messages.ShareUrlRequest(), _messages.ShareUrlDisconnect()):
-        asyncio.run_coroutine_threadsafe(lift.server._websock_server._handle_incoming_message(0, share), loop).result(timeout=10)
+        asyncio.run_coroutine_threadsafe(lift.server._websock_server._handle_incoming_message(0, share), loop).result(timeout=120)
     time.sleep(0.5)
     assert opened == [] and lift.server._share_tunnel is None
     serves_a_normal_client(lift)
