@@ -8,14 +8,12 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import Env, State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config import bounds, values

@@ -1,13 +1,11 @@
 """Training wrappers: batches with automatic restarts, and expert starts."""
 
-import mjx_nero.sim.quiet  # noqa: F401
-
-# isort: split
 import dataclasses
+
+from mjx_nero.sim.quiet import Env, State, Wrapper
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State, Wrapper
 
 from mjx_nero.envs.env import ManipulationEnv, Starts
 from mjx_nero.mdp import curriculum

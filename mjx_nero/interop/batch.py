@@ -1,11 +1,9 @@
 """A batch of environments that restarts ended episodes, and returns how they ended."""
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import State
 
-# isort: split
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.types import Key

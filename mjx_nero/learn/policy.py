@@ -6,9 +6,6 @@ import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
-
-# isort: split
 import jax
 
 from mjx_nero.envs.env import ManipulationEnv

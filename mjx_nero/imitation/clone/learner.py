@@ -8,14 +8,12 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import Env
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.envs.base import Env
 from flax import struct
 from jaxtyping import Array, Int
 

@@ -11,13 +11,11 @@ import dataclasses
 import math
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import Env, State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import optax
-from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
 from flax import struct
 from jaxtyping import Array, Float, Int

@@ -9,13 +9,11 @@ import functools
 from collections.abc import Iterator
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_nero import math

@@ -6,12 +6,10 @@ The critic exists only in training, so the policy needs nothing but its cameras.
 import dataclasses
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import Env
 
-# isort: split
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 from brax.training import networks as feed_forward
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, networks

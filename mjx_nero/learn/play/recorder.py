@@ -2,12 +2,10 @@
 
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import State
 
-# isort: split
 import jax
 import numpy as np
-from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Bool, Float
 

@@ -25,14 +25,12 @@ import itertools
 import math
 from typing import Any, TypeVar
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import Env, State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.envs.base import Env, State
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses, networks, optimizer
 from flax import struct

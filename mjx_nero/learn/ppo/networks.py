@@ -6,7 +6,6 @@ from typing import Any
 
 import mjx_nero.sim.quiet  # noqa: F401
 
-# isort: split
 import jax
 import jax.numpy as jnp
 from brax.training import networks as feed_forward

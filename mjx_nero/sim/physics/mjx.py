@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import mjx_nero.sim.quiet  # noqa: F401
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import mujoco

@@ -3,13 +3,11 @@
 import dataclasses
 import pathlib
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 
 from mjx_nero.data import Dataset, Episode, open_with, units
 from mjx_nero.data import episode as names

@@ -50,9 +50,6 @@ class Witness:
         return f"the task {'succeeded' if met else 'failed'}: {1e3 * way:.0f} mm to go at the end"
 
     def _judged(self) -> tuple[bool, float]:
-        import mjx_nero.sim.quiet  # noqa: F401
-
-        # isort: split
         import jax
         import jax.numpy as jnp
 

@@ -5,13 +5,11 @@ import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import mjx_nero.sim.quiet  # noqa: F401
+from mjx_nero.sim.quiet import State
 
-# isort: split
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import EnvCfg
