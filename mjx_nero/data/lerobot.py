@@ -7,6 +7,7 @@ Source of the format: huggingface/lerobot 0.4.4 and 0.6.1, ``src/lerobot/dataset
 
 import concurrent.futures
 import functools
+import importlib
 import json
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +35,7 @@ class LeRobotForm:
         self._pieces = 0
         self._pictures = [name for name, feature in schema.features.items() if feature.picture]
         if self._pictures:
-            video.need()
+            importlib.import_module("av")  # before the first episode is played
         index = files.inside(path, *lf.INFO.split("/"))
         if index.exists():
             self._load(files.read_json(index), index)

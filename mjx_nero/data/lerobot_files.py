@@ -5,16 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import parquet as parquet
 
 from mjx_nero.data import stats, video
 from mjx_nero.data.episode import Schema
-from mjx_nero.errors import UserError
-
-try:
-    import pyarrow as pa
-    from pyarrow import parquet as parquet
-except ModuleNotFoundError:
-    raise UserError("LeRobot's format needs pyarrow, of the extra 'demos': pip install 'mjx-nero[demos]'") from None
 
 VERSION, CHUNK = "v3.0", 1000  # version of the format; files per folder
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"

@@ -14,19 +14,6 @@ import numpy as np
 
 from mjx_nero import cores
 from mjx_nero.data import encoding, stats
-from mjx_nero.errors import UserError
-
-
-def need() -> None:
-    """Checks that the encoder is installed.
-
-    Raises:
-        UserError: it is not.
-    """
-    try:
-        import av  # noqa: F401
-    except ModuleNotFoundError:
-        raise UserError("pictures need PyAV, of the extra 'demos': pip install 'mjx-nero[demos]'") from None
 
 
 def write(

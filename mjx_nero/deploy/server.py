@@ -28,7 +28,7 @@ from mjx_nero.deploy.guard import Dry, Guard, WallClock, urgent
 from mjx_nero.deploy.identified import Offset
 from mjx_nero.deploy.log import Log
 from mjx_nero.deploy.safety import Fault, SafetyCfg
-from mjx_nero.errors import UserError
+from mjx_nero.errors import UserError, missing
 
 PACKET = 1 << 17  # maximum bytes of a message
 
@@ -140,9 +140,10 @@ def serve(channel: socket.socket) -> None:
     spec = Spec(**json.loads(channel.recv(PACKET)))
     try:
         server = Server(spec)
-    except (UserError, ArmError) as error:
+    except (UserError, ArmError, ModuleNotFoundError) as error:
+        said = missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
         with contextlib.suppress(OSError):  # the other side waits no longer
-            channel.send(json.dumps({"error": str(error)}).encode())
+            channel.send(json.dumps({"error": said}).encode())
         return
     try:
         channel.send(json.dumps({"fault": None}).encode())

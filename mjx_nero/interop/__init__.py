@@ -3,16 +3,10 @@
 import importlib
 from typing import Any
 
-from mjx_nero.types import UserError
+from mjx_nero.errors import UserError, missing
 
 
-def missing(error: ModuleNotFoundError, extra: str) -> UserError:
-    """Makes the error for an installation that lacks the module of an extra."""
-    name = (error.name or "").partition(".")[0]
-    return UserError(f"this needs {name}, of the extra {extra!r}: pip install 'mjx-nero[{extra}]'")
-
-
-def need(module: str, extra: str) -> Any:
+def need(module: str) -> Any:
     """Imports a module of an extra.
 
     Raises:
@@ -21,4 +15,4 @@ def need(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise missing(error, extra) from None
+        raise UserError(missing(error)) from None

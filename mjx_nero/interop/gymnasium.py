@@ -14,17 +14,17 @@ import numpy as np
 import mjx_nero
 from mjx_nero.config import bounds, values
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import missing, need
+from mjx_nero.errors import UserError, missing
+from mjx_nero.interop import need
 from mjx_nero.interop.batch import Batch
 from mjx_nero.learn import device_memory
 from mjx_nero.sim.render import Renderer
 from mjx_nero.tasks import registry
-from mjx_nero.types import UserError
 
 try:
     import gymnasium
 except ModuleNotFoundError as error:
-    raise missing(error, "gym") from None
+    raise UserError(missing(error)) from None
 
 ARRAYS = ("numpy", "jax", "torch")
 
@@ -276,7 +276,7 @@ def _converter(arrays: str) -> Callable[[jax.Array], Any]:
     if not isinstance(arrays, str) or arrays not in ARRAYS:
         raise UserError(f"unknown arrays {values.short(arrays)}: choose one of {', '.join(ARRAYS)}")
     if arrays == "torch":
-        return need("torch", "torch").from_dlpack
+        return need("torch").from_dlpack
     return np.asarray if arrays == "numpy" else lambda array: array
 
 

@@ -36,7 +36,7 @@ def model(policy: Policy, env: ManipulationEnv) -> Any:
     Raises:
         UserError: the extra ``onnx`` is not installed, or the policy's observation terms stay apart.
     """
-    onnx = need("onnx", "onnx")
+    onnx = need("onnx")
     if isinstance(policy.meta["observation_size"]["state"], dict):
         raise UserError(
             "only a policy that reads one vector can be exported, and this one's terms stay apart: train another preset"
@@ -150,7 +150,7 @@ def check(made: Any, policy: Policy, observations: int = 0) -> tuple[float, floa
     Raises:
         UserError: the extra ``onnx`` is not installed.
     """
-    runtime, observations = need("onnxruntime", "onnx"), observations or tries(policy.meta)
+    runtime, observations = need("onnxruntime"), observations or tries(policy.meta)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = runtime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])

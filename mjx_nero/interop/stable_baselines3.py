@@ -7,14 +7,13 @@ import jax
 import numpy as np
 
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.interop import missing
+from mjx_nero.errors import UserError, missing
 from mjx_nero.interop.gymnasium import VectorEnv, checked_seed
-from mjx_nero.types import UserError
 
 try:
     from stable_baselines3.common import vec_env
 except ModuleNotFoundError as error:
-    raise missing(error, "torch") from None
+    raise UserError(missing(error)) from None
 
 
 class VecEnv(vec_env.VecEnv):

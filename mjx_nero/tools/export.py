@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
     from mjx_nero.interop import onnx
     from mjx_nero.learn import policy
 
-    onnx_package = need("onnx", "onnx")
+    onnx_package = need("onnx")
     cli.setup_jax()
     path = bundled.find(args.policy)
     meta = policy.load(path).meta

@@ -149,7 +149,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _serve(robot: RobotCfg, run: Run, host: str, port: int) -> None:
     """Serves the page until Ctrl-C."""
-    need("viser", "view")
+    need("viser")
     from mjx_nero.tools.view import door
 
     page, guard = door.open_page(host, port)

@@ -227,5 +227,6 @@ def test_without_the_extra(call, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     status, _, err = call("mjx_nero", "export", "nero_lift", "--out", "p.onnx")
     assert status == 2 and err == "error: this needs onnx, of the extra 'onnx': pip install 'mjx-nero[onnx]'\n"
-    with pytest.raises(UserError, match="of the extra 'gym'"):
-        interop.need("no_such_module", "gym")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(UserError, match="of the extra 'torch'"):
+        interop.need("torch")

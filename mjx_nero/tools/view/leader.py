@@ -50,16 +50,12 @@ def at(port: str, calibration: pathlib.Path | None) -> Readable:
     """Connects to the leader at a serial port.
 
     Raises:
-        UserError: no calibration file is given, a package is missing, or no arm that matches the calibration answers.
+        UserError: no calibration file is given, or no arm that matches the calibration answers.
     """
     from mjx_nero.deploy.drivers import so_leader
 
     if calibration is None:
         raise UserError("--leader needs --calibration: the leader's file written by lerobot-calibrate")
-    try:
-        import serial  # noqa: F401
-    except ModuleNotFoundError:
-        raise UserError("--leader needs pyserial, of the extra 'deploy': pip install 'mjx-nero[deploy]'") from None
     made = so_leader.of(description.robot(registry.robot(_MODEL)), port, calibration, WallClock())
     made.connect()
     return made

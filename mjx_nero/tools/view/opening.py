@@ -34,7 +34,6 @@ def serve(**kwargs: Any) -> None:
     Args:
         kwargs: arguments of ``open_view``.
     """
-    need("viser", "view")
     cli.setup_jax()
     view = open_view(**kwargs)
     print(f"{view.url}  (Ctrl-C ends it)", flush=True)
@@ -131,7 +130,7 @@ def open_view(
     Raises:
         UserError: see ``command.main``.
     """
-    need("viser", "view")
+    need("viser")
     from mjx_nero.tools.view import hand, session, tape
     from mjx_nero.tools.view import leader as leaders
 
