@@ -5,6 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
+from mjx_nero.config import flag
 from mjx_nero.config.bounds import Bounds, NonNegative, Positive, Seed, check
 from mjx_nero.errors import UserError
 from mjx_nero.identify.excitation import RATE, sweeps
@@ -28,15 +29,15 @@ class RecordCfg:
         seed: random seed.
     """
 
-    seconds: Annotated[float, Bounds(0.0, 3600.0, above=True)] = 60.0
-    rate: Annotated[float, Bounds(1.0, 10_000.0)] = 200.0
-    noise: NonNegative = 0.0
-    resolution: NonNegative = 0.0
-    scatter: Annotated[float, Bounds(0.0, 100.0, above=True)] = 1.0
-    offset: NonNegative = 0.0
-    delay: Annotated[float, Bounds(0.0, 10.0)] = 0.0
-    amplitude: Positive = 0.5
-    seed: Seed = 0
+    seconds: Annotated[float, Bounds(0.0, 3600.0, above=True)] = flag(60.0)
+    rate: Annotated[float, Bounds(1.0, 10_000.0)] = flag(200.0)
+    noise: NonNegative = flag(0.0)
+    resolution: NonNegative = flag(0.0)
+    scatter: Annotated[float, Bounds(0.0, 100.0, above=True)] = flag(1.0)
+    offset: NonNegative = flag(0.0)
+    delay: Annotated[float, Bounds(0.0, 10.0)] = flag(0.0)
+    amplitude: Positive = flag(0.5)
+    seed: Seed = flag(0)
 
     def __post_init__(self):
         check(self)

@@ -1,5 +1,5 @@
-"""Imports MJX and Brax's ``Env`` without packages that they do not need here, and without the lines that they print. Import it
-before Brax.
+"""Imports MJX and Brax's ``Env``, ``State`` and ``Wrapper`` without packages that they do not need here, and without the lines
+that they print. It must come before all of Brax, so it has a section of its own among a file's imports.
 
 These packages are seldom or never needed, and take longer to import than MJX and ``Env`` themselves:
 
@@ -67,4 +67,6 @@ if "brax.envs" not in sys.modules:
     package = sys.modules["brax"].envs = sys.modules["brax.envs"] = importlib.util.module_from_spec(spec)  # type: ignore[attr-defined]
     package.__class__ = _Unread
 with _replaced({name: _Later(name) for name in _ENGINES}):
-    importlib.import_module("brax.envs.base")
+    from brax.envs.base import Env as Env
+    from brax.envs.base import State as State
+    from brax.envs.base import Wrapper as Wrapper

@@ -24,6 +24,15 @@ from mjx_nero.runs import signals
 LONGEST_NAME = 255  # bytes of a file name; the limit of all common file systems
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Ends the help of a flag with its default, unless the flag is a switch or its help names a default itself."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        said, default = action.help or "", action.default
+        silent = isinstance(default, bool | list) or default in (None, "", argparse.SUPPRESS) or "(default: " in said
+        return said if silent else f"{said} (default: %(default)s)"
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that reports mistakes in one line.
 
@@ -34,14 +43,13 @@ class Parser(argparse.ArgumentParser):
     """
 
     def __init__(self, command: str, says: str = "", ends: str | None = None):
-        form = argparse.RawDescriptionHelpFormatter
-        super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=form)
+        super().__init__(called_as(command), description=says, epilog=ends, allow_abbrev=False, formatter_class=_Help)
 
     def add_environment(self) -> None:
         """Adds ``--load``, ``--env``, ``--preset``, ``--robot`` and ``--object``, which choose an environment."""
         self.add_load()
-        self.add_argument("--env", default="nero_lift", help="environment; list-envs lists them all (default: %(default)s)")
-        self.add_argument("--preset", default="default", help="preset of the environment (default: %(default)s)")
+        self.add_argument("--env", default="nero_lift", help="environment; list-envs lists them all")
+        self.add_argument("--preset", default="default", help="preset of the environment")
         self.add_argument("--robot", help="name of another robot, or folder of an imported one (default: the environment's own)")
         text = "object to lift, push or place instead of the task's own: a mesh (.obj, .stl, .glb), a folder or a name"
         self.add_argument("--object", metavar="FILE", help=f"{text} (see inspect --object; scale it by --env.object.scale)")
@@ -63,13 +71,13 @@ class Parser(argparse.ArgumentParser):
 
     def add_address(self) -> None:
         """Adds ``--host`` and ``--port`` of a web page."""
-        self.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-        self.add_argument("--port", type=at_most(65535), default=8080, help="port to listen on (default: %(default)s)")
+        self.add_argument("--host", default="127.0.0.1", help="address to listen on")
+        self.add_argument("--port", type=at_most(65535), default=8080, help="port to listen on")
 
     def add_seed(self, default: int, several: bool = False) -> None:
         """Adds ``--seed`` and, if ``several``, ``--seeds``."""
         group = self.add_mutually_exclusive_group()
-        group.add_argument("--seed", type=seed, default=default, help="random seed (default: %(default)s)")
+        group.add_argument("--seed", type=seed, default=default, help="random seed")
         if several:
             text = "several seeds, such as 0-7 or 0,3,5: one run for each, and a table"
             group.add_argument("--seeds", type=seeds, help=text)
@@ -84,8 +92,7 @@ class Parser(argparse.ArgumentParser):
             name = f"--{field.name.replace('_', '-')}"
             if not field.metadata.get("flag") or name in self._option_string_actions:
                 continue
-            shown = "" if field.default in (None, "", False) or isinstance(field.default, bool) else " (default: %(default)s)"
-            text = about.get(field.name, "").replace("%", "%%") + shown
+            text = about.get(field.name, "").replace("%", "%%")
             if isinstance(field.default, bool):
                 self.add_argument(name, action="store_true", default=field.default, help=text)
             else:

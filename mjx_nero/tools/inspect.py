@@ -64,9 +64,7 @@ def _parser() -> cli.Parser:
     parser.add_argument("--preset", help="preset of the environment (default: the first)")
     parser.add_argument("--robot", help="robot in the environment, or to inspect alone: a name, or the folder of an imported one")
     parser.add_argument("--object", metavar="FILE", help="show a mesh object instead: a file, a folder or a name")
-    parser.add_argument(
-        "--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths (default: %(default)s)"
-    )
+    parser.add_argument("--scale", type=cli.positive_float, default=1.0, help="scale of --object's lengths")
     parser.add_argument("--no-self-test", dest="self_test", action="store_false", help="skip the self-test of an imported robot")
     parser.add_argument("--move", action="store_true", help="move every joint to its limits, and open and close the gripper")
     parser.add_argument("--render", type=cli.output(".png"), metavar="FILE", help="write a PNG of the robot at home")

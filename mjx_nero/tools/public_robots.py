@@ -52,9 +52,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--robots", help="list of robots, or none to only write the table (default: all robots that the JSON file lacks)"
     )
-    parser.add_argument(
-        "--jobs", type=cli.at_most(100), default=1, help="number of robots to import at once (default: %(default)s)"
-    )
+    parser.add_argument("--jobs", type=cli.at_most(100), default=1, help="number of robots to import at once")
     args, _ = parser.parse(argv)
     held = figures(args.json) if args.json.exists() else {}
     commits, robots = read(args.list)

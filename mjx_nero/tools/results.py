@@ -58,13 +58,9 @@ def main(argv: Sequence[str]) -> None:
         "--what", help=f"list of {', '.join(WHATS)}, or none to only show the table (default: all)", default=",".join(WHATS)
     )
     parser.add_argument("--envs", help="list of environments (default: all that can be trained)")
-    parser.add_argument(
-        "--preset", default="default", help="preset to train, or whose policies to measure (default: %(default)s)"
-    )
-    parser.add_argument("--seeds", type=cli.positive, default=8, help="seeds per environment (default: %(default)s)")
-    parser.add_argument(
-        "--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes per policy (default: %(default)s)"
-    )
+    parser.add_argument("--preset", default="default", help="preset to train, or whose policies to measure")
+    parser.add_argument("--seeds", type=cli.positive, default=8, help="seeds per environment")
+    parser.add_argument("--episodes", type=cli.at_most(1_000_000), default=1000, help="episodes per policy")
     args, _ = parser.parse(argv)
     whats = [] if args.what == "none" else cli.choices(args.what, "what", WHATS)
     held = read(args.json)

@@ -117,20 +117,14 @@ def _parser() -> cli.Parser:
         help=f"list of numbers of environments (default: {','.join(map(str, SIZES))}; for learning: train.py's default)",
     )
     parser.add_argument("--learner", help="learner for ppo and learning (default: the task's own)")
-    parser.add_argument(
-        "--num-devices", type=cli.positive, default=1, help="number of GPUs for ppo and learning (default: %(default)s)"
-    )
-    parser.add_argument("--impl", default="auto", help=f"list of physics: {', '.join(impls())} (default: %(default)s)")
-    parser.add_argument("--what", default="step", help="list of what to measure, see below (default: %(default)s)")
-    parser.add_argument("--steps", type=cli.positive, default=100, help="control steps per measurement (default: %(default)s)")
-    parser.add_argument(
-        "--repeats", type=cli.positive, default=5, help="number of measurements; the median is reported (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--batch", type=_sizes, default="1,100,1000,2000,10000", help="list of ik batch sizes, in poses (default: %(default)s)"
-    )
-    parser.add_argument("--seeds", type=cli.positive, default=8, help="number of seeds for learning (default: %(default)s)")
-    parser.add_argument("--target", type=cli.share, default=0.95, help="success rate that ends learning (default: %(default)s)")
+    parser.add_argument("--num-devices", type=cli.positive, default=1, help="number of GPUs for ppo and learning")
+    parser.add_argument("--impl", default="auto", help=f"list of physics: {', '.join(impls())}")
+    parser.add_argument("--what", default="step", help="list of what to measure, see below")
+    parser.add_argument("--steps", type=cli.positive, default=100, help="control steps per measurement")
+    parser.add_argument("--repeats", type=cli.positive, default=5, help="number of measurements; the median is reported")
+    parser.add_argument("--batch", type=_sizes, default="1,100,1000,2000,10000", help="list of ik batch sizes, in poses")
+    parser.add_argument("--seeds", type=cli.positive, default=8, help="number of seeds for learning")
+    parser.add_argument("--target", type=cli.share, default=0.95, help="success rate that ends learning")
     parser.add_argument("--num-timesteps", type=cli.positive, help="maximum env steps per seed (default: train.py's)")
     parser.add_argument("--eval-every", type=cli.positive, default=0, help="env steps between evaluations (default: 24 per run)")
     parser.add_argument(

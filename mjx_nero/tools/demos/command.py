@@ -36,9 +36,7 @@ def main(argv: Sequence[str]) -> None:
         "--sheet", type=cli.output(".png"), metavar="FILE", help="with --inspect: draw pictures of the first episodes"
     )
     parser.add_argument("--replay", type=cli.path(), metavar="DIR", help="replay an episode of a data set in simulation")
-    parser.add_argument(
-        "--episode", type=cli.number(int), default=0, help="with --replay: index of the episode, from 0 (default: %(default)s)"
-    )
+    parser.add_argument("--episode", type=cli.number(int), default=0, help="with --replay: index of the episode, from 0")
     parser.add_argument("--video", type=cli.output(".mp4"), help="with --replay: write a video of the episode")
     args, dotted = parser.parse(argv, ("env",), config_help.of_environment)
     asked = [name for name in ("out", "inspect", "replay") if getattr(args, name)]

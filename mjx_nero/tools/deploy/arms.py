@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 from mjx_nero.config.bounds import Bounds
+from mjx_nero.deploy.arm import ArmError
 from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
@@ -16,16 +17,6 @@ WARNING = (
     "nobody has tried this on hardware: the drivers are written from the makers' and LeRobot's sources and tested on emulators. "
     "Keep a hand on the power switch and people out of reach."
 )
-EXTRAS = {
-    "onnxruntime": "deploy",
-    "serial": "deploy",
-    "can": "deploy",
-    "pymodbus": "deploy",
-    "lerobot": "lerobot",
-    "cv2": "camera",
-    "pupil_apriltags": "camera",
-    "viser": "view",
-}
 KEPT = ("joints", "gripper", "body", "base", "regions", "command", "control_dt", "robot")
 
 
@@ -43,25 +34,13 @@ def add_arm(parser: cli.Parser) -> None:
 def add_limits(parser: cli.Parser) -> None:
     """Adds the flags of the safety layer. They move limits but switch none off."""
     add = parser.add_argument
-    add(
-        "--speed",
-        type=cli.share,
-        default=1.0,
-        metavar="SHARE",
-        help="maximum share of the joints' speed limits (default: %(default)s)",
-    )
-    add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table top [m] (default: %(default)s)")
+    add("--speed", type=cli.share, default=1.0, metavar="SHARE", help="maximum share of the joints' speed limits")
+    add("--table", type=cli.number(float), default=0.0, metavar="Z", help="height of the table top [m]")
     text = "box that no link may leave [m] (default: around home and the task's regions, with a margin of 0.3 m)"
     add("--workspace", metavar="X0,X1,Y0,Y1,Z0,Z1", help=text)
-    add("--apart", type=cli.non_negative, default=0.0, help="minimum distance between links [m] (default: %(default)s)")
+    add("--apart", type=cli.non_negative, default=0.0, help="minimum distance between links [m]")
     hottest = cli.number(Annotated[float, Bounds(20.0, 90.0)])
-    add(
-        "--hottest",
-        type=hottest,
-        default=60.0,
-        metavar="CELSIUS",
-        help="hold if a drive gets hotter than this (default: %(default)s)",
-    )
+    add("--hottest", type=hottest, default=60.0, metavar="CELSIUS", help="hold if a drive gets hotter than this")
 
 
 def check(parser: cli.Parser, args: argparse.Namespace) -> None:
@@ -75,19 +54,16 @@ def check(parser: cli.Parser, args: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def missing() -> Iterator[None]:
-    """Reports a missing package in one line, with the extra to install.
+def in_reach() -> Iterator[None]:
+    """Reports in one line that an arm is lost.
 
     Raises:
-        UserError: a package is missing.
+        UserError: it is.
     """
     try:
         yield
-    except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
-            raise
-        raise UserError(f"the package {error.name} is missing: pip install 'mjx-nero[{extra}]'") from None
+    except ArmError as error:
+        raise UserError(f"the arm is lost: {error}") from None
 
 
 def numbers(text: str | None, counts: Sequence[int], flag: str) -> list[float] | None:

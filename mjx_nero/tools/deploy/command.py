@@ -8,9 +8,7 @@ from typing import Annotated, Any
 
 from mjx_nero.config.bounds import Bounds
 from mjx_nero.deploy import check, drivers
-from mjx_nero.deploy.arm import ArmError
 from mjx_nero.deploy.pictures import summary
-from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 from mjx_nero.tools.deploy import arms
 
@@ -30,11 +28,8 @@ def main(argv: Sequence[str]) -> None:
     arms.check(parser, args)
     if args.check and args.dry_run:
         parser.error("--check moves the arm, and --dry-run does not: pass one of them")
-    try:
-        with arms.missing():
-            ended = _run(args)
-    except ArmError as error:
-        raise UserError(f"the arm is lost: {error}") from None
+    with arms.in_reach():
+        ended = _run(args)
     if ended:
         raise SystemExit(FAULT)
 
@@ -59,7 +54,7 @@ def _parser() -> cli.Parser:
         metavar="X,Y,Z",
         help="goal position [m], optionally followed by its orientation W,X,Y,Z (default: the middle of the task's region)",
     )
-    add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts [s] (default: %(default)s)")
+    add("--seconds", type=cli.non_negative, default=10.0, help="how long the policy acts [s]")
     text = "time until a target takes effect [s], as identify measures it; the policy then sees its own targets equally late"
     add(
         "--delay",
@@ -70,11 +65,7 @@ def _parser() -> cli.Parser:
     add("--dry-run", action="store_true", help="read the arm and show what would be sent, but send nothing")
     text = "instead of running the policy, move each joint a little, ask what you saw, and write offsets and delay"
     add("--check", type=cli.output(".yaml", ".yml", marks=(check.MARK,)), metavar="FILE", help=text)
-    add(
-        "--log",
-        type=cli.output(".csv", marks=(NOTE,)),
-        help="write a table of everything read and sent, which identify reads",
-    )
+    add("--log", type=cli.output(".csv", marks=(NOTE,)), help="write a table of everything read and sent, which identify reads")
     add("--alive", type=cli.path(), metavar="FILE", help="hold unless this file is touched at least every half second")
     arms.add_limits(parser)
     return parser

@@ -1,13 +1,9 @@
 """The commands ``record`` and ``identify``."""
 
 import argparse
-import dataclasses
 from collections.abc import Sequence
 
-from mjx_nero import config
 from mjx_nero.deploy import drivers
-from mjx_nero.deploy.arm import ArmError
-from mjx_nero.errors import UserError
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.fit import identify
 from mjx_nero.identify.plant import Plant, usual_step
@@ -39,12 +35,7 @@ def record_main(argv: Sequence[str]) -> None:
         required=True,
         help="log to write: a comma-separated table (docs/guides/identification.md)",
     )
-    about = config.describe(RecordCfg())
-    for field in dataclasses.fields(RecordCfg):
-        kind = cli.seed if field.name == "seed" else cli.number(field.type)
-        parser.add_argument(
-            f"--{field.name}", type=kind, default=field.default, help=f"{about[field.name]} (default: %(default)s)"
-        )
+    parser.add_fields(RecordCfg)
     args, _ = parser.parse(argv)
     if wrong := parser.given(argv) & (_SIMULATED if args.arm else _ARM):
         flags = ", ".join(f"--{name}" for name in sorted(wrong))
@@ -52,9 +43,8 @@ def record_main(argv: Sequence[str]) -> None:
     if args.arm:
         _record_arm(parser, args)
         return
-    cfg = RecordCfg(**{field.name: getattr(args, field.name) for field in dataclasses.fields(RecordCfg)})
     plant = _plant(args)
-    log, truth = record(plant, cfg)
+    log, truth = record(plant, RecordCfg(**cli.fields(args, RecordCfg)))
     notes = [
         f"{logs.ROBOT}{plant.robot.name}",
         SIMULATED,
@@ -72,13 +62,10 @@ def _record_arm(parser: cli.Parser, args: argparse.Namespace) -> None:
         SystemExit: the arm holds because something failed.
     """
     arms.check(parser, args)
-    try:
-        with arms.missing():
-            from mjx_nero.tools.identification.arm import record_arm
+    from mjx_nero.tools.identification.arm import record_arm
 
-            failed = record_arm(args, registry.robot(args.robot))
-    except ArmError as error:
-        raise UserError(f"the arm is lost: {error}") from None
+    with arms.in_reach():
+        failed = record_arm(args, registry.robot(args.robot))
     console.wrote(console.screen(), "log", args.out)
     if failed:
         raise SystemExit(FAULT)

@@ -27,7 +27,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_environment()
     parser.add_argument("--policy", type=cli.path(), help="policy file (default: the bundled policy)")
-    parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting (default: %(default)s)")
+    parser.add_argument("--episodes", type=cli.at_most(100_000), default=200, help="episodes per setting")
     parser.add_seed(90210)
     parser.add_impl()
     parser.add_argument(

@@ -27,13 +27,12 @@ def main(argv: Sequence[str]) -> None:
         "--step",
         type=cli.positive_float,
         default=0.1,
-        help="step of the target that the drives must follow within their effort [rad or m]; at most a tenth of a joint's range "
-        "(default: %(default)s)",
+        help="step of the target that the drives must follow within their effort [rad or m]; at most a tenth of a joint's range",
     )
     parser.add_argument(
         "--frequency", type=cli.positive_float, help="maximum natural frequency [Hz] (default: one radian per control step)"
     )
-    parser.add_argument("--dt", type=cli.positive_float, default=SimCfg.dt, help="physics step [s] (default: %(default)s)")
+    parser.add_argument("--dt", type=cli.positive_float, default=SimCfg.dt, help="physics step [s]")
     parser.add_argument(
         "--gravity-compensation", action=argparse.BooleanOptionalAction, help="override the robot's gravity compensation"
     )

@@ -21,12 +21,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--agent", help="agent that acts first: expert, a controller, zero, random or 'joint sliders' (default: a policy)"
     )
-    parser.add_argument(
-        "--run",
-        type=pathlib.Path,
-        metavar="FOLDER",
-        help="run folder to follow: play its newest checkpoint",
-    )
+    parser.add_argument("--run", type=pathlib.Path, metavar="FOLDER", help="run folder to follow: play its newest checkpoint")
     parser.add_argument(
         "--demos",
         type=cli.path(),
@@ -43,9 +38,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--calibration", type=cli.path(".json"), help="with --leader: LeRobot's calibration file of the leader arm"
     )
-    parser.add_argument(
-        "--num-envs", type=cli.at_most(100), default=1, help="number of environments side by side (default: %(default)s)"
-    )
+    parser.add_argument("--num-envs", type=cli.at_most(100), default=1, help="number of environments side by side")
     parser.add_seed(1)
     parser.add_address()
     args, dotted = parser.parse(argv, ("env",), config_help.of_environment)
