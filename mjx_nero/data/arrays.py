@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from mjx_nero import files
 from mjx_nero.config.values import read
 from mjx_nero.data import folder
-from mjx_nero.data.episode import Dataset, Episode, Feature, Schema, check
+from mjx_nero.data.episode import Episode, Feature, Schema, check
 from mjx_nero.errors import UserError
 
 INDEX = "meta/pieces.json"
@@ -110,10 +110,6 @@ class ArraysForm:
                 part = file.get_slice(name)
                 for k in range(part.get_shape()[0]):
                     yield part[k : k + 1][0]
-
-    def dataset(self) -> Dataset:
-        """Returns the data set as it is now."""
-        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
 
 def _save(arrays: dict[str, np.ndarray], path: pathlib.Path) -> None:

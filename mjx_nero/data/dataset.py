@@ -36,7 +36,8 @@ class Form(Protocol):
     def tidy(self) -> None: ...
     def put(self, episodes: Sequence[Episode]) -> None: ...
     def finish(self) -> None: ...
-    def dataset(self) -> Dataset: ...
+    def column(self, name: str) -> np.ndarray: ...
+    def frames(self, name: str) -> Iterator[np.ndarray]: ...
 
 
 def _make(name: str, path: pathlib.Path, schema: Schema) -> Form:
@@ -96,7 +97,8 @@ def open_dataset(path: pathlib.Path) -> Dataset:
     schema, form = folder.schema_of(path), _held(path)
     if form is None:
         raise UserError(f"{path} holds no episode yet: repeat the command that started it")
-    return _make(form, path, schema).dataset()
+    made = _make(form, path, schema)
+    return Dataset(schema, made.lengths, made.success, made.numbers, made.column, made.frames)
 
 
 def open_with(path: pathlib.Path, index: int) -> Dataset:

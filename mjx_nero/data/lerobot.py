@@ -19,7 +19,7 @@ from mjx_nero import files
 from mjx_nero.config.values import read
 from mjx_nero.data import folder, stats, video
 from mjx_nero.data import lerobot_files as lf
-from mjx_nero.data.episode import Dataset, Episode, Schema, check
+from mjx_nero.data.episode import Episode, Schema, check
 from mjx_nero.data.lerobot_files import pa, parquet
 from mjx_nero.errors import UserError
 
@@ -138,10 +138,6 @@ class LeRobotForm:
         """Yields a camera's frames."""
         for piece in range(self._pieces):
             yield from video.frames(self._place(lf.film(name), piece))
-
-    def dataset(self) -> Dataset:
-        """Returns the data set as it is now."""
-        return Dataset(self.schema, self.lengths, self.success, self.numbers, self.column, self.frames)
 
     def _steps(self, episodes: Sequence[Episode]) -> pa.Table:
         for episode in episodes:

@@ -23,6 +23,7 @@ import numpy as np
 
 from mjx_nero import files
 from mjx_nero.deploy.body import matrix, transform
+from mjx_nero.deploy.pictures import opened
 from mjx_nero.deploy.places import FRESH, Known, Lost, Place
 from mjx_nero.errors import UserError
 
@@ -110,17 +111,8 @@ class FromTags(Known):
     def _open(self) -> Pictures:
         import cv2
 
-        capture = cv2.VideoCapture(self._camera.source)
-        if not capture.isOpened():
-            raise UserError(f"cannot open camera {self._camera.source!r}: give OpenCV's number or address of a camera")
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        self._end = capture.release
-
-        def pictures() -> np.ndarray | None:
-            there, picture = capture.read()
-            return cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if there else None
-
-        return pictures
+        shown, self._end = opened(self._camera.source)
+        return lambda: None if (picture := shown()) is None else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
 
     def _run(self) -> None:
         while not self._over.is_set():

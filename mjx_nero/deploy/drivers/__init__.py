@@ -5,7 +5,6 @@ from typing import Any
 
 from mjx_nero.deploy.arm import Arm, Clock
 from mjx_nero.deploy.drivers import bcap
-from mjx_nero.deploy.executor import Lag
 from mjx_nero.errors import UserError
 
 KINDS = ("sim", "so101", "so100", "piper", "nero", "cobotta", "lerobot")
@@ -52,11 +51,10 @@ def make(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any], clo
         UserError: the arm is unknown or not the policy's robot, or a package or file is missing.
     """
     check(kind, metadata)
-    joints = tuple(metadata["joints"]["names"])
     if kind == "sim":
         from mjx_nero.deploy.drivers import sim
 
-        return sim.of(metadata, joints, Lag.of(metadata).lead, clock, **options)
+        return sim.of(metadata, clock, **options)
     if kind in ("so101", "so100"):
         from mjx_nero.deploy.drivers import so_arm
 

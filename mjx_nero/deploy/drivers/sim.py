@@ -1,15 +1,14 @@
 """The simulated arm: MuJoCo's C library in real time, with the drives of training."""
 
-import dataclasses
-import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from mjx_nero.deploy.arm import Clock, Feedback
+from mjx_nero.deploy.emulators import plant as plants
 from mjx_nero.deploy.emulators.plant import Plant
-from mjx_nero.deploy.places import sender
+from mjx_nero.deploy.executor import Lag
 
 
 class SimArm:
@@ -47,28 +46,7 @@ class SimArm:
         """See ``Arm``."""
 
 
-def of(
-    metadata: Mapping[str, Any],
-    joints: tuple[str, ...],
-    lead: np.ndarray,
-    clock: Clock,
-    model: str,
-    tracker: int | None = None,
-    start: Sequence[float] | None = None,
-    objects: Mapping[str, Sequence[float]] | None = None,
-    **faults: Any,
-) -> SimArm:
-    """Makes the arm of a model file (``.mjb``).
-
-    Args:
-        tracker: port of this machine to which object positions are sent.
-        start: first positions of the joints [rad or m]; None: home.
-        objects: first positions of the objects, in the root frame [m].
-        faults: fields of ``emulators.plant.Faults``.
-    """
-    at = np.array(metadata["joints"]["home"] if start is None else start, float)
-    told = sender("127.0.0.1", tracker) if tracker else None
-    plant = Plant(pathlib.Path(model), joints, at, clock, metadata["base"]["position"], told)
-    plant.faults = dataclasses.replace(plant.faults, **faults)
-    plant.reset(at, {name: np.array(position, float) for name, position in (objects or {}).items()})
-    return SimArm(plant, joints, lead, clock)
+def of(metadata: Mapping[str, Any], clock: Clock, **scene: Any) -> SimArm:
+    """Makes the arm of a scene; see ``plant.of``."""
+    made = plants.of(metadata, clock, **scene)
+    return SimArm(made, tuple(metadata["joints"]["names"]), Lag.of(metadata).lead, clock)

@@ -53,22 +53,12 @@ class Port(Protocol):
 
 def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
     """Runs an emulator's process: makes the plant that ``started`` describes, prints the ports, and serves until input ends."""
-    import dataclasses
-
-    import numpy as np
-
-    from mjx_nero.deploy.emulators.plant import Plant
+    from mjx_nero.deploy.emulators import plant
     from mjx_nero.deploy.guard import WallClock, urgent
-    from mjx_nero.deploy.places import sender
 
     told = json.loads(sys.argv[1])
-    metadata, own = told["metadata"], told["metadata"]["joints"]
-    tracker = sender("127.0.0.1", told["tracker"]) if told.get("tracker") else None
-    start = np.array(told.get("start") or own["home"], float)
-    plant = Plant(pathlib.Path(told["model"]), own["names"], start, WallClock(), metadata["base"]["position"], tracker)
-    plant.faults = dataclasses.replace(plant.faults, **told.get("faults", {}))
-    plant.reset(start, {name: np.array(position, float) for name, position in told.get("objects", {}).items()})
-    port = port_of(plant, told)
+    scene = {name: told.get(name) for name in ("model", "tracker", "start", "objects", "faults")}
+    port = port_of(plant.of(told["metadata"], WallClock(), **scene), told)
     gripper = getattr(port, "gripper", None)
     print(json.dumps({"port": port.name, **({"gripper": gripper} if gripper else {})}), flush=True)
     with urgent():

@@ -6,14 +6,14 @@ import dataclasses
 import functools
 import pathlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import mujoco
 import numpy as np
 
 from mjx_nero.deploy.arm import Clock
-from mjx_nero.deploy.places import Sender
+from mjx_nero.deploy.places import Sender, sender
 
 _SLOW = 0.02  # damping over stiffness of a drive that counts as slow [s]
 _LONGEST = 0.5  # maximum time to catch up at once [s]; after a longer pause of the program the arm has not moved on
@@ -45,6 +45,33 @@ def _alone(method: Method) -> Method:
             return method(plant, *args, **kwargs)
 
     return cast(Method, locked)
+
+
+def of(
+    metadata: Mapping[str, Any],
+    clock: Clock,
+    model: str,
+    tracker: int | None = None,
+    start: Sequence[float] | None = None,
+    objects: Mapping[str, Sequence[float]] | None = None,
+    faults: Mapping[str, Any] | None = None,
+) -> "Plant":
+    """Makes the plant of a policy's or a robot's metadata.
+
+    Args:
+        model: file of the scene (``.mjb``).
+        tracker: port of this machine to which object positions are sent.
+        start: first positions of the joints [rad or m]; None: home.
+        objects: first positions of the objects, in the root frame [m].
+        faults: fields of ``Faults``.
+    """
+    own = metadata["joints"]
+    at = np.array(own["home"] if start is None else start, float)
+    told = sender("127.0.0.1", tracker) if tracker else None
+    plant = Plant(pathlib.Path(model), own["names"], at, clock, metadata["base"]["position"], told)
+    plant.faults = Faults(**(faults or {}))
+    plant.reset(at, {name: np.array(position, float) for name, position in (objects or {}).items()})
+    return plant
 
 
 class Plant:

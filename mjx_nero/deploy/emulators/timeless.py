@@ -6,8 +6,6 @@ Registers, frames and drivers are the same as in the emulators with separate pro
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from mjx_nero.deploy.arm import Arm
 from mjx_nero.deploy.drivers import agilex, feetech, sim, so_arm
 from mjx_nero.deploy.emulators import agilex as can
@@ -115,8 +113,3 @@ def engaged(kind: str, told: Mapping[str, Any], plant: Plant, clock: Clock) -> t
         close()
 
     return arm, unplug
-
-
-def home_of(told: Mapping[str, Any]) -> np.ndarray:
-    """Returns the home positions of all joints [rad or m]."""
-    return np.array(told["joints"]["home"], float)

@@ -48,7 +48,7 @@ def lifts(
     """
     brain, clock, rng = Brain(policy), timeless.Clock(), np.random.default_rng(seed)
     told, ended, good = brain.metadata, [], 0
-    home, region = timeless.home_of(told), np.array([told["command"][axis] for axis in "xyz"])
+    home, region = np.array(told["joints"]["home"], float), np.array([told["command"][axis] for axis in "xyz"])
     event = next(term for term in cfg.events.values() if "x" in term.params)
     cubes, base = np.array([event.params[axis] for axis in "xy"]), told["base"]["position"]
     model, names = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False), told["joints"]["names"]
