@@ -195,7 +195,8 @@ def _line(above: Mapping[str, Joint], link: str) -> list[str]:
 def _position(tree: Tree, name: str, value: float | None) -> float:
     moving = {n: j for n, j in tree.joints.items() if j.moves}
     if name not in moving:
-        raise UserError(f"--fix names joint {config.short(name)}{config.hint(name, moving)}: choose from {_few(list(moving))}")
+        choices = ", ".join([*moving][:12]) + ", ..." * (len(moving) > 12)
+        raise UserError(f"--fix names joint {config.short(name)}{config.hint(name, moving)}: choose from {choices}")
     joint = moving[name]
     if value is None:
         return nearest(joint)
@@ -207,7 +208,3 @@ def _position(tree: Tree, name: str, value: float | None) -> float:
 def nearest(joint: Joint) -> float:
     """Returns the position nearest to 0 [rad, m]."""
     return float(np.clip(0.0, joint.lower, joint.upper))
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:12]) + ", ..." * (len(names) > 12)

@@ -56,6 +56,11 @@ class Cloud:
         turning = [b for b in self._parts.values() if b.joint and b.joint.name in self.arm and b.joint.type != "prismatic"]
         return self.poses[turning[0].name][0, :3, 3] if turning else np.zeros(3)
 
+    @property
+    def reach(self) -> float:
+        """Distance of the grasp point from the shoulder that all but the farthest hundredth of the poses keep [m]."""
+        return float(np.quantile(np.linalg.norm(self.site[1:, :3, 3] - self.shoulder, axis=1), 0.99))
+
     def at(self, q: Float[np.ndarray, "n k"]) -> dict[str, Poses]:
         """Poses [n, 4, 4] of the bodies with the arm's joints at ``q`` and an open gripper."""
         driven = {j: np.full(len(q), self.q[j][1]) for j in self._hand.joints} | dict(zip(self.arm, q.T, strict=True))

@@ -16,7 +16,7 @@ from mjx_nero.urdf.fingers import Grip, Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
 from mjx_nero.urdf.swing import Swing, surface
-from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Poses, Tree, Values, Vec, body_of, depth
+from mjx_nero.urdf.tree import Body, Matrix, Points, Pose, Poses, Tree, Values, Vec, body_of, carriers
 from mjx_nero.urdf.tree import poses as body_poses
 
 _TIPS = re.compile(r"tcp|(^|[_/])ee(_|$)|end_?effector|grasp|gripper_frame|hand_tip", re.IGNORECASE)
@@ -134,16 +134,14 @@ class _Gripper:
             moving, jaw = self._fingers(share, frame)
             fit = pads.fitted(moving, jaw, frame)
             sides = {finger.name: finger.outward for finger in (*(f for f, _ in moving), *([jaw] if jaw else []))}
-            gaps = np.array([self._gap(k, fit, sides) for k in range(SHARES)])
+            at = [{n: self._way[n][k] for n in fit.pads} for k in range(SHARES)]
+            gaps = np.array([pads.gap(fit.pads, poses, sides) for poses in at])
             held = _Held(frame, frame @ pads.middle(fit.held, frame), share, fit, (float(gaps[0]), float(gaps[-1])))
             edge = grasp.edge(held.gaps[1], self._extents(held), held.gaps[0])
             if not gaps[0] < edge < gaps[-1]:
                 break
             share = float(np.interp(edge, np.maximum.accumulate(gaps) + 1e-9 * self._shares, self._shares))
         return held
-
-    def _gap(self, k: int, fit: pads.Pads, sides: Mapping[str, float]) -> float:
-        return pads.gap(fit.pads, {n: self._way[n][k] for n in fit.pads}, sides)
 
     def _frame(self, share: float, ahead: Vec | None) -> Matrix:
         """Builds the frame of the fingers there: where they point, how they open, and across both."""
@@ -357,7 +355,7 @@ def _tool(parts: dict[str, Body]) -> str:
 
     Without a telling name, it is a link on the last joint's axis, where flanges are.
     """
-    last = parts[max(parts, key=lambda n: depth(parts, n))]
+    last = parts[max(parts, key=lambda n: len(carriers(parts, n)))]
     links = [n for n in last.links if not SENSORS.search(n)] or list(last.links)
     for pattern in _TOOLS:
         found = [n for n in links if pattern.search(n)]

@@ -13,8 +13,8 @@ from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.primitives import Primitive
 from mjx_nero.urdf.regions import Place, Quat
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.rest import seen
-from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of
+from mjx_nero.urdf.swing import surface
+from mjx_nero.urdf.tree import Body, Points, Poses, Values, Vec, body_of, carriers
 from mjx_nero.urdf.workspace import Box
 
 STARTS = 48  # number of descents to the middle of the workspace
@@ -184,8 +184,7 @@ def _comfort(cloud: Cloud, q: Float[np.ndarray, "n k"], poses: Mapping[str, Pose
     """Rates poses as starts: far from limits, singularities and the table, joints turned little, links high."""
     spare = np.minimum(q - cloud.lower, cloud.upper - q) / (cloud.upper - cloud.lower)
     spare = np.where(cloud.endless, 1.0, spare).min(1)
-    reach = float(np.quantile(np.linalg.norm(cloud.site[1:, :3, 3] - cloud.shoulder, axis=1), 0.99))
-    jacobian = cloud.jacobian(poses)
+    jacobian, reach = cloud.jacobian(poses), cloud.reach
     jacobian[:, :3] /= reach
     agile = np.linalg.svd(jacobian, compute_uv=False)[:, min(jacobian.shape[1:]) - 1]
     turned = np.abs(q - np.array([cloud.q[j][0] for j in cloud.arm])).mean(1) / np.pi
@@ -210,8 +209,7 @@ def _touching(
     out = np.zeros(n, bool)
     surfaces: dict[str, Points] = {}
     for body in parts.values():
-        if found := seen(body, looks):
-            points = np.concatenate(found)
+        if (points := surface(body.links, looks)) is not None:
             surfaces[body.name] = points[:: 1 + len(points) // POINTS]
     for link, shape, _ in shapes:
         body = body_of(parts, link)
@@ -229,8 +227,4 @@ def _touching(
 
 def _apart(parts: dict[str, Body], a: str, b: str) -> int:
     """Number of joints between two bodies."""
-    return len(set(_line(parts, a)) ^ set(_line(parts, b)))
-
-
-def _line(parts: dict[str, Body], name: str) -> list[str]:
-    return [name, *_line(parts, parts[name].parent)] if name else []
+    return len(set(carriers(parts, a)) ^ set(carriers(parts, b)))

@@ -120,11 +120,11 @@ def find(cloud: Cloud, hand: Hand, work: Box | None, down: Quat, shapes: Shapes,
         pick = _pick(Reaching(cloud, shapes, shun, tilt, ways[0][0]), work, low)
         if pick is not None:
             found.append((_width(pick), pick, how, tilt, ways))
-            if not tilt or _width(pick) > WIDTH * _reach(cloud):
+            if not tilt or _width(pick) > WIDTH * cloud.reach:
                 break
     if found:
         _, pick, how, tilt, ways = max(found, key=lambda item: item[0])
-        hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=_reach(cloud))
+        hold = _hold(Reaching(cloud, shapes, shun, HELD), pick, reach=cloud.reach)
         notes.add("guessed", "robot", name, f"pick: {_text(pick)}, the hand {how}")
         notes.add("guessed", "robot", name, f"hold: {_text(hold)}")
         if how == exact and ways[0] is either[0] and Reaching(cloud, shapes, shun, tilt, -along).everywhere(pick):
@@ -154,13 +154,9 @@ def _text(box: Box) -> str:
     return ", ".join(f"{k} {a:g} .. {b:g}" for k, (a, b) in zip("xyz", box, strict=True))
 
 
-def _reach(cloud: Cloud) -> float:
-    return float(np.quantile(np.linalg.norm(cloud.site[1:, :3, 3] - cloud.shoulder, axis=1), 0.99))
-
-
 def _pick(reaching: Reaching, work: Box, low: float) -> Box | None:
     cloud = reaching.cloud
-    reach, origin = _reach(cloud), cloud.shoulder
+    reach, origin = cloud.reach, cloud.shoulder
     cell = reach / CELLS
     middle = np.mean(work, axis=1)[:2] - origin[:2]
     axis = int(np.argmax(np.abs(middle)))

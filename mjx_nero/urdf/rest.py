@@ -8,7 +8,8 @@ import numpy as np
 from mjx_nero.urdf.fingers import Hand
 from mjx_nero.urdf.geometry import Look
 from mjx_nero.urdf.report import Notes
-from mjx_nero.urdf.tree import Body, Points, Pose, body_of
+from mjx_nero.urdf.swing import surface
+from mjx_nero.urdf.tree import Body, Pose, body_of, carriers
 
 SINKS = 0.1  # [m] a base that goes further below its frame is a pedestal on the floor beside the table
 UPRIGHT = 0.99  # least cosine of a base's tilt on the table
@@ -34,8 +35,8 @@ def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: 
     table's height. A hanging robot hangs where the table is within reach.
     """
     base = next(iter(parts.values()))
-    points = seen(base, looks)
-    low = min(float((p @ mount[2, :3]).min()) for p in points) if points else 0.0
+    points = surface(base.links, looks)
+    low = 0.0 if points is None else float((points @ mount[2, :3]).min())
     chain = _chain(parts, hand)
     shoulder = float((mount[:3, :3] @ _pose(parts, chain[0].name)[:3, 3])[2]) if chain else 0.0
     length = sum(float(np.linalg.norm(b.frame[:3, 3])) for b in chain[1:])
@@ -51,7 +52,7 @@ def stand(parts: dict[str, Body], looks: Mapping[str, Look], hand: Hand, mount: 
         mount = _at(mount, -round(shoulder - BELOW * length, 2))
         notes.add("guessed", "robot", name, f"it stands on the floor: the table is {-mount[2, 3]:g} m higher (base_pos)")
         return Stand(mount, round(float(mount[2, 3]) + low, 3))
-    if points and mount[2, 2] > UPRIGHT and mount[2, 3] + low > SINKS:
+    if points is not None and mount[2, 2] > UPRIGHT and mount[2, 3] + low > SINKS:
         notes.add("guessed", "robot", name, f"mounted {mount[2, 3]:.2f} m up on nothing: put on the table (base_pos)")
         mount = _at(mount, -low)
     return Stand(mount, 0.0)
@@ -76,11 +77,7 @@ def _hung(mount: Pose, shoulder: float, length: float, name: str, notes: Notes) 
 
 def _chain(parts: dict[str, Body], hand: Hand) -> list[Body]:
     """Lists the bodies from the base to the hand, without the slides of a lift at the start."""
-    chain: list[Body] = []
-    at = body_of(parts, hand.link)
-    while at.joint is not None:
-        chain.insert(0, at)
-        at = parts[at.parent]
+    chain = [parts[n] for n in carriers(parts, body_of(parts, hand.link).name)[-2::-1]]
     while len(chain) > 1 and chain[0].joint and chain[0].joint.type == "prismatic":
         chain = chain[1:]
     return chain
@@ -102,9 +99,3 @@ def _at(mount: Pose, height: float) -> Pose:
 def _pose(parts: dict[str, Body], name: str) -> Pose:
     """Pose of a body in the base at joint positions 0."""
     return _pose(parts, parts[name].parent) @ parts[name].frame if parts[name].parent else parts[name].frame
-
-
-def seen(body: Body, looks: Mapping[str, Look]) -> list[Points]:
-    """Surface points [n, 3] of each of a body's links whose collision meshes were read, in the body's frame."""
-    known = [(looks[link], at) for link, at in body.links.items()]
-    return [look.points @ at[:3, :3].T + at[:3, 3] for look, at in known if look.points is not None and not look.guessed]

@@ -171,9 +171,9 @@ def body_of(parts: dict[str, Body], link: str) -> Body:
     return next(b for b in parts.values() if link in b.links)
 
 
-def depth(parts: dict[str, Body], name: str) -> int:
-    """Number of bodies from the base to this one, including both."""
-    return 1 + depth(parts, parts[name].parent) if parts[name].parent else 0
+def carriers(parts: dict[str, Body], name: str) -> list[str]:
+    """Lists a body and those that carry it, down to the base."""
+    return [name, *carriers(parts, parts[name].parent)] if name else []
 
 
 def positions(parts: dict[str, Body], driven: dict[str, Values], n: int) -> dict[str, Values]:

@@ -56,15 +56,13 @@ def workspace(cloud: Cloud, name: str, notes: Notes) -> tuple[Box | None, bool]:
     of its first cell to that of its last. In front means +x, unless another side has more than ``FRONT`` times as many reachable
     cells. The box shrinks until inverse kinematics reaches 27 of its points, including corners and centre.
     """
-    origin = cloud.shoulder
-    at = cloud.site[1:, :3, 3] - origin
-    reach = float(np.quantile(np.linalg.norm(at, axis=1), 0.99))
+    origin, reach = cloud.shoulder, cloud.reach
     if reach < 0.02:
         notes.add("warning", "robot", name, "no workspace: the grasp point hardly moves; give one in robot.yaml")
         return None, False
     cell = reach / CELLS
     centre = (np.arange(2 * CELLS) - CELLS + 0.5) * cell
-    seen = _visited(at, cell)
+    seen = _visited(cloud.site[1:, :3, 3] - origin, cell)
     floor = -cloud.height - origin[2] + TABLE  # lowest height of a box, from the shoulder
     room = [(seen & _ahead(centre, reach, floor, side)).sum() * (1 if side else FRONT) for side in range(len(SIDES))]
     side = int(np.argmax(room))
