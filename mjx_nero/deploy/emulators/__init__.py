@@ -4,14 +4,13 @@ import contextlib
 import json
 import pathlib
 import subprocess
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from mjx_nero.deploy import children
 from mjx_nero.errors import UserError
 
-_MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "agilex", "cobotta": "bcap"}
+MODULES = {"so101": "feetech", "so100": "feetech", "piper": "agilex", "nero": "agilex", "cobotta": "bcap"}
 
 
 @contextlib.contextmanager
@@ -26,12 +25,12 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
     """
     folder, driver = pathlib.Path(options["model"]).parent, {}
     told = {"kind": kind, "metadata": {name: metadata[name] for name in ("joints", "gripper", "base", "robot")}, **options}
-    if _MODULES[kind] == "feetech":
+    if MODULES[kind] == "feetech":
         from mjx_nero.deploy.emulators import feetech
 
         driver["calibration"] = told["calibration"] = str(folder / "calibration.json")
         (folder / "calibration.json").write_text(json.dumps(feetech.calibration(metadata, kind)))
-    argv = children.command(f"mjx_nero.deploy.emulators.{_MODULES[kind]}", json.dumps(told))
+    argv = children.command(__name__, json.dumps(told))
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": children.environment()}
     with subprocess.Popen(argv, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         try:
@@ -41,25 +40,3 @@ def started(kind: str, options: Mapping[str, Any], metadata: Mapping[str, Any]) 
         finally:
             process.stdin.close()
             process.wait(10)
-
-
-class Port(Protocol):
-    """An emulated arm that listens on a port of this machine."""
-
-    name: str
-
-    def serve(self, until: Callable[[], bool] = ..., other: int | None = ...) -> None: ...
-
-
-def process(port_of: Callable[[Any, Mapping[str, Any]], Port]) -> None:
-    """Runs an emulator's process: makes the plant that ``started`` describes, prints the ports, and serves until input ends."""
-    from mjx_nero.deploy.emulators import plant
-    from mjx_nero.deploy.guard import WallClock, urgent
-
-    told = json.loads(sys.argv[1])
-    scene = {name: told.get(name) for name in ("model", "tracker", "start", "objects", "faults")}
-    port = port_of(plant.of(told["metadata"], WallClock(), **scene), told)
-    gripper = getattr(port, "gripper", None)
-    print(json.dumps({"port": port.name, **({"gripper": gripper} if gripper else {})}), flush=True)
-    with urgent():
-        port.serve(other=sys.stdin.fileno())

@@ -1,13 +1,12 @@
 """An emulated Piper or Nero behind a serial CAN adapter (SLCAN), which sends its frames 200 times per second.
 
-    python -m mjx_nero.deploy.emulators.agilex '{"model": "scene.mjb", ...}'
-
-prints the port for ``--port``, and serves until its input ends. It counts what a runtime must never do: ``torque_cuts``.
+It counts what a runtime must never do: ``torque_cuts``.
 """
 
 import dataclasses
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -155,12 +154,6 @@ class Port:
         self._left = self._left[self._line.write(self._left) :]
 
 
-def main() -> None:
-    """Runs the emulator's process."""
-    from mjx_nero.deploy.emulators import process
-
-    process(lambda plant, told: Port(Arm(plant, agilex.MODELS[told["kind"]]), Line()))
-
-
-if __name__ == "__main__":
-    main()
+def port_of(plant: Plant, told: Mapping[str, Any]) -> Port:
+    """Makes the arm that ``emulators.started`` describes."""
+    return Port(Arm(plant, agilex.MODELS[told["kind"]]), Line())

@@ -1,10 +1,7 @@
 """An emulated Cobotta Pro controller with its RG6: b-CAP over TCP and UDP, and Modbus over TCP.
 
-    python -m mjx_nero.deploy.emulators.bcap '{"model": "scene.mjb", ...}'
-
-prints both addresses and serves until its input ends. In slave mode it executes a target every 8 ms. Three targets can wait; the
-sender of a fourth has to wait itself. If targets stop, the controller leaves slave mode and the arm stands still. It counts what
-a runtime must never do: ``torque_cuts``.
+In slave mode it executes a target every 8 ms. Three targets can wait; the sender of a fourth has to wait itself. If targets stop,
+the controller leaves slave mode and the arm stands still. It counts what a runtime must never do: ``torque_cuts``.
 """
 
 import contextlib
@@ -14,7 +11,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -219,12 +216,6 @@ class Port:
             each.close()
 
 
-def main() -> None:
-    """Runs the emulator's process."""
-    from mjx_nero.deploy.emulators import process
-
-    process(lambda plant, told: Port(Controller(plant, np.array(told["metadata"]["joints"]["speed"])[:_ARM])))
-
-
-if __name__ == "__main__":
-    main()
+def port_of(plant: Plant, told: Mapping[str, Any]) -> Port:
+    """Makes the arm that ``emulators.started`` describes."""
+    return Port(Controller(plant, np.array(told["metadata"]["joints"]["speed"])[:_ARM]))

@@ -1,9 +1,6 @@
 """Emulated STS3215 servos behind a serial line: registers in EEPROM and RAM, and answers at the real bus's pace.
 
-    python -m mjx_nero.deploy.emulators.feetech '{"model": "scene.mjb", ...}'
-
-prints the port's name and serves until its input ends. It counts what a runtime must never do: ``eeprom_writes`` and
-``torque_cuts``.
+It counts what a runtime must never do: ``eeprom_writes`` and ``torque_cuts``.
 """
 
 import dataclasses
@@ -232,18 +229,9 @@ def servos_of(metadata: Mapping[str, Any], kind: str, entries: Mapping[str, Mapp
     return Servos(plant, [entries[name] for name in own["names"]], limits, grips, middle)
 
 
-def main() -> None:
-    """Runs the emulator's process."""
-    from mjx_nero.deploy.emulators import process
-
-    def port(plant: Plant, told: Mapping[str, Any]) -> Port:
-        entries = json.loads(pathlib.Path(told["calibration"]).read_text())
-        made = Port(servos_of(told["metadata"], told["kind"], entries, plant), Line())
-        made.servos.faults = dataclasses.replace(made.servos.faults, **told.get("bus", {}))
-        return made
-
-    process(port)
-
-
-if __name__ == "__main__":
-    main()
+def port_of(plant: Plant, told: Mapping[str, Any]) -> Port:
+    """Makes the arm that ``emulators.started`` describes."""
+    entries = json.loads(pathlib.Path(told["calibration"]).read_text())
+    made = Port(servos_of(told["metadata"], told["kind"], entries, plant), Line())
+    made.servos.faults = dataclasses.replace(made.servos.faults, **told.get("bus", {}))
+    return made
