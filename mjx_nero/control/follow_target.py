@@ -114,17 +114,15 @@ class RmpFollower:
         robot: robot whose ``ee_site`` follows.
         dt: control step [s].
         cfg: files and integration.
-        obstacles: obstacles to avoid; None: the scene's.
 
     Raises:
         UserError: the robot has no RMPflow files, or they do not fit it.
     """
 
-    def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg(), obstacles: Obstacles | None = None):
+    def __init__(self, robot: RobotCfg, dt: float, cfg: RmpCfg = RmpCfg()):
         descriptor, config = (pathlib.Path(f) if f else None for f in (cfg.descriptor, cfg.config))
         self.flow = RmpFlow(robot, None, descriptor, config, cfg.maximum_substep_size)
-        self.dt, self._obstacles = dt, obstacles
-        self._lead = np.array(robot.arm.lead, np.float32)
+        self.dt, self._lead = dt, np.array(robot.arm.lead, np.float32)
         self._n = len(robot.arm.joints)
 
     def init(self, view: View) -> Memory:
@@ -138,7 +136,7 @@ class RmpFollower:
 
     def arm(self, view: View, target: Target) -> Joints:
         """Computes the targets of the arm's drives on the way to ``target`` [rad]."""
-        obstacles = Obstacles.seen(view) if self._obstacles is None else self._obstacles
+        obstacles = Obstacles.seen(view)
         q, qd = self.flow.step(view.joint_pos[: self._n], view.joint_vel[: self._n], target, obstacles, self.dt)
         return q + self._lead * qd
 

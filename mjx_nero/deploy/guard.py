@@ -69,12 +69,14 @@ class Guarded(Protocol):
 class Guard:
     """An arm in this process.
 
-    Args:
+    Attributes:
         log: log of everything read and sent; None: there is none.
     """
 
-    def __init__(self, arm: Arm, safety: Safety, clock: Clock, log: Log | None = None):
-        self.arm, self.safety, self.clock, self.log = arm, safety, clock, log
+    log: Log | None = None
+
+    def __init__(self, arm: Arm, safety: Safety, clock: Clock):
+        self.arm, self.safety, self.clock = arm, safety, clock
         self.sent = 0.0
         self._last: Feedback | None = None
 

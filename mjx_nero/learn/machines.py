@@ -44,11 +44,6 @@ def first() -> bool:
     return jax.process_index() == 0
 
 
-def default_devices() -> int:
-    """Returns the default number of devices per machine: one, or all if machines are joined."""
-    return jax.local_device_count() if several() else 1
-
-
 def devices(each: int) -> list[Any]:
     """Returns the first ``each`` devices of every process."""
     count: dict[int, int] = {}

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+import jax
+
 from mjx_nero.envs.env import MAX_SPEED
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
@@ -40,7 +42,7 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
     )
     run = going_on(run, flags, dotted, args.trust)
     if "num_devices" not in flags and machines.several():
-        run = dataclasses.replace(run, num_devices=machines.default_devices())
+        run = dataclasses.replace(run, num_devices=jax.local_device_count())
     if args.seeds:
         rows, folder, code = seeds.train(run, args.seeds, command=cli.called_as("train"))
         report_seeds(rows, folder)
