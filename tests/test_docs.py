@@ -17,6 +17,7 @@ from PIL import Image
 import mjx_nero
 from mjx_nero import config
 from mjx_nero.__main__ import COMMANDS
+from mjx_nero.errors import EXTRAS
 from mjx_nero.learn import header, policy
 from mjx_nero.runs import cfg
 from mjx_nero.sim import robot_file
@@ -220,6 +221,14 @@ def test_the_file_formats_are_those_that_are_read():
 def test_the_extra_of_the_site_has_what_documented_modules_import():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(extras["gym"]) <= set(extras["docs"])  # the environment of the tests has it in any case
+
+
+def test_the_extra_that_a_message_names_installs_the_package():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    projects = {"can": "python-can", "cv2": "opencv-python-headless", "serial": "pyserial"}  # of other names than their packages
+    for package, extra in EXTRAS.items():
+        project = projects.get(package, package.replace("_", "-"))
+        assert [need for need in extras[extra] if re.split(r"[\[>]", need)[0] == project], package
 
 
 @pytest.mark.slow

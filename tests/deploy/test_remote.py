@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib
 import json
 import os
 import pathlib
@@ -51,6 +52,16 @@ remote.close()
 def spec(lift, told, tmp_path):
     kept = {name: told[name] for name in ("joints", "gripper", "body", "base", "regions", "command", "control_dt", "robot")}
     return Spec("sim", {"model": str(lift / "scene.mjb")}, kept, log=str(tmp_path / "log.csv"))
+
+
+def test_a_missing_package_is_one_line_with_its_extra(spec, monkeypatch):
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    monkeypatch.setitem(sys.modules, "serial", None)  # Python finds no such module then
+    monkeypatch.setattr(server.drivers, "make", lambda *_: importlib.import_module("serial"))
+    with here, there:
+        here.send(json.dumps(vars(spec)).encode())
+        server.serve(there)
+        assert "this needs serial, of the extra 'deploy'" in json.loads(here.recv(server.PACKET))["error"]
 
 
 def rows(spec):
