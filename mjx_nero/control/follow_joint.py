@@ -15,7 +15,6 @@ from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.pick_up import UNREACHABLE
 from mjx_nero.mdp import fixtures as terms
-from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.mdp.fixtures import Handle
 from mjx_nero.sim import fixtures
 from mjx_nero.sim.robot import RobotCfg
@@ -145,8 +144,7 @@ class FollowJoint:
         found = self._ik.local(pos, quat, memory.q).q
         wanted = jnp.where(phase == BEFORE, memory.before, jnp.where(phase == CLOSE, memory.q, found))
         q, qd = setpoint.follow(memory.q, memory.qd, wanted, jnp.asarray(self._speed), self.dt)
-        ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+        fingers = self.gripper.paced(phase >= CLOSE, view.ctrl[self._n :], self._finger_step)
 
         lost = holds & (terms.distance(view, self.cfg.handle) > self._lost)
         ended = self._ended(memory, jnp.linalg.norm(view.ee_pos_w - pos), out)

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
 from mjx_nero.config.bounds import Positive
-from mjx_nero.control.pick_up import CLOSE, PickUp, PickUpCfg, PickUpMemory
-from mjx_nero.mdp.actions import rate_limit
+from mjx_nero.control.pick_up import PickUp, PickUpCfg, PickUpMemory
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.sim.solids import kept_grasps
@@ -101,13 +100,9 @@ class GraspThing(PickUp):
             middle=self._local(view, middles[best]),
         )
 
-    def step(self, memory: PickUpMemory, view: View) -> tuple[PickUpMemory, Float[Array, " nu"]]:
-        """Computes the targets of all drives."""
+    def fingers(self, memory: PickUpMemory, view: View, closes: Bool[Array, ""]) -> Float[Array, " ng"]:
         assert isinstance(memory, GraspThingMemory)
-        after, targets = super().step(memory, view)
-        ends = jnp.where(memory.phase >= CLOSE, jnp.asarray(self.gripper.closed), memory.opened)
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
-        return after, jnp.concatenate([targets[: self._n], fingers])
+        return self.gripper.paced(closes, view.ctrl[self._n :], self.finger_step, memory.opened)
 
     def off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
         assert isinstance(memory, GraspThingMemory)

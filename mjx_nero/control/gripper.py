@@ -84,6 +84,13 @@ class ParallelGripper:
         wanted = jnp.where(closing, self.close(positions), self.open(positions))
         return rate_limit(wanted, targets, step=jnp.asarray(self._speed * dt))
 
+    def paced(
+        self, closes: Bool[Array, ""], targets: Positions, step: Float[np.ndarray, " n"], opened: Positions | None = None
+    ) -> Positions:
+        """Moves ``targets`` by at most ``step`` [rad or m] towards closed, or else ``opened``; None: the gripper's own."""
+        ends = jnp.where(closes, jnp.asarray(self.closed), jnp.asarray(self.opened) if opened is None else opened)
+        return rate_limit(ends, targets, step=jnp.asarray(step))
+
     def gap(self, positions: Positions) -> Float[Array, ""]:
         """Computes the distance between the pads [m], by the robot's formula or from the pads in its model.
 

@@ -14,7 +14,6 @@ from mjx_nero.config.bounds import Positive
 from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
-from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
 
@@ -111,8 +110,7 @@ class _Arm:
 
     def fingers(self, view: View, closed: Bool[Array, ""]) -> Float[Array, " ng"]:
         """The fingers' next targets; ``view`` is the robot's own."""
-        ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
-        return rate_limit(ends, view.ctrl[self.n :], step=jnp.asarray(self.finger_step))
+        return self.gripper.paced(closed, view.ctrl[self.n :], self.finger_step)
 
     def step(
         self, arm: ArmMemory, across: Bool[Array, ""], to: Float[Array, " nj"], pos: Float[Array, "3"], held: Bool[Array, ""]

@@ -14,7 +14,6 @@ from mjx_nero.config.bounds import Positive
 from mjx_nero.control import setpoint
 from mjx_nero.control.gripper import GRIP_FILTER, ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
-from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim import grasp
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import UserError, View
@@ -169,9 +168,8 @@ class PickUp:
         wanted_q = jnp.where(phase == ABOVE, memory.above, found)
         fastest = jnp.where(phase <= DOWN, setpoint.FASTEST, self.gentle)
         q, qd = setpoint.follow(memory.q, memory.qd, wanted_q, jnp.asarray(self._speed), self.dt, fastest)
-        ends = jnp.where(phase >= CLOSE, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self.finger_step))
 
+        fingers = self.fingers(memory, view, phase >= CLOSE)
         lost = (phase >= UP) & (self.off(memory, view) > self.lost)
         falls = (phase == ABOVE) & (memory.tries > 0)
         held, meant = (math.rotate(quat, jnp.asarray(self._point)) for quat in (view.ee_quat_w, self.hand(memory.yaw)))
@@ -190,6 +188,10 @@ class PickUp:
             tries=memory.tries + lost,
         )
         return memory, jnp.concatenate([q + self.lead * qd, fingers])
+
+    def fingers(self, memory: PickUpMemory, view: View, closes: Bool[Array, ""]) -> Float[Array, " ng"]:
+        """Computes the targets of the fingers' drives."""
+        return self.gripper.paced(closes, view.ctrl[self._n :], self.finger_step)
 
     def off(self, memory: PickUpMemory, view: View) -> Float[Array, ""]:
         """Distance of the grasp point from where the object is to be held [m]."""

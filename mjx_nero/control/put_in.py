@@ -16,7 +16,6 @@ from mjx_nero.control import setpoint
 from mjx_nero.control.grasp_thing import GraspThing, GraspThingCfg
 from mjx_nero.control.gripper import GRIP_FILTER
 from mjx_nero.control.pick_up import ABOVE, CARRY, PickUp, PickUpCfg, PickUpMemory
-from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
 
@@ -163,7 +162,7 @@ class PutIn:
         wanted = jnp.where(stage == OPEN, pick.q, found)
         fastest = jnp.where(stage == AWAY, setpoint.FASTEST, self._pick.gentle)
         q, qd = setpoint.follow(pick.q, pick.qd, wanted, jnp.asarray(self._speed), self.dt, fastest)
-        fingers = self._fingers(pick, view, stage >= OPEN)
+        fingers = self._pick.fingers(pick, view, stage < OPEN)
 
         lost = ((stage == OVER) | (stage == IN)) & (self._pick.off(pick, view) > self._pick.lost)
         again = (stage == IN) & ((memory.count + 1) * self.dt > self.cfg.patience)
@@ -242,11 +241,6 @@ class PutIn:
         most = jnp.pi / self.cfg.turns
         lacks = math.yaw(math.quat_mul(view.goal_quat_w, math.quat_conj(quat)))
         return jnp.mod(lacks + most, 2 * most) - most
-
-    def _fingers(self, pick: PickUpMemory, view: View, opens: Bool[Array, ""]) -> Float[Array, " ng"]:
-        opened = getattr(pick, "opened", self._pick.gripper.opened)
-        ends = jnp.where(opens, jnp.asarray(opened), jnp.asarray(self._pick.gripper.closed))
-        return rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._pick.finger_step))
 
     def warning(self, memory: PutInMemory) -> str:
         """Says how many objects were lost, or did not go in at the first try."""

@@ -14,7 +14,6 @@ from mjx_nero.control.gripper import ParallelGripper
 from mjx_nero.control.ik import IkCfg, InverseKinematics
 from mjx_nero.control.turns import TOP, Plan, Table, Turns
 from mjx_nero.mdp import sides
-from mjx_nero.mdp.actions import rate_limit
 from mjx_nero.sim.robot import RobotCfg
 from mjx_nero.types import View
 
@@ -117,8 +116,7 @@ class TurnOver:
         lifts = leaps if self.cfg.rises else phase == TURN
         q = jnp.where(lifts, self._above(memory, q, wanted_q, wanted), q)
         qd = jnp.where(lifts, (q - memory.q) / self.dt, qd)  # the drives' targets lead by it
-        ends = jnp.where(closed, jnp.asarray(self.gripper.closed), jnp.asarray(self.gripper.opened))
-        fingers = rate_limit(ends, view.ctrl[self._n :], step=jnp.asarray(self._finger_step))
+        fingers = self.gripper.paced(closed, view.ctrl[self._n :], self._finger_step)
 
         lost = (phase >= UP) & (phase <= SET) & (jnp.linalg.norm(view.ee_pos_w - seen) > self._lost)
         near = jnp.linalg.norm(memory.q - wanted_q) < 0.05
