@@ -17,6 +17,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.tools import cli
 
 TRIES = 16
+MARKS = '"placed": ', '"failed": "'  # of a file of results
 ENOUGH = 14  # successful tries for a robot to count
 _LONGEST = 300  # seconds for an import and its self-test
 _COLUMNS = ("robot", "repository, commit", "file", "flags", "opening", "grasped", "placed", "warnings")
@@ -43,7 +44,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--folder", type=cli.path(), required=True, help="folder that contains the repositories, each as OWNER+NAME"
     )
-    parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
+    parser.add_argument(
+        "--json", type=cli.output(".json", marks=MARKS), required=True, help="file of results; new ones are added to it"
+    )
     parser.add_argument(
         "--markdown",
         type=cli.output(".md", marks=("The importer accepts",)),

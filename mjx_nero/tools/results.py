@@ -19,6 +19,8 @@ from mjx_nero.tools import cli
 Row = dict[str, Any]
 WHATS = {"learning": "seeds trained by the default command until they succeed", "policies": "the bundled policies"}
 SEEDS = "seeds"  # key of the seeds of an environment whose training is not complete
+KINDS = ("learning", SEEDS, "native", "warp")  # keys of an environment's results
+MARKS = tuple(f'"{kind}": {{' for kind in KINDS)
 EVALUATIONS = 48  # evaluations of a seed that needs all of its env steps
 _COLUMNS = ("environment", "target", "seeds", "seconds", "env steps", "policy in MuJoCo C", "policy on Warp", "measured with")
 _PAGE = """# Benchmarks
@@ -48,7 +50,9 @@ def main(argv: Sequence[str]) -> None:
         ends=cli.listed("what can be measured", WHATS),
     )
     parser.add_load()
-    parser.add_argument("--json", type=cli.output(".json"), required=True, help="file of results; new ones are added to it")
+    parser.add_argument(
+        "--json", type=cli.output(".json", marks=MARKS), required=True, help="file of results; new ones are added to it"
+    )
     parser.add_argument(
         "--markdown",
         type=cli.output(".md", marks=("mjx_nero results",)),

@@ -1,5 +1,8 @@
-"""Each kind of table and YAML is known by a mark of its own: a command replaces files of its kind, and no other command's."""
+"""Each kind of table, YAML and JSON has a mark of its own: a command replaces files of its kind, and no other command's."""
 
+import pathlib
+import re
+import shutil
 import types
 
 import numpy as np
@@ -12,11 +15,12 @@ from mjx_nero.identify import Fit, RecordCfg, record
 from mjx_nero.identify import log as logs
 from mjx_nero.identify.plant import Drives, Plant
 from mjx_nero.tasks import registry
+from mjx_nero.tools import public_robots, results
 from mjx_nero.tools.deploy.command import NOTE
 from mjx_nero.tools.identification import report
 from mjx_nero.tools.tuning import report as tuning
 
-JOINTS = ("j1",)
+JOINTS, ROOT = ("j1",), pathlib.Path(__file__).parents[2]
 
 
 def drives_file(path):
@@ -45,12 +49,19 @@ def run_log(note):
     return write
 
 
+def page_of(name):
+    """Writes the figures of a page of the documentation."""
+    return lambda path: shutil.copy(ROOT / "docs" / name, path)
+
+
 KINDS = {  # what writes it, and the mark by which its command knows it
     "identify --out": (drives_file, (report.MARK,)),
     "deploy --check": (check_file, (check.MARK,)),
     "tune-gains --out": (gains_file, (tuning.MARK,)),
     "record": (simulated_log, (report.SIMULATED, report.MOVEMENT)),
     "record --arm": (run_log(f"arm by sim, {report.MOVEMENT}"), (report.SIMULATED, report.MOVEMENT)),
+    "results --json": (page_of("benchmarks.json"), results.MARKS),
+    "public-robots --json": (page_of("public_robots.json"), public_robots.MARKS),
     "deploy --log": (run_log(f"nero_reach on sim{NOTE}p.onnx"), (NOTE,)),
 }
 
@@ -65,3 +76,11 @@ def test_a_file_is_replaced_by_its_own_kind_alone(tmp_path, name):
         else:
             with pytest.raises(UserError, match="it exists and is another kind of file"):
                 files.check_writable(tmp_path / "file", marks)
+
+
+def test_every_command_that_writes_text_has_marks():
+    text = ".csv", ".json", ".md", ".yaml"
+    sources = {path: path.read_text() for path in (ROOT / "mjx_nero").rglob("*.py")}
+    outputs = [(path, call) for path, source in sources.items() for call in re.findall(r"cli\.output\((.*)\)", source)]
+    assert len(outputs) > 15
+    assert not [found for found in outputs if any(f'"{suffix}"' in found[1] for suffix in text) and "marks=" not in found[1]]

@@ -113,7 +113,7 @@ def test_seeds_are_kept_one_by_one(call, tmp_path, monkeypatch):
     ],
 )
 def test_mistakes(call, tmp_path, flags, said):
-    (tmp_path / "bad.json").write_text('{"a": 3}')
+    (tmp_path / "bad.json").write_text('{"a": {"native": {"b": 3}}}')
     code, _, err = call("mjx_nero", "results", *flags)
     assert code == 2 and said in err and not (tmp_path / "r.json").exists()
 
