@@ -2,21 +2,35 @@
 
 import functools
 import math
+import re
+import typing
 
 import pytest
 
 from mjx_nero import UserError, env_cfg, make
-from mjx_nero.mdp import rewards
+from mjx_nero.config import bounds, docs
+from mjx_nero.config.bounds import Bounds
+from mjx_nero.envs.task import ThingCfg
+from mjx_nero.mdp import commands, events, fixtures, looks, rewards
 from mjx_nero.mdp.terms import RewardTerm, Term
+from mjx_nero.sim.cameras import CameraCfg
+from mjx_nero.sim.fixtures import FixtureCfg
+from mjx_nero.sim.obstacles import ObstacleCfg
+from mjx_nero.sim.robot import RobotCfg
+from mjx_nero.sim.scene import ObjectCfg, SceneCfg
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scene.objects.cube.mass": -1.0}, "scene.objects.cube.mass must be above 0, got -1.0"),
+        ({"scene.objects.cube.mass": -1.0}, "scene.objects.cube.mass must be above 0 and at most 1000, got -1.0"),
         ({"scene.objects.cube.mass": math.nan}, "scene.objects.cube.mass takes a finite number, got nan"),
-        ({"scene.objects.cube.size": (0.03, 0.0, 0.03)}, "scene.objects.cube.size\\[1\\] must be above 0, got 0.0"),
+        ({"scene.objects.cube.size": (0.03, 0.0, 0.03)}, "scene.objects.cube.size\\[1\\] must be above 0 and at most 2, got 0.0"),
         ({"scene.objects.cube.friction": (1.0, -0.1, 0.0)}, "scene.objects.cube.friction\\[1\\] must be at least 0, got -0.1"),
+        ({"scene.objects.cube.size": (5.0,) * 3}, "scene.objects.cube.size\\[0\\] must be above 0 and at most 2, got 5.0"),
+        ({"scene.objects.cube.mass": 1e9}, "scene.objects.cube.mass must be above 0 and at most 1000, got 1000000000.0"),
+        ({"robot.base_pos": (0.0, 0.0, 900.0)}, "robot.base_pos\\[2\\] must be at least -20 and at most 20, got 900.0"),
+        ({"command.params.x": (0.3, 60.0)}, "command.params.x\\[1\\] must be at least -20 and at most 20, got 60.0"),
         ({"sim.dt": 0}, "sim.dt must be at least 1e-06 and at most 1, got 0"),
         ({"sim.dt": -0.01}, "sim.dt must be at least 1e-06 and at most 1, got -0.01"),
         ({"sim.decimation": 0}, "sim.decimation must be at least 1 and at most 10000, got 0"),
@@ -66,7 +80,7 @@ def test_an_episode_shorter_than_a_step_is_refused():
 
 def test_a_bad_value_ends_a_command_in_one_line(call):
     code, _, err = call("train", "--env", "nero_lift", "--env.scene.objects.cube.mass", "-1")
-    assert code == 2 and err == "error: scene.objects.cube.mass must be above 0, got '-1'\n"
+    assert code == 2 and err == "error: scene.objects.cube.mass must be above 0 and at most 1000, got '-1'\n"
 
 
 def test_configs_are_read_only_all_the_way_down():
@@ -107,3 +121,32 @@ def test_a_partial_is_a_term():
 def test_a_robot_given_as_a_preset_is_told_so():
     with pytest.raises(UserError, match="^'piper' is a robot, not a preset of nero_lift: pass it as --robot$"):
         env_cfg("nero_lift", "piper")
+
+
+def limited(kind) -> bool:
+    """Whether every number of a type has a greatest value."""
+    if typing.get_origin(kind) is typing.Annotated:
+        inner, *marks = typing.get_args(kind)
+        return any(isinstance(mark, Bounds) and mark.high < math.inf for mark in marks) or limited(inner)
+    if kind in (int, float):
+        return False
+    return all(limited(inner) for inner in typing.get_args(kind) if inner is not type(None))
+
+
+@pytest.mark.parametrize("cls", [RobotCfg, ObjectCfg, ObstacleCfg, FixtureCfg, CameraCfg, SceneCfg, ThingCfg])
+def test_lengths_and_masses_have_a_greatest_value(cls):
+    hints = typing.get_type_hints(cls, include_extras=True)
+    measured = [name for name, text in docs.fields(cls).items() if re.search(r"\[(m|kg|kg/m3)\]", text) and name != "friction"]
+    assert measured and [name for name in measured if not limited(hints[name])] == []
+
+
+@pytest.mark.parametrize("module", [commands, events, fixtures, looks])
+def test_places_of_terms_have_a_greatest_value(module):
+    terms = {name: term for name, term in vars(module).items() if callable(term) and term.__module__ == module.__name__}
+    found = {
+        f"{name}.{axis}": hint
+        for name, term in terms.items()
+        for axis, hint in bounds.parameter_hints(term).items()
+        if axis in ("x", "y", "z")
+    }
+    assert found and [name for name, hint in found.items() if not limited(hint)] == []

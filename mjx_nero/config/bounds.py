@@ -63,6 +63,15 @@ Share = Annotated[float, Bounds(0.0, 1.0)]
 Count = Annotated[int, Bounds(1)]
 Whole = Annotated[int, Bounds(0)]
 Range = Annotated[tuple[float, float], Ascending()]
+# What an arm on a table can have to do with. Beyond it, a value is a slip of the hand or of the unit.
+Place = Annotated[float, Bounds(-20.0, 20.0)]  # a coordinate [m]
+Places = Annotated[tuple[Place, Place], Ascending()]
+Point = tuple[Place, Place, Place]
+Length = Annotated[float, Bounds(0.0, 20.0, above=True)]  # of what stands in a scene [m]
+Gap = Annotated[float, Bounds(0.0, 20.0)]  # a length that may be zero [m]
+Edge = Annotated[float, Bounds(0.0, 2.0, above=True)]  # of an object that a robot moves [m]
+Mass = Annotated[float, Bounds(0.0, 1000.0, above=True)]  # [kg]
+Density = Annotated[float, Bounds(0.0, 25_000.0)]  # [kg/m3]: that of osmium is 22,600
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 PositiveRange = Annotated[tuple[Positive, Positive], Ascending()]
 Counts = Annotated[tuple[Count, Count], Ascending()]  # a range of whole numbers from 1

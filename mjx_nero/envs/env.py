@@ -5,6 +5,7 @@ It is one long class because ``reset`` and ``step`` share all their parts, and o
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config import bounds, values
-from mjx_nero.envs import identified, things
+from mjx_nero.envs import identified, reach, things
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import events, terms
@@ -70,6 +71,7 @@ class ManipulationEnv(Env):
     ``reset`` and ``step`` are pure and work on one environment: use ``jax.vmap`` for thousands, and ``jax.jit`` for speed.
     ``state.pipeline_state`` is the physics state (``types.Sim``), ``state.obs`` is a dict of observation groups, and
     ``state.info['carry']`` holds the rest of the episode's memory. ``info['truncation']`` is 1 where ``done`` is a time-out.
+    A warning says if goals or objects lie out of every hand's reach (``envs.reach``).
 
     Args:
         cfg: the task.
@@ -98,6 +100,8 @@ class ManipulationEnv(Env):
             raise UserError(f"episode_length_s must be a control step ({self.dt:g} s) or more, got {cfg.episode_length_s:g}")
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
+        if said := reach.beyond(cfg, model):
+            warnings.warn(said, stacklevel=2)
         self._parts = scene.parts(
             cfg.scene, model, cfg.command.targets, cfg.obstacles, lambda: self.mj_model, lambda: self._randomization.names
         )

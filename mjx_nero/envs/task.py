@@ -6,7 +6,7 @@ from typing import Any
 
 from mjx_nero import config
 from mjx_nero.config import bounds
-from mjx_nero.config.bounds import Count, NonNegative, Positive, Share
+from mjx_nero.config.bounds import Count, Density, NonNegative, Positive, Share
 from mjx_nero.envs import old_names
 from mjx_nero.mdp import actions, success
 from mjx_nero.mdp.terms import ROBOT, CommandTerm, DoneTerm, MetricTerm, ObservationGroup, RewardTerm, Term
@@ -94,7 +94,7 @@ class ThingCfg:
 
     file: str = ""
     scale: Positive = 1.0
-    density: NonNegative = 0.0
+    density: Density = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

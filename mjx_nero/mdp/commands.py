@@ -5,13 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.config.bounds import Range
+from mjx_nero.config.bounds import Places, Range
 from mjx_nero.types import Key
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
 
 
-def uniform_position(key: Key, *, x: Range, y: Range, z: Range) -> Float[Array, "3"]:
+def uniform_position(key: Key, *, x: Places, y: Places, z: Places) -> Float[Array, "3"]:
     """Draws a point uniformly from a box in the robot's root frame [m]."""
     low, high = jnp.array([x, y, z]).T
     return jax.random.uniform(key, (3,), minval=low, maxval=high)
@@ -29,12 +29,12 @@ def either_side(key: Key, *, size: Range) -> Float[Array, "3"]:
     return jnp.array([1.0, 0.0, 0.0]) * jnp.where(jax.random.bernoulli(k_sign), drawn, -drawn)
 
 
-def pose(key: Key, *, x: Range, y: Range, z: Range, quat: tuple[float, float, float, float]) -> Pose:
+def pose(key: Key, *, x: Places, y: Places, z: Places, quat: tuple[float, float, float, float]) -> Pose:
     """Draws a point uniformly from a box in the robot's root frame [m], with a fixed orientation (wxyz)."""
     return uniform_position(key, x=x, y=y, z=z), jnp.array(quat, jnp.float32)
 
 
-def uniform_pose(key: Key, *, x: Range, y: Range, z: Range, roll: Range, pitch: Range, yaw: Range) -> Pose:
+def uniform_pose(key: Key, *, x: Places, y: Places, z: Places, roll: Range, pitch: Range, yaw: Range) -> Pose:
     """Draws a pose uniformly in the robot's root frame: position [m] and angles [rad]. Isaac Lab's ``UniformPoseCommand``."""
     low, high = jnp.array([x, y, z, roll, pitch, yaw]).T
     drawn = jax.random.uniform(key, (6,), minval=low, maxval=high)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.config.bounds import Counts, NonNegative, Positive, Range
+from mjx_nero.config.bounds import Counts, NonNegative, Places, Positive, Range
 from mjx_nero.types import Bank, Key, Start, UserError
 
 
-def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Range, object: str = "cube") -> Start:
+def object_position_uniform(key: Key, start: Start, *, x: Places, y: Places, z: Places, object: str = "cube") -> Start:
     """Puts the object at a uniform ``x`` and ``y`` in the world, ``z`` above its height in the scene [m]."""
     low, high = jnp.array([x, y, z]).T
     height = start.object_pos_w[object] * jnp.array([0.0, 0.0, 1.0])
@@ -19,7 +19,7 @@ def object_position_uniform(key: Key, start: Start, *, x: Range, y: Range, z: Ra
     return dataclasses.replace(start, object_pos_w={**start.object_pos_w, object: pos})
 
 
-def object_apart_from_goal(key: Key, start: Start, *, x: Range, y: Range, apart: NonNegative, object: str = "cube") -> Start:
+def object_apart_from_goal(key: Key, start: Start, *, x: Places, y: Places, apart: NonNegative, object: str = "cube") -> Start:
     """Puts the object at a uniform ``x`` and ``y`` in the world, at least ``apart`` from the goal along the table [m].
 
     Of sixteen random places, it takes the first that is far enough, or else the farthest.
@@ -38,8 +38,8 @@ def scatter(
     *,
     objects: tuple[str, ...],
     count: Counts,
-    x: Range,
-    y: Range,
+    x: Places,
+    y: Places,
     pitch: Positive,
     jitter: NonNegative,
     away: tuple[float, float],
@@ -85,7 +85,7 @@ def scatter(
     return dataclasses.replace(start, object_pos_w=pos, object_quat_w=quat, target=jnp.argmin(rank))
 
 
-def objects_apart(key: Key, start: Start, *, objects: tuple[str, ...], x: Range, y: Range, apart: Positive) -> Start:
+def objects_apart(key: Key, start: Start, *, objects: tuple[str, ...], x: Places, y: Places, apart: Positive) -> Start:
     """Puts objects at uniform ``x`` and ``y`` in the world, at least ``apart`` from one another along the longer side [m].
 
     The draw is exact and needs no retry. It shortens that side by the gaps, sorts uniform points on the rest, puts the gaps back,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_nero import math
-from mjx_nero.config.bounds import NonNegative, Positive, Range
+from mjx_nero.config.bounds import NonNegative, Places, Positive, Range
 from mjx_nero.mdp.memory import Latch
 from mjx_nero.types import FixtureStart, FixtureView, Key, Start, View
 
@@ -43,7 +43,7 @@ class Handle:
 # Reset events.
 
 
-def stand_uniform(key: Key, start: Start, *, fixture: str, x: Range, y: Range, yaw: Range) -> Start:
+def stand_uniform(key: Key, start: Start, *, fixture: str, x: Places, y: Places, yaw: Range) -> Start:
     """Moves a fixture along the table by uniform ``x`` and ``y`` [m] and turns it about the vertical by ``yaw`` [rad]."""
     low, high = jnp.array([x, y, yaw]).T
     dx, dy, angle = jax.random.uniform(key, (3,), minval=low, maxval=high)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero import math
-from mjx_nero.config.bounds import NonNegative, PositiveRange, Range, Share
+from mjx_nero.config.bounds import NonNegative, Places, PositiveRange, Share
 from mjx_nero.mdp.randomization import Drawn, Model
 from mjx_nero.types import Key
 
@@ -108,7 +108,7 @@ def _chosen(key: Key, model: Model, rows: np.ndarray, shown: np.ndarray, there: 
     return jnp.where(there, which, model.fields["geom_matid"][rows])
 
 
-def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Range, y: Range, z: Range, there: Share = 1.0) -> Drawn:
+def places(key: Key, model: Model, *, geoms: tuple[str, ...], x: Places, y: Places, z: Places, there: Share = 1.0) -> Drawn:
     """Puts geoms without collisions at random places, turned about the vertical at random.
 
     Each one shows with probability ``there``; otherwise it is hidden below the table.

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero import math
+from mjx_nero.config.bounds import Point
 from mjx_nero.config.values import hint, short
 from mjx_nero.sim import linkage, model_file, quats
 from mjx_nero.sim.kinematics import Chain
@@ -38,7 +39,7 @@ class FixtureCfg:
     """
 
     file: str = "cabinet"
-    pos: tuple[float, float, float] = (0.5, 0.0, 0.0)
+    pos: Point = (0.5, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 

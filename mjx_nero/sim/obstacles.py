@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array
 
-from mjx_nero.config.bounds import Positive
+from mjx_nero.config.bounds import Length, Point
 from mjx_nero.sim import touch
 from mjx_nero.sim.parts import Fields, Part
 from mjx_nero.types import Carry, Key, ObstacleView, Sim, UserError, View
@@ -30,8 +30,8 @@ class ObstacleCfg:
         rgba: colour.
     """
 
-    size: tuple[Positive, Positive, Positive] = (0.05, 0.05, 0.05)
-    pos: tuple[float, float, float] = (0.0, 0.0, -0.5)
+    size: tuple[Length, Length, Length] = (0.05, 0.05, 0.05)
+    pos: Point = (0.0, 0.0, -0.5)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     rgba: tuple[float, float, float, float] = (0.32, 0.38, 0.5, 1.0)
 

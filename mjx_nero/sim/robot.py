@@ -7,9 +7,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mjx_nero.config.bounds import NonNegative, Positive, Range
+from mjx_nero.config.bounds import Gap, NonNegative, Place, Places, Point, Positive
 
-Box = tuple[Range, Range, Range]  # x, y and z [m]
+Box = tuple[Places, Places, Places]  # x, y and z [m]
 
 # In a checkout the assets lie beside the package, in a wheel inside it.
 _HERE = pathlib.Path(__file__).resolve().parents[1]
@@ -110,17 +110,17 @@ class RobotCfg:
     gripper: GripperCfg = GripperCfg()
     ee_site: str = "ee"
     base_link: str = "base_link"
-    base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_pos: Point = (0.0, 0.0, 0.0)
     base_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     down: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
     gravity_compensation: bool = False
     max_step: NonNegative = 0.0
     workspace: Box | None = None
-    floor: float = 0.0
-    opening: NonNegative = 0.0
-    closed: NonNegative = 0.0
-    pad: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
-    grip: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    floor: Place = 0.0
+    opening: Gap = 0.0
+    closed: Gap = 0.0
+    pad: tuple[Gap, Gap, Gap] = (0.0, 0.0, 0.0)
+    grip: Point = (0.0, 0.0, 0.0)
     pick: Box | None = None
     lean: NonNegative = 0.0
     turns: bool = True

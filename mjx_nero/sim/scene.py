@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_nero import config
-from mjx_nero.config.bounds import Bounds, OneOf, Positive
+from mjx_nero.config.bounds import Bounds, Edge, Length, OneOf, Place, Point, Positive
 from mjx_nero.sim import fixtures, forces, obstacles, team, touch
 from mjx_nero.sim.cameras import drawn
 from mjx_nero.sim.cameras.cfg import CameraCfg
@@ -57,8 +57,8 @@ class SceneCfg:
             native physics, otherwise ``warp``.
     """
 
-    table_center: tuple[float, float] = (0.3, 0.0)
-    table_size: tuple[Positive, Positive] = (1.0, 1.2)
+    table_center: tuple[Place, Place] = (0.3, 0.0)
+    table_size: tuple[Length, Length] = (1.0, 1.2)
     table: bool = True
     objects: Mapping[str, ObjectCfg] = dataclasses.field(default_factory=lambda: {"cube": ObjectCfg()})
     obstacles: Mapping[str, ObstacleCfg] = dataclasses.field(default_factory=dict)
@@ -67,9 +67,9 @@ class SceneCfg:
     self_collision: bool = False
     sensors: tuple[Annotated[str, OneOf(touch.HAND, forces.WRIST, forces.FINGERS)], ...] = ()
     goal: str = "sphere"
-    goal_edge: Positive = 0.03
-    look_at: tuple[float, float, float] = (0.17, 0.0, 0.21)
-    view_distance: Positive = 1.1
+    goal_edge: Edge = 0.03
+    look_at: Point = (0.17, 0.0, 0.21)
+    view_distance: Length = 1.1
     view_from: tuple[float, float, float] = (0.71, -0.65, 0.28)
     distractors: Annotated[int, Bounds(0, 100)] = 0
     backdrop: bool = False

@@ -12,6 +12,7 @@ import re
 import sys
 import traceback
 import typing
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib import metadata
 from typing import Annotated, Any, NoReturn
@@ -227,11 +228,12 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     """
     _occupy_streams()
     try:
-        with signals.at_once():
+        with signals.at_once(), warnings.catch_warnings():
             from mjx_nero.files import cache  # needs installed packages
 
             cache.check_addresses()
             try:
+                warnings.showwarning = _warn
                 main(sys.argv[1:])
             finally:
                 _flush()  # what is still unwritten may fail like everything before
@@ -258,6 +260,11 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or else Python complains of unwritten output as it ends
     sys.exit(code)
+
+
+def _warn(message: Warning | str, *_: Any) -> None:
+    """Prints a warning in one line, without the place in the code that gave it."""
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _flush() -> None:

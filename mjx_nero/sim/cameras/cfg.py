@@ -7,7 +7,7 @@ from typing import Annotated
 import mujoco
 import numpy as np
 
-from mjx_nero.config.bounds import Bounds
+from mjx_nero.config.bounds import Bounds, Point
 from mjx_nero.sim import quats
 from mjx_nero.types import UserError
 
@@ -30,7 +30,7 @@ class CameraCfg:
     """
 
     link: str = ""
-    pos: tuple[float, float, float] = (1.0, 0.0, 0.5)
+    pos: Point = (1.0, 0.0, 0.5)
     quat: tuple[float, float, float, float] = (0.5, 0.5, 0.5, 0.5)
     fovy: Annotated[float, Bounds(1.0, 170.0)] = 45.0
     size: tuple[Pixels, Pixels] = (64, 64)

@@ -6,7 +6,7 @@ from typing import Annotated
 import mujoco
 import numpy as np
 
-from mjx_nero.config.bounds import NonNegative, OneOf, Positive
+from mjx_nero.config.bounds import Density, Edge, Mass, NonNegative, OneOf, Point, Positive
 from mjx_nero.sim import quats, solids
 
 # Shape -> MuJoCo's type, and what ``ObjectCfg.size`` says of it.
@@ -42,17 +42,17 @@ class ObjectCfg:
     """
 
     shape: Annotated[str, OneOf(*SHAPES, "mesh")] = "box"
-    size: tuple[Positive, ...] = (0.03, 0.03, 0.03)
-    mass: Positive = 0.03
+    size: tuple[Edge, ...] = (0.03, 0.03, 0.03)
+    mass: Mass = 0.03
     friction: tuple[NonNegative, NonNegative, NonNegative] = (1.0, 0.005, 0.0001)
     condim: Annotated[int, OneOf(1, 3, 4, 6)] = 3
-    pos: tuple[float, float, float] = (0.35, 0.0, 0.0)
+    pos: Point = (0.35, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     rgba: tuple[float, float, float, float] = (0.85, 0.3, 0.2, 1.0)
     file: str = ""
     bank: tuple[str, ...] = ()
     scale: Positive = 1.0
-    density: NonNegative = 0.0
+    density: Density = 0.0
 
     @property
     def solids(self) -> list[solids.Solid]:
