@@ -19,6 +19,7 @@ _NAMES = re.compile(r"grip|grasp|fi?nge?r|jaw|hand|knuckle|claw|clamp|pinch|tong
 MOST_JOINTS = 4  # greatest number of driven joints of a finger
 JAW = 2.8  # [rad] greatest opening of a single jaw; a joint that turns further is a wrist
 STILL = 2e-3  # [m] a joint grips if it changes a distance between fingers by more
+FINGERS, TURNS = 4, 13  # fewest fingers of a hand with a thumb that turns, and positions in which it is tried
 ALIKE = 0.8  # a third finger opens by more than this share of the best pair's opening
 Chosen = tuple[Tree, tuple[str, ...], str]
 
@@ -80,6 +81,21 @@ class Grip:
     fingers: tuple[str, ...]
     jaw: str
     meeting: Meeting
+
+
+def opposed(tree: Tree, looks: Mapping[str, Look], notes: Notes) -> Tree:
+    """Returns the robot with the joint that turns a thumb across the palm held where the thumb stands opposite the fingers.
+
+    Only the hands of four or more fingers have such a joint: the first of the one finger with two joints. Without it, these hands
+    close like a gripper of two jaws.
+    """
+    parts = bodies(tree)
+    joints, fork = _guess(tree, parts, chain.limb(parts).end, looks, Notes())
+    if not (thumb := _thumb(parts, fork, joints)):
+        return tree
+    at = _opposite(tree, looks, tuple(name for name in joints if name != thumb[0]), thumb, fork)
+    notes.add("guessed", "joint", thumb[0], f"turns the thumb: held at {at:g}, opposite the fingers (--fix {thumb[0]}=VALUE)")
+    return chain.fixed(tree, {thumb[0]: at}, Notes())
 
 
 def choose(tree: Tree, looks: Mapping[str, Look], gripper: Sequence[str] | None, notes: Notes) -> Chosen:
@@ -227,6 +243,29 @@ def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mappin
             out.append(name)
     bounded = [n for n in out if by_name[n].type != "continuous"]
     return bounded or out
+
+
+def _thumb(parts: dict[str, Body], fork: str, joints: tuple[str, ...]) -> list[str]:
+    """Returns the joints that turn and bend a thumb: those of the one finger with two, if all others have one; else none."""
+    roots = [b.name for b in parts.values() if b.parent == fork and b.joint]
+    fingers = [[joint for joint in _driven(parts, below(parts, name)) if joint in joints] for name in roots]
+    fingers = sorted(filter(None, fingers), key=len)
+    return fingers[-1] if len(fingers) >= FINGERS and list(map(len, fingers[-2:])) == [1, 2] else []
+
+
+def _opposite(tree: Tree, looks: Mapping[str, Look], joints: tuple[str, ...], thumb: Sequence[str], fork: str) -> float:
+    """Returns the position of the thumb's first joint at which the thumb meets the fingers best, all taken together [rad]."""
+    (turns, bends), worth = thumb, {}
+    for value in np.linspace(*limits(tree.joints[turns]), TURNS):
+        held = chain.fixed(tree, {turns: float(value)}, Notes())
+        swing, met = Swing(held, bodies(held), looks, joints, fork), {}
+        own = _branch(swing, next(b.name for b in swing.parts.values() if b.joint and b.joint.name == bends))
+        for meeting in swing.between(*swing.ends(joints, {}, {})):
+            pair = {_branch(swing, name) for name in meeting.names} if not meeting.fixed else set()
+            if own in pair and len(pair) == 2:  # the best with each finger comes first
+                met.setdefault((pair - {own}).pop(), meeting.worth)
+        worth[round(float(value), 3)] = sum(met.values())
+    return max(worth, key=worth.__getitem__)
 
 
 def _given(parts: dict[str, Body], joints: Sequence[str]) -> tuple[tuple[str, ...], str]:

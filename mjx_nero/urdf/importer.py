@@ -81,6 +81,8 @@ def import_urdf(
         notes.add("repaired", "robot", tree.name, roots.told())
     check_lengths(tree, looks.spans, units)
     whole = filled(tree, looks, notes)
+    if gripper is None:
+        whole = fingers.opposed(whole, looks.of, notes)
     tree, grips, fork = fingers.choose(whole, looks.of, gripper, notes)
     couplings.warn_of_frozen(whole, tree, grips, notes)
     parts = bodies(tree)

@@ -3,6 +3,7 @@
 Each URDF here has the structure of a public robot whose gripper an earlier rule misread."""
 
 import json
+import re
 from pathlib import Path
 
 import mujoco
@@ -289,3 +290,31 @@ def test_a_collision_that_lies_elsewhere_than_the_visual_of_the_same_mesh_is_mov
     text = "its collision is its visual's mesh, but elsewhere: moved to the visual"
     assert text not in one and other.count(text) == 1
     assert len(set(models.values())) == 1
+
+
+def test_a_thumb_that_turns_across_the_palm_is_held_opposite_the_fingers(tmp_path):
+    """At 0 it stands beside three fingers, after a quarter turn in front of them. Hands of fewer fingers stay as they are."""
+    bend = 'lower="0" upper="1.4" effort="5" velocity="2"'
+    bar = make.shape('<box size="0.016 0.016 0.07"/>', xyz="0 0 0.035")
+    palm = [make.link("palm", make.inertial(0.2), make.shape('<box size="0.02 0.08 0.08"/>', xyz="0 0 0.04"))]
+    palm.append(make.joint("mount", "link6", "palm", "fixed", xyz="0 0 0.2"))
+    thumb = [
+        make.link("turned", make.inertial(0.02), make.shape('<box size="0.01 0.01 0.01"/>', xyz="0 0.05 0")),
+        make.joint("turn", "palm", "turned", xyz="0 0 0.02", limit='lower="-1.5708" upper="0" effort="5" velocity="2"'),
+        make.link("thumb", make.inertial(0.02), make.shape('<box size="0.016 0.016 0.09"/>', xyz="0 0 0.045")),
+        make.joint("bend", "turned", "thumb", xyz="0 0.06 0", axis="1 0 0", limit=bend),
+    ]
+    fingers = [
+        part
+        for k in range(3)
+        for part in (
+            make.link(f"f{k}", make.inertial(0.02), bar),
+            make.joint(f"bend{k}", "palm", f"f{k}", xyz=f"0 {0.025 * (k - 1)} 0.085", axis="0 1 0", limit=bend),
+        )
+    ]
+    _, report = imported(tmp_path, base(), *six(), *palm, *thumb, *fingers)
+    assert set(report.robot.gripper.joints) == {"bend", "bend0", "bend1", "bend2"}
+    found = re.search(r"turns the thumb: held at (-?[\d.]+), opposite the fingers", " ".join(report.notes.of("joint", "turn")))
+    assert found and float(found[1]) < -np.pi / 4  # nearer to in front
+    _, report = imported(tmp_path / "fewer", base(), *six(), *palm, *thumb, *fingers[:4])
+    assert {"turn", "bend", "bend0", "bend1"} == set(report.robot.gripper.joints)
