@@ -101,7 +101,7 @@ class ManipulationEnv(Env):
         model = scene.build(cfg.robot, cfg.scene, cfg.sim, visuals=False, fuse=True)
         self.physics_model = model
         if said := reach.beyond(cfg, model):
-            warnings.warn(said, stacklevel=2)
+            warnings.warn(said, stacklevel=1)  # one place, so that a program says it once
         self._parts = scene.parts(
             cfg.scene, model, cfg.command.targets, cfg.obstacles, lambda: self.mj_model, lambda: self._randomization.names
         )

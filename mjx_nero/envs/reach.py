@@ -20,7 +20,7 @@ def beyond(cfg: EnvCfg, model: mujoco.MjModel) -> str:
     Args:
         model: the scene.
     """
-    regions = [("command", cfg.command, np.array(cfg.robot.base_pos))]
+    regions: list[tuple[str, Term, np.ndarray]] = [("command", cfg.command, np.array(cfg.robot.base_pos))]
     moved = [(f"events.{name}", term) for name, term in cfg.events.items() if {"object", "objects"} & term.params.keys()]
     regions += [(name, term, np.zeros(3)) for name, term in moved]
     corners = {name: _corners(term) + origin for name, term, origin in regions if {"x", "y"} <= term.params.keys()}

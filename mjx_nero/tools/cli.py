@@ -262,7 +262,7 @@ def run(main: Callable[[Sequence[str]], None]) -> NoReturn:
     sys.exit(code)
 
 
-def _warn(message: Warning | str, *_: Any) -> None:
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     """Prints a warning in one line, without the place in the code that gave it."""
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 

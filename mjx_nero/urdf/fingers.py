@@ -258,7 +258,8 @@ def _opposite(tree: Tree, looks: Mapping[str, Look], joints: tuple[str, ...], th
     (turns, bends), worth = thumb, {}
     for value in np.linspace(*limits(tree.joints[turns]), TURNS):
         held = chain.fixed(tree, {turns: float(value)}, Notes())
-        swing, met = Swing(held, bodies(held), looks, joints, fork), {}
+        swing = Swing(held, bodies(held), looks, joints, fork)
+        met: dict[str, float] = {}
         own = _branch(swing, next(b.name for b in swing.parts.values() if b.joint and b.joint.name == bends))
         for meeting in swing.between(*swing.ends(joints, {}, {})):
             pair = {_branch(swing, name) for name in meeting.names} if not meeting.fixed else set()
