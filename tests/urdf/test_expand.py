@@ -463,8 +463,8 @@ def touched(folder: pathlib.Path, act, beside: bool = False) -> list[tuple[str, 
     finally:
         Watch.on = False
     own = [("open", str(folder)), ("import", "")]
-    there = ("os.scandir", str(folder.parent))
-    seen = [each for each in Watch.seen if not (beside and each == there)]
+    there = [("os.scandir", str(place)) for place in (folder.parent, folder)]  # Python 3.12's glob also lists the latter
+    seen = [each for each in Watch.seen if not (beside and each in there)]
     return [(e, what) for e, what in seen if not any(e == kind and what.startswith(start) for kind, start in own)]
 
 
