@@ -47,15 +47,9 @@ for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.S
 # Most of the tests' time is XLA's. Set for the processes that tests start, too: what one has compiled, none compiles again, and
 # nothing gets into the cache of whoever runs the tests.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
-_FLAGS = []
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     # Learners compile in a fifth of the time. Said as 0, and not as false, it is the user's choice (``physics.fusion``).
-    _FLAGS.append("--xla_cpu_use_fusion_emitters=0")
-if "PYTEST_XDIST_WORKER" in os.environ:  # all cores are busy: in one piece a program takes a tenth less to compile
-    _FLAGS.append("--xla_cpu_parallel_codegen_split_count=1")
-for _flag in _FLAGS:
-    if _flag.partition("=")[0] not in os.environ.get("XLA_FLAGS", ""):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flag}".strip()
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=0")
 _CACHE = pathlib.Path(tempfile.gettempdir()) / f"mjx-nero-tests-{getpass.getuser()}"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
