@@ -46,8 +46,6 @@ def test_mistakes_end_in_one_line(call, argv, message):
     ],
 )
 def test_a_command_replaces_what_it_wrote_before(call, tmp_path, line, names):
-    if "results" in line:
-        (tmp_path / "a.json").write_text("{}")
     for _ in range(2):
         status, _, err = call("mjx_nero", *line.split())
         assert status == 0, err
