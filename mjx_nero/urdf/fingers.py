@@ -90,7 +90,10 @@ def opposed(tree: Tree, looks: Mapping[str, Look], notes: Notes) -> Tree:
     close like a gripper of two jaws.
     """
     parts = bodies(tree)
-    joints, fork = _guess(tree, parts, chain.limb(parts).end, looks, Notes())
+    end = chain.limb(parts).end
+    if sum(map(bool, _branches(parts, end))) < FINGERS:
+        return tree
+    joints, fork = _guess(tree, parts, end, looks, Notes())
     if not (thumb := _thumb(parts, fork, joints)):
         return tree
     at = _opposite(tree, looks, tuple(name for name in joints if name != thumb[0]), thumb, fork)
@@ -199,7 +202,7 @@ def _branch(swing: Swing, name: str) -> str:
 
 def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Look], notes: Notes) -> tuple[tuple[str, ...], str]:
     """Guesses the driven joints of the gripper, and the body that carries it."""
-    branches = [_driven(parts, below(parts, b.name)) for b in parts.values() if b.parent == end and b.joint]
+    branches = _branches(parts, end)
     if branches and parts[end].parent:
         if max(map(len, branches)) > MOST_JOINTS:
             count = sum(map(len, branches))
@@ -222,6 +225,11 @@ def _guess(tree: Tree, parts: dict[str, Body], end: str, looks: Mapping[str, Loo
             text += f"--gripper {last.name} --open {last.name}=VALUE --closed {last.name}=VALUE"
             notes.add("guessed", "robot", tree.name, text)
     return (), end
+
+
+def _branches(parts: dict[str, Body], end: str) -> list[list[str]]:
+    """Lists the driven joints of each branch that leaves a body."""
+    return [_driven(parts, below(parts, b.name)) for b in parts.values() if b.parent == end and b.joint]
 
 
 def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mapping[str, Look]) -> list[str]:
@@ -247,8 +255,7 @@ def _gripping(parts: dict[str, Body], end: str, joints: list[str], looks: Mappin
 
 def _thumb(parts: dict[str, Body], fork: str, joints: tuple[str, ...]) -> list[str]:
     """Returns the joints that turn and bend a thumb: those of the one finger with two, if all others have one; else none."""
-    roots = [b.name for b in parts.values() if b.parent == fork and b.joint]
-    fingers = [[joint for joint in _driven(parts, below(parts, name)) if joint in joints] for name in roots]
+    fingers = [[joint for joint in branch if joint in joints] for branch in _branches(parts, fork)]
     fingers = sorted(filter(None, fingers), key=len)
     return fingers[-1] if len(fingers) >= FINGERS and list(map(len, fingers[-2:])) == [1, 2] else []
 
