@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from mjx_nero.deploy.emulators.timeless import Clock
 from mjx_nero.interop import description
 from mjx_nero.tasks import registry
 
-__all__ = ["PATIENT", "Bench", "Clock", "Ideal", "metadata", "wait_for"]
+__all__ = ["PATIENT", "Bench", "Clock", "Ideal", "metadata"]
 
 # Run before the command ``deploy``, which then forgives a busy machine its deadlines: what those do is tested in simulated time.
 PATIENT = """
@@ -20,15 +19,6 @@ from mjx_nero.tools.deploy import arms
 limits = arms.safety_of
 arms.safety_of = lambda args: dataclasses.replace(limits(args), misses=1_000_000, silence=60.0, stale=60.0, behind_s=60.0)
 """
-
-
-def wait_for(what, seconds=120.0):
-    """Returns what ``what`` returns, as soon as that is true."""
-    end = time.monotonic() + seconds
-    while not (found := what()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
-    return found
 
 
 def metadata(name, dt=0.02):

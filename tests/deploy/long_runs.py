@@ -13,8 +13,9 @@ import arms
 import episodes
 import numpy as np
 import pytest
-from test_remote import SWING, gone, late, rows, spec, targets, wait_for
+from test_remote import SWING, gone, rows, spec, targets
 from test_safety import ROBOTS, fuzz, fuzz_feedback
+from waiting import wait
 
 from mjx_nero.deploy import children
 from mjx_nero.deploy.emulators.plant import Faults
@@ -25,7 +26,7 @@ ARMS = {"so101_lift": "so101", "piper_lift": "piper", "nero_lift": "nero"}
 LIKE, OFF = Faults(), Faults(stiffness=0.8, late=0.04)
 
 
-__all__ = ["late", "spec"]
+__all__ = ["spec"]
 
 
 def share(folder, name, preset="sim2real", count=100, faults=LIKE, delay=None):
@@ -96,7 +97,7 @@ def test_a_hundred_policies_that_die_or_freeze_leave_an_arm_that_holds(spec, lat
             process.send_signal(number)
             time.sleep(0.3)
             process.kill()
-            wait_for(lambda arm=arm: gone(arm))
+            wait(lambda arm=arm: gone(arm))
         table = rows(own)
         last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
         took.append(next(float(row["time"]) for row in table if row["held"]) - last)

@@ -8,6 +8,7 @@ import arms
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from waiting import wait
 
 from mjx_nero.deploy import setup
 from mjx_nero.deploy.arm import ArmError
@@ -214,7 +215,7 @@ def test_threads_keep_the_controllers_pace(told, model, late):
         bench.start()
         begun, moves, do = time.monotonic(), [], bench.arm._do
         bench.arm._do = lambda name, value=None: moves.append(name) or do(name, value)
-        arms.wait_for(lambda: len(moves) >= 50 or bench.arm.turning._error)
+        wait(lambda: len(moves) >= 50 or bench.arm.turning._error)
         rate, error = len(moves) / (time.monotonic() - begun), bench.arm.turning._error
         assert rate < 140 and (rate > 80 and not error or late() > cobotta.CYCLE), (rate, error, late())
         bench.arm.close()

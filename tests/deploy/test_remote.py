@@ -14,7 +14,7 @@ import sys
 import arms
 import numpy as np
 import pytest
-from arms import wait_for
+from waiting import wait
 
 from mjx_nero.deploy import server
 from mjx_nero.deploy.arm import ArmError
@@ -83,7 +83,7 @@ def swinging(spec):
     yield process, arm
     process.kill()
     process.wait()
-    wait_for(lambda: gone(arm))
+    wait(lambda: gone(arm))
 
 
 def targets(table):
@@ -98,9 +98,9 @@ def at_rest(table):
 
 def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec, late):
     process, arm = swinging
-    wait_for(lambda: len(targets(rows(spec))) > 30 or gone(arm))
+    wait(lambda: len(targets(rows(spec))) > 30 or gone(arm))
     process.kill()
-    wait_for(lambda: gone(arm))  # it left by itself
+    wait(lambda: gone(arm))  # it left by itself
     table = rows(spec)
     held = [row for row in table if row["held"]]
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
@@ -112,9 +112,9 @@ def test_a_killed_policy_leaves_an_arm_that_brakes_and_holds(swinging, spec, lat
 
 def test_a_frozen_policy_leaves_an_arm_that_holds_within_a_tenth_of_a_second(swinging, spec, late):
     process, arm = swinging
-    wait_for(lambda: len(targets(rows(spec))) > 30 or gone(arm))
+    wait(lambda: len(targets(rows(spec))) > 30 or gone(arm))
     process.send_signal(signal.SIGSTOP)
-    wait_for(lambda: at_rest(rows(spec)))
+    wait(lambda: at_rest(rows(spec)))
     table = rows(spec)
     last = max(float(row["time"]) for row in table if not row["held"] and row["target.shoulder_pan"])
     first = next(float(row["time"]) for row in table if row["held"])
@@ -131,7 +131,7 @@ def test_ctrl_c_does_not_reach_the_arms_process(swinging, spec, late):
     process, arm = swinging
     os.kill(arm, signal.SIGINT)
     told = len(rows(spec))
-    wait_for(lambda: len(rows(spec)) > told + 20 or gone(arm))
+    wait(lambda: len(rows(spec)) > told + 20 or gone(arm))
     assert not gone(arm) or late() > BUSY
 
 
@@ -141,7 +141,7 @@ def test_an_arm_whose_process_is_killed_is_said(spec):
     remote.start()
     os.kill(remote.pid, signal.SIGKILL)
     with pytest.raises(ArmError, match="the drives hold their last target"):
-        wait_for(lambda: remote.read() is None)
+        wait(lambda: remote.read() is None)
     remote.close()
 
 

@@ -69,6 +69,7 @@ def _answer(port: int, data: bytes) -> bytes:
 def messages(seed: int, count: int) -> Iterator[tuple[str, str]]:
     """Messages to a view, a hundred a connection; a page of somebody else's stays all the time."""
     import pages
+    from waiting import wait
 
     from mjx_nero.tools.view import opening
 
@@ -89,7 +90,7 @@ def messages(seed: int, count: int) -> Iterator[tuple[str, str]]:
                 speed = draw.choice((1.0, 2.0, 3.0, 0.5))
                 pages.say(other, "GuiUpdateMessage", uuid=pages.controls(shown)["Speed"][0], updates={"value": speed})
                 try:
-                    pages.wait(lambda speed=speed: shown.session.speed == speed)
+                    wait(lambda speed=speed: shown.session.speed == speed)
                     why = "Traceback" if "Traceback" in said.getvalue() or shown.session.failure is not None else ""
                 except AssertionError:
                     why = "the other page is not heard any more"

@@ -1,13 +1,13 @@
 """A page of the browser view without a browser: what it sends, as tests say it."""
 
 import contextlib
-import time
 import urllib.parse
 
 import msgspec
 import viser
 from viser import _messages
 from viser.infra._messages import wire_field_names
+from waiting import wait
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -72,14 +72,6 @@ def look(shown, client):
     before = set(shown.server.get_clients())
     say(client, "ViewerCameraMessage", **CAMERA)
     wait(lambda: set(shown.server.get_clients()) - before)
-
-
-def wait(condition, seconds=120):
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-    return found
 
 
 def controls(shown):

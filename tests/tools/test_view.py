@@ -6,8 +6,8 @@ import time
 import imageio.v3 as imageio
 import jax.numpy as jnp
 import numpy as np
-import pages
 import pytest
+import waiting
 from flax import struct
 
 import mjx_nero
@@ -18,7 +18,7 @@ from mjx_nero.tools.view.orders import Orders
 from mjx_nero.tools.view.scene import Scene
 from mjx_nero.tools.view.session import Session, free_joints
 
-wait = functools.partial(pages.wait, seconds=180)  # a browser that draws in software is slow
+wait = functools.partial(waiting.wait, seconds=180)  # a browser that draws in software is slow
 STRONG = {"robot.gravity_compensation": True}  # the drives hold the arm up, so that it gets where it is sent
 
 

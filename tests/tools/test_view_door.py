@@ -17,7 +17,8 @@ from mjx_nero.tools.view import opening, request
 
 pytest.importorskip("viser")
 
-from pages import CAMERA, SPOKEN, controls, cookie_of, odd_requests, token_of, wait
+from pages import CAMERA, SPOKEN, controls, cookie_of, odd_requests, token_of
+from waiting import wait
 
 from mjx_nero.tools.view import inner
 from mjx_nero.tools.view.door import Door

@@ -11,7 +11,8 @@ pytest.importorskip("viser")
 
 import http.client
 
-from pages import SPOKEN, cookie_of, token_of, wait
+from pages import SPOKEN, cookie_of, token_of
+from waiting import wait
 from websockets.sync.client import connect
 
 from mjx_nero.tools.view import gamepad, inner

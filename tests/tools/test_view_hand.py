@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("viser")
 
-from pages import controls, wait
+from pages import controls
+from waiting import wait
 
 import mjx_nero
 from mjx_nero.data import episode as names

@@ -7,7 +7,7 @@ import time
 import mujoco
 import numpy as np
 import pytest
-from pages import wait
+from waiting import wait
 
 import mjx_nero
 from mjx_nero.deploy.arm import ArmError

@@ -14,9 +14,10 @@ from mjx_nero.tools.view.orders import Orders
 
 pytest.importorskip("viser")
 
-from pages import DRAG, INF, NAN, SPOKEN, controls, drain, look, odd_messages, say, talk, wait
+from pages import DRAG, INF, NAN, SPOKEN, controls, drain, look, odd_messages, say, talk
 from viser import _messages, _viser
 from viser.infra._messages import wire_field_names
+from waiting import wait
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import unix_connect
 
