@@ -15,7 +15,7 @@ import pytest
 import mjx_nero
 from mjx_nero.mdp import images
 from mjx_nero.mdp.terms import ObservationGroup, ObservationTerm
-from mjx_nero.sim import cameras, scene
+from mjx_nero.sim import cameras, quats, scene
 from mjx_nero.sim.cameras import opengl, places
 from mjx_nero.sim.cameras.cfg import KINDS, MARK, CameraCfg
 from mjx_nero.tasks import registry
@@ -127,11 +127,37 @@ def test_default_cameras_see_the_cube_and_the_hand(name):
 
 
 def test_cameras_of_bundled_policies_stand_where_they_stood():
-    """Policies that come with the package saw these pictures (``nero_lift_rgb``, ``piper_lift_rgb``)."""
-    nero, piper = (places.find(registry.robot(name)) for name in ("nero", "piper"))
-    assert nero["front"].pos == (0.9145, -0.254, 0.6084) and piper["front"].pos == (0.8571, -0.2642, 0.6253)
-    assert nero["wrist"].pos == (0.15, 0.0, 0.065) and nero["wrist"].quat == (0.3484, 0.6153, 0.6153, 0.3484)
-    assert piper["wrist"].pos == (-0.12, 0.0, 0.065) and piper["wrist"].quat == (-0.3162, -0.6325, 0.6325, 0.3162)
+    """Policies that come with the package saw pictures from these places."""
+    found = {name: places.find(registry.robot(name)) for name in ("nero", "piper", "cobotta_pro_900", "so_arm101")}
+    assert {name: cameras["wrist"].pos for name, cameras in found.items()} == {
+        "nero": (0.15, 0.0, 0.065),
+        "piper": (-0.12, 0.0, 0.065),
+        "cobotta_pro_900": (-0.09, 0.0, 0.2),
+        "so_arm101": (0.01, 0.15, -0.03),
+    }
+    assert found["nero"]["front"].pos == (0.9145, -0.254, 0.6084) and found["piper"]["front"].pos == (0.8571, -0.2642, 0.6253)
+    assert found["nero"]["wrist"].quat == (0.3484, 0.6153, 0.6153, 0.3484)
+    assert found["piper"]["wrist"].quat == (-0.3162, -0.6325, 0.6325, 0.3162)
+
+
+@pytest.mark.parametrize("name", registry.ROBOTS)
+def test_a_small_camera_fits_at_the_wrist(name):
+    """Within 2.5 cm there is nothing, closed and open; the grasp point is 10 cm away, and the table 6 cm lower than the camera."""
+    robot = registry.robot(name)
+    camera, (model, data) = places.find(robot)["wrist"], scene.at_home(robot, whole=True)
+    hand = model.site(robot.ee_site)
+    away = np.array(camera.pos) - hand.pos
+    back = quats.matrix(hand.quat) @ quats.matrix(np.array(robot.down)).T[:, 2]  # the hand's axis, away from its fingers
+    assert np.linalg.norm(away) >= 0.1 and away @ back > 0.0599
+    ways = np.random.default_rng(0).normal(size=(300, 3))
+    for fingers in (robot.gripper.open, robot.gripper.close):
+        for joint, position in zip(robot.gripper.joints, fingers, strict=True):
+            data.joint(joint).qpos[0] = position
+        mujoco.mj_kinematics(model, data)
+        link = data.body(camera.link)
+        eye = link.xpos + link.xmat.reshape(3, 3) @ camera.pos
+        hits = [mujoco.mj_ray(model, data, eye, way / np.linalg.norm(way), None, 1, -1, np.zeros(1, np.int32)) for way in ways]
+        assert min(hit for hit in hits if hit >= 0) > 0.025
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,12 @@ Cameras = dict[str, CameraCfg]
 _FRONT = np.array([1.0, -0.45, 0.75])  # direction from the region to the camera, ahead of the robot, where the robot hides little
 _MARGIN = 0.04  # [m] margin around the regions
 _ASIDE = (0.05, 0.07, 0.09, 0.12, 0.15)  # [m] distances of a camera from the hand's axis
-_BEHIND = (0.02, 0.06, 0.1, 0.14)  # [m] distances behind the grasp point
+_BEHIND = (0.06, 0.1, 0.14)  # [m] distances behind the grasp point: nearer ones would strike the table
+_NEAREST = 0.1  # [m] to the grasp point: where small cameras begin to focus
 _AHEAD = 0.03  # [m] the wrist's camera looks this far ahead of the grasp point
 _CLEAR = 0.012  # [m] shapes nearer to a point than this belong to it
-_FREE = 0.01  # [m] free space around a camera
+_FREE = 0.03  # [m] free space around a camera: small ones are cubes of 3 to 4 cm
+_AROUND = np.array([way / np.linalg.norm(way) for way in itertools.product((-1, 0, 1), repeat=3) if any(way)])  # unit directions
 _EQUAL = 4  # places count as equal if their numbers of visible points differ by no more than this
 
 
@@ -61,8 +63,8 @@ def front(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb",), fovy: float = 75.0) -> CameraCfg:
     """Places a camera on the hand that looks past the fingers.
 
-    It takes, of many places, the one that sees most points between and ahead of the fingers, open and closed. Among equals it
-    takes the highest at home, which sees the table, then the nearest to the hand.
+    It takes, of many places where a small camera fits, the one that sees most points between and ahead of the fingers, open and
+    closed. Among equals it takes the highest at home, which sees the table, then the nearest to the hand.
     """
     link, pos, quat = _on_hand(robot)
     return CameraCfg(link=link, pos=pos, quat=quat, fovy=fovy, size=size, kinds=kinds)
@@ -80,6 +82,8 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
     found = []
     up = data.xmat[body].reshape(3, 3)[2]  # the world's vertical, in the link's frame
     for aside, behind, angle in itertools.product(_ASIDE, _BEHIND, np.arange(8) * np.pi / 4):
+        if np.hypot(aside, behind) < _NEAREST:
+            continue
         out = np.cos(angle) * side + np.sin(angle) * across
         pos = grasp + behind * back + aside * out
         seen = _sees(model, robot, body, pos, grasp, straight)
@@ -90,7 +94,7 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
 
 
 def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:
-    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame can see."""
+    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame can see; -1 where none fits."""
     data, count, hit = mujoco.MjData(model), 0, np.zeros(1, np.int32)
     for fingers in (robot.gripper.open, robot.gripper.close):
         for joint, position in zip(robot.joints, (*robot.arm.home, *fingers), strict=True):
@@ -98,12 +102,12 @@ def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, gr
         mujoco.mj_kinematics(model, data)
         frame, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
         eye = origin + frame @ pos
+        if any(0 <= mujoco.mj_ray(model, data, eye, frame @ way, None, 1, -1, hit) < _FREE for way in _AROUND):
+            return -1
         for local in itertools.product((-0.02, 0.0, 0.02), (-0.02, 0.0, 0.02), (0.0, -0.03, -0.06, -0.1)):
             way = origin + frame @ (grasp + straight @ np.array(local)) - eye
             far = float(np.linalg.norm(way))
             first = mujoco.mj_ray(model, data, eye, way / far, None, 1, -1, hit)
-            if 0 <= first < _FREE:  # within a link
-                return -1
             count += first < 0 or first > far - _CLEAR
     return count
 
