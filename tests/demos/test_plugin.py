@@ -1,12 +1,16 @@
 """The plug-in for LeRobot, where LeRobot is: see ``lerobots``."""
 
+import importlib.util
 import json
 import os
 import pathlib
 import subprocess
 
+import numpy as np
 import pytest
 from lerobots import lerobot_python
+
+from mjx_nero.types import UserError
 
 HERE = pathlib.Path(__file__).parent
 
@@ -33,3 +37,29 @@ def test_lerobot_makes_and_steps_an_environment():
     seen |= {f"observation.images.{name}": [3, 32, 32] for name in ("front", "wrist")}
     assert told["asked"] == {"action": [9], **seen}
     assert told["pictures"] == {name: [1, *shape] for name, shape in seen.items()}
+
+
+def test_an_evaluation_is_filmed_without_opengl(monkeypatch):
+    """``lerobot-eval`` films every evaluation: without OpenGL it gets what the first camera sees, or one line."""
+    path = HERE.parents[1] / "plugins" / "lerobot_env_mjx_nero" / "lerobot_env_mjx_nero" / "env.py"
+    spec = importlib.util.spec_from_file_location("plugin_env", path)
+    plugin = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(plugin)
+
+    def absent(*_):
+        raise UserError("no offscreen OpenGL here")
+
+    env = plugin.Env("nero_reach", cameras="front+side", size=(24, 16))
+    seen, _ = env.reset(seed=1)
+    (picture,) = seen["pixels"].values()
+    assert env.render().shape == (480, 640, 3)
+    env.close()
+    monkeypatch.setattr(plugin, "Renderer", absent)
+    np.testing.assert_array_equal(env.render(), picture)
+    assert picture.shape == (16, 48, 3) and picture.std() > 5
+    seen, *_ = env.step(env.action_space.sample())
+    np.testing.assert_array_equal(env.render(), next(iter(seen["pixels"].values())))
+    blind = plugin.Env("nero_reach")
+    blind.reset(seed=1)
+    with pytest.raises(UserError, match="no offscreen OpenGL"):
+        blind.render()

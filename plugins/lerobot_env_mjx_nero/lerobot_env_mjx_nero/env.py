@@ -15,6 +15,7 @@ from mjx_nero.sim.render import Renderer
 from mjx_nero.tasks import registry
 from mjx_nero.tools import cli
 from mjx_nero.tools.demos import making
+from mjx_nero.types import UserError
 
 
 class Programs:
@@ -123,20 +124,23 @@ class Env(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Dict(spaces)
         self._renderer: Renderer | None = None
         self._state: Any = None
+        self._observed: dict[str, Any] = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict]:
         """Starts an episode; a seed determines all of it."""
         super().reset(seed=seed)
         self._state, seen = self._programs.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
-        return self._programs.named(self._state, seen), {"is_success": False}
+        self._observed = self._programs.named(self._state, seen)
+        return self._observed, {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict]:
         """Runs one control step. The info has ``is_success``, which can only be true at the end of an episode."""
         self._state, seen, out = self._programs.step(self._state, np.asarray(action, np.float32))
         reward, done, truncated, success = (float(x) for x in out)
         ended = done > 0
+        self._observed = self._programs.named(self._state, seen)
         return (
-            self._programs.named(self._state, seen),
+            self._observed,
             reward,
             ended and not truncated,
             truncated > 0,
@@ -144,8 +148,16 @@ class Env(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray:
-        """Renders a frame, uint8 [height, width, 3]."""
-        self._renderer = self._renderer or Renderer(self._programs.env.mj_model)
+        """Renders a frame, uint8 [height, width, 3]: the scene, or without OpenGL what the first camera sees.
+
+        ``lerobot-eval`` films every evaluation, and a server that draws with the ray tracer need not have OpenGL.
+        """
+        try:
+            self._renderer = self._renderer or Renderer(self._programs.env.mj_model)
+        except UserError:
+            if pictures := self._observed.get("pixels"):
+                return next(iter(pictures.values()))
+            raise
         scenery = jax.device_get(self._programs.scenery(self._state))
         return self._renderer.render(np.asarray(self._state.pipeline_state.qpos), scenery)
 
