@@ -37,7 +37,7 @@ PICTURES = {  # name -> robots, width and height, steps between frames, quality 
 }
 
 # Environments with bundled policies of the preset rgb.
-SEEING = ("nero_lift", "cobotta_lift", "piper_lift", "so101_lift", "cobotta_place", "cobotta_stack")
+SEEING = ("nero_lift", "cobotta_lift", "piper_lift", "so101_lift", "cobotta_place", "cobotta_stack", "nero_place", "nero_stack")
 FALL_SHORT = ("nero_clutter", "cobotta_place")  # a seed or more learnt too late: see docs/lab/results.md
 
 
