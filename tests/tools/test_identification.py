@@ -16,7 +16,7 @@ from mjx_nero.identify.plant import POSITIVE, in_force, usual_step
 from mjx_nero.mdp import actions, randomization
 from mjx_nero.sim.robot import DriveCfg, RobotCfg
 from mjx_nero.tasks import registry
-from mjx_nero.tools.identification.report import save, save_plot
+from mjx_nero.tools.identification.report import plot, save, save_plot
 
 SHAPE = '<geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="0.8"/>'
 LINK = '<joint name="{}" axis="0 1 0" range="-2 2" armature="0.02"/>' + SHAPE
@@ -97,6 +97,30 @@ def test_what_was_put_in_is_found_again(plant, tmp_path):
     found = identified.read(tmp_path / "fit.yaml")
     assert found.joints["elbow"].stiffness.value == pytest.approx(truth.stiffness[1], rel=0.05)
     assert found.delay.low <= found.delay.value <= found.delay.high
+
+
+@pytest.mark.parametrize(("noise", "error"), [(1e-4, 0.1), (1.1e-6, 1e-3), (3e-5, 20.0), (0.05, 0.1), (1e-4, 1e-4)])
+@pytest.mark.parametrize("count", [1, 4, 7])
+def test_no_two_numbers_of_the_plot_overlap(noise, error, count):
+    """The numbers beside each panel stand apart, and the lowest panel of each column has the times below it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    times = np.linspace(0, 60, 600)
+    wave = np.sin(times)[:, None] * np.ones(count)
+    log = logs.Log(times=times, positions=np.zeros_like(wave), sent=times[:1], targets=np.zeros((1, count)))
+    drives, held = dataclasses.replace(Plant(ARM, 0.005).nominal), times > 45
+    fit = fitting.Fit(drives, drives, drives, noise * wave, error * wave, held, np.full(count, noise), np.full(count, error))
+    figure = Figure(figsize=(12, 0.8 + 2.2 * -(-count // 3)), layout="constrained")
+    plot([f"joint{i}" for i in range(count)], log, fit, figure)
+    FigureCanvasAgg(figure).draw()
+    for panel in figure.axes[:count]:
+        low, high = panel.get_window_extent().extents[[1, 3]]
+        boxes = [label.get_window_extent().extents for label in panel.get_yticklabels() if label.get_text()]
+        boxes = sorted((box[1], box[3]) for box in boxes if low - 1 <= (box[1] + box[3]) / 2 <= high + 1)
+        assert len(boxes) > 1 and all(above[0] > below[1] for below, above in zip(boxes, boxes[1:], strict=False))
+    lowest = figure.axes[max(0, count - 3) : count]
+    assert all(any(label.get_visible() and label.get_text() for label in panel.get_xticklabels()) for panel in lowest)
 
 
 @pytest.mark.slow

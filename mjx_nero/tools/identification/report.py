@@ -58,30 +58,37 @@ def save(path: pathlib.Path, robot: str, log: str, joints: Sequence[str], fit: F
     files.write(path, (head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)).encode())
 
 
-def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> None:
+def plot(joints: Sequence[str], log: Log, fit: Fit, figure) -> None:
     """Plots simulated minus measured positions over time, one panel per joint, for the identified and the model's drives."""
-    from matplotlib.figure import Figure
-
     columns = min(3, len(joints))
-    rows = math.ceil(len(joints) / columns)
-    figure = Figure(figsize=(12, 0.8 + 2.2 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    panels = figure.subplots(math.ceil(len(joints) / columns), columns, squeeze=False, sharex=True).ravel()
     thin = slice(None, None, max(1, len(log.times) // 4000))
+    # Linear up to a power of ten, where the first tick beside zero is: a smaller one would be written over zero's.
+    linear = 10.0 ** math.ceil(math.log10(max(1e-3, 3e3 * float(np.min(fit.rms)))))
     for i, (panel, joint) in enumerate(zip(panels, joints, strict=False)):
-        for path_, label, color in (
+        for path, label, color in (
             (fit.nominal, "the model's own drives", "tab:gray"),
             (fit.readings, "identified", "tab:blue"),
         ):
-            panel.plot(log.times[thin], 1e3 * (path_ - log.positions)[thin, i], label=label, color=color, linewidth=0.7)
+            panel.plot(log.times[thin], 1e3 * (path - log.positions)[thin, i], label=label, color=color, linewidth=0.7)
         panel.axvspan(log.times[fit.held][0], log.times[-1], color="tab:orange", alpha=0.12, label="held out")
         panel.set_title(f"{joint}: held out {1e3 * fit.rms[i]:.3g} (was {1e3 * fit.nominal_rms[i]:.3g})", loc="left", fontsize=9)
-        panel.set_yscale("symlog", linthresh=float(max(1e-3, 3e3 * np.min(fit.rms))))
+        panel.set_yscale("symlog", linthresh=linear)
+        panel.tick_params(labelsize=7, labelbottom=i >= len(joints) - columns)
         panel.grid(alpha=0.3)
     for panel in panels[len(joints) :]:
         panel.set_axis_off()
     panels[0].legend(fontsize=7, loc="lower left")
     figure.suptitle("simulated minus measured position [mrad, mm]", x=0.01, ha="left")
     figure.supxlabel("time [s]", fontsize=9)
+
+
+def save_plot(path: pathlib.Path, joints: Sequence[str], log: Log, fit: Fit) -> None:
+    """Writes the picture of ``plot``."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 0.8 + 2.2 * math.ceil(len(joints) / 3)), layout="constrained")
+    plot(joints, log, fit, figure)
     with files.whole(path) as part:
         figure.savefig(part, dpi=110)
 
