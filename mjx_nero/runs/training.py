@@ -139,8 +139,10 @@ def carry_out(
     try:
         ended = _loop(run, made, tally, meta, folder)
     except NotWritten as error:
-        last = next((f"; the last good checkpoint is {p}" for p in saved(folder)), "")
-        raise UserError(f"{error}: stopped at {tally.steps:,} steps{last}. Make room and {go_on}") from None
+        last = next(iter(saved(folder)), None)
+        there = f"; the last good checkpoint is {last}. Make room and {go_on}"
+        none = f" without a checkpoint. Make room, remove {folder} and start again"
+        raise UserError(f"{error}: stopped at {tally.steps:,} steps{there if last else none}") from None
     if ended.why == "interrupted":
         say(f"stopped at {tally.steps:,} steps, all saved; {go_on}")
     return _finish(run, made.learner, tally, ended, folder, made.seconds)

@@ -81,13 +81,29 @@ def test_a_full_disk(train, at_row, undisturbed, tmp_path, moment):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     *_, line = err.splitlines()
     assert code == 2 and line.startswith("error: cannot write run/") and "File too large: stopped at" in line
-    assert "Make room and resume with: python train.py --restore run" in line
-    if moment > 1:
+    if any((tmp_path / "run" / "checkpoints").glob("*.safetensors")):
         assert "the last good checkpoint is run/checkpoints/0000" in line
+        assert line.endswith("Make room and resume with: python train.py --restore run")
+    else:
+        assert moment == 1 and line.endswith("without a checkpoint. Make room, remove run and start again")
     assert not list((tmp_path / "run").rglob("*.part*"))
     code, _, err = train("--out", "run", "--resume", "auto")
     assert code == 0, err
     assert last(tmp_path / "run") == undisturbed
+
+
+def test_a_disk_too_small_for_a_first_checkpoint(train, tmp_path):
+    """The settings fit, and no checkpoint does: nothing can be resumed, and the line does not say so."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        code, _, err = train("--out", "run")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    *_, line = err.splitlines()
+    assert code == 2 and line.startswith("error: cannot write run/checkpoints/") and "--restore" not in line
+    assert line.endswith("without a checkpoint. Make room, remove run and start again")
+    assert not list((tmp_path / "run" / "checkpoints").iterdir())
 
 
 def test_a_disk_that_is_full_at_the_start(train, tmp_path, monkeypatch):
