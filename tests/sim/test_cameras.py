@@ -142,7 +142,7 @@ def test_cameras_of_bundled_policies_stand_where_they_stood():
 
 @pytest.mark.parametrize("name", registry.ROBOTS)
 def test_a_small_camera_fits_at_the_wrist(name):
-    """Within 2.5 cm there is nothing, closed and open; the grasp point is 10 cm away, and the table 6 cm lower than the camera."""
+    """Within 2.5 cm there is nothing, closed and open; the grasp point is 10 cm away, the table 6 cm lower than the camera."""
     robot = registry.robot(name)
     camera, (model, data) = places.find(robot)["wrist"], scene.at_home(robot, whole=True)
     hand = model.site(robot.ee_site)

@@ -94,7 +94,7 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
 
 
 def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, grasp: np.ndarray, straight: np.ndarray) -> int:
-    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame can see; -1 where none fits."""
+    """Counts the points between and ahead of the fingers that a camera at ``pos`` in the link's frame sees; -1: none fits."""
     data, count, hit = mujoco.MjData(model), 0, np.zeros(1, np.int32)
     for fingers in (robot.gripper.open, robot.gripper.close):
         for joint, position in zip(robot.joints, (*robot.arm.home, *fingers), strict=True):
