@@ -96,15 +96,16 @@ def report(result: dict[str, Any]) -> None:
 
 
 def draw(played: "Played", path: pathlib.Path, cfg: videos.VideoCfg) -> None:
-    """Writes the video, or prints why it cannot."""
-    screen, episodes = console.screen(), played.episodes
-    try:
-        with console.drawing(console.screen(stderr=True), path.name) as update:
-            model, what = played.env.mj_model, (episodes.qpos, episodes.scenery)
-            videos.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.pictures)
-        console.wrote(screen, "video", path)
-    except UserError as error:
-        console.line(screen, str(error))
+    """Writes the video.
+
+    Raises:
+        UserError: it cannot be drawn or written.
+    """
+    episodes = played.episodes
+    with console.drawing(console.screen(stderr=True), path.name) as update:
+        model, what = played.env.mj_model, (episodes.qpos, episodes.scenery)
+        videos.write_episodes(path, model, *what, played.env.dt, cfg, update, episodes.pictures)
+    console.wrote(console.screen(), "video", path)
 
 
 def table(result: dict[str, Any]) -> console.Table:

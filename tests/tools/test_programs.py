@@ -214,10 +214,10 @@ def test_without_opengl_all_but_the_video(call, tmp_path, monkeypatch):
         raise ImportError("no GL")
 
     monkeypatch.setattr(mujoco, "Renderer", broken)
-    code, out, _ = call(
+    code, out, err = call(
         "eval", "--agent", "zero", "--episodes", 1, "--backend", "mujoco", "--video", "lift.mp4", "--json", "r.json"
     )
-    assert code == 0 and "install libegl1" in out
+    assert code == 2 and "success rate" in out and "install libegl1" in err
     assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
 
 
