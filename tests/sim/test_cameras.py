@@ -160,6 +160,13 @@ def test_a_small_camera_fits_at_the_wrist(name):
         assert min(hit for hit in hits if hit >= 0) > 0.025
 
 
+def test_a_hand_without_room_for_a_camera_is_refused(monkeypatch):
+    monkeypatch.setattr(places, "_FREE", 1.0)  # [m]: the table is nearer
+    places._on_hand.cache_clear()
+    with pytest.raises(UserError, match="^nero leaves no room for a camera at its hand: set scene.cameras yourself$"):
+        places.wrist(registry.robot("nero"))
+
+
 @pytest.fixture(scope="module")
 def pictured():
     """Two environments on MuJoCo's renderer, of episodes of three steps."""

@@ -31,7 +31,7 @@ def find(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb"
     """Finds a camera in front and one at the wrist.
 
     Raises:
-        UserError: the robot's config lacks its regions.
+        UserError: the robot's config lacks its regions, or no camera fits at the wrist.
     """
     return {"front": front(robot, size, kinds), "wrist": wrist(robot, size, kinds)}
 
@@ -65,6 +65,9 @@ def wrist(robot: RobotCfg, size: Size = (64, 64), kinds: tuple[str, ...] = ("rgb
 
     It takes, of many places where a small camera fits, the one that sees most points between and ahead of the fingers, open and
     closed. Among equals it takes the highest at home, which sees the table, then the nearest to the hand.
+
+    Raises:
+        UserError: none fits.
     """
     link, pos, quat = _on_hand(robot)
     return CameraCfg(link=link, pos=pos, quat=quat, fovy=fovy, size=size, kinds=kinds)
@@ -87,7 +90,10 @@ def _on_hand(robot: RobotCfg) -> tuple[str, tuple, tuple]:
         out = np.cos(angle) * side + np.sin(angle) * across
         pos = grasp + behind * back + aside * out
         seen = _sees(model, robot, body, pos, grasp, straight)
-        found.append((-(seen // _EQUAL), -round(float(out @ up), 1), aside + behind, float(angle), tuple(pos), tuple(out)))
+        if seen >= 0:
+            found.append((-(seen // _EQUAL), -round(float(out @ up), 1), aside + behind, float(angle), tuple(pos), tuple(out)))
+    if not found:
+        raise UserError(f"{robot.name} leaves no room for a camera at its hand: set scene.cameras yourself")
     *_, pos, out = min(found)
     quat = look_at(np.array(pos), grasp - _AHEAD * back, up=out)
     return model.body(body).name, _tuple(pos), _tuple(quat)
