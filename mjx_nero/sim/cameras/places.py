@@ -23,7 +23,7 @@ _NEAREST = 0.1  # [m] to the grasp point: where small cameras begin to focus
 _AHEAD = 0.03  # [m] the wrist's camera looks this far ahead of the grasp point
 _CLEAR = 0.012  # [m] shapes nearer to a point than this belong to it
 _FREE = 0.03  # [m] free space around a camera: small ones are cubes of 3 to 4 cm
-_AROUND = np.array([way / np.linalg.norm(way) for way in itertools.product((-1, 0, 1), repeat=3) if any(way)])  # unit directions
+_AROUND = [np.array(way) / np.linalg.norm(way) for way in itertools.product((-1, 0, 1), repeat=3) if any(way)]  # unit directions
 _EQUAL = 4  # places count as equal if their numbers of visible points differ by no more than this
 
 
