@@ -98,7 +98,8 @@ def load_meta(path: pathlib.Path) -> dict[str, Any]:
         UserError: the file is missing, or ``save`` did not write it.
     """
     if path.is_dir():
-        raise UserError(f"{path} is a folder: give a file in it, such as {path}/policy.safetensors")
+        there = sorted(path.glob("*.safetensors"), key=lambda p: p.name != "policy.safetensors")
+        raise UserError(f"{path} is a folder: " + (f"give a file in it, such as {there[0]}" if there else "give a policy's file"))
     if not path.is_file():
         raise UserError(f"no such file: {path}")
     _, texts = header.read(path)

@@ -102,11 +102,18 @@ def test_write_protected_folder(tmp_path):
 
 def test_missing_file(tmp_path):
     none = tmp_path / "none.safetensors"
-    for path, said in ((none, f"^no such file: {none}$"), (tmp_path, f"^{tmp_path} is a folder: give a file in it, such as ")):
+    for path, said in ((none, f"^no such file: {none}$"), (tmp_path, f"^{tmp_path} is a folder: give a policy's file$")):
         with pytest.raises(UserError, match=said):
             checkpoint.load_meta(path)
         with pytest.raises(UserError, match=said):
             checkpoint.load(path, TREE)
+
+
+def test_a_folder_names_a_file_that_is_in_it(tmp_path):
+    for name in ("best.safetensors", "policy.safetensors"):
+        checkpoint.save(tmp_path / name, TREE, META)
+        with pytest.raises(UserError, match=f"^{tmp_path} is a folder: give a file in it, such as {tmp_path / name}$"):
+            checkpoint.load_meta(tmp_path)
 
 
 def truncated(path):

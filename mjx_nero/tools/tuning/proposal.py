@@ -72,7 +72,7 @@ def tune(robot: RobotCfg, step: float = 0.1, frequency: float | None = None, sim
     frequency = 1 / (2 * math.pi * sim.dt * sim.decimation) if frequency is None else frequency
     if 2 * math.pi * frequency * sim.dt > 1:
         limit = 1 / (2 * math.pi * sim.dt)
-        raise UserError(f"a physics step of {sim.dt:g} s cannot follow {frequency:g} Hz: at most {limit:.3g} Hz")
+        raise UserError(f"a physics step of {sim.dt:g} s cannot follow {frequency:g} Hz: at most {limit:.3g} Hz, or a smaller dt")
     model = drives_model(robot, sim)
     carried = loads(model)
     sizes = np.abs(steps(model, robot.home, step))
