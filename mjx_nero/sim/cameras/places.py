@@ -114,6 +114,8 @@ def _sees(model: mujoco.MjModel, robot: RobotCfg, body: int, pos: np.ndarray, gr
             way = origin + frame @ (grasp + straight @ np.array(local)) - eye
             far = float(np.linalg.norm(way))
             first = mujoco.mj_ray(model, data, eye, way / far, None, 1, -1, hit)
+            if 0 <= first < _FREE:  # too thin for the directions around
+                return -1
             count += first < 0 or first > far - _CLEAR
     return count
 
