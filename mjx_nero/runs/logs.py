@@ -1,6 +1,7 @@
 """The logs of a run. They are expendable: if one cannot be written, training continues without it."""
 
 import contextlib
+import functools
 import json
 import pathlib
 import time
@@ -9,6 +10,7 @@ from typing import Any, Protocol
 
 from mjx_nero import files
 from mjx_nero.errors import UserError
+from mjx_nero.files import imports
 
 METRICS = "metrics.jsonl"
 MAX_METRICS = 200_000_000  # bytes
@@ -84,10 +86,7 @@ class Logs:
                     plot_curve(rows, part)
 
     def _write_events(self, row: Row) -> None:
-        from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
-        from tensorboardX.summary import scalar
-
+        EventsWriter, Event, SessionLog, scalar = _tensorboard()
         if self._events is None:
             folder = self._folder / "tensorboard"
             folder.mkdir(parents=True, exist_ok=True)
@@ -133,6 +132,16 @@ def _row(text: bytes) -> Row | None:
         return None
     numbers = isinstance(row, dict) and all(value is None or type(value) in (int, float) for value in row.values())
     return row if numbers and row.get("steps") is not None else None
+
+
+@functools.cache
+def _tensorboard() -> tuple[Any, ...]:
+    """Imports TensorBoard's writer without PyTorch, which takes seconds, and which numbers do without."""
+    with imports.replaced({"torch": None}):
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.summary import scalar
+    return EventsWriter, Event, SessionLog, scalar
 
 
 def _append(path: pathlib.Path, text: str) -> None:

@@ -17,31 +17,9 @@ import importlib.util
 import io
 import sys
 import types
-from collections.abc import Iterator, Mapping
 from typing import Any
 
-
-class _Later(types.ModuleType):
-    """Stands in for a module, and imports it when one of its attributes is first read."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # Python itself asks for those
-            raise AttributeError(name)
-        if sys.modules.get(self.__name__) is self:  # still hidden: only annotations read it
-            return Any
-        return getattr(importlib.import_module(self.__name__), name)
-
-
-@contextlib.contextmanager
-def _replaced(stand_ins: Mapping[str, Any]) -> Iterator[None]:
-    """Lets imports find stand-ins for modules that are not imported yet. A module that is None cannot be imported."""
-    hidden = {name: stand_in for name, stand_in in stand_ins.items() if name not in sys.modules}
-    sys.modules |= hidden
-    try:
-        yield
-    finally:
-        for name in hidden:
-            del sys.modules[name]
+from mjx_nero.files.imports import Later, replaced
 
 
 class _Unread(types.ModuleType):
@@ -56,17 +34,17 @@ class _Unread(types.ModuleType):
         return getattr(self, name)
 
 
-_MJX = {"warp": None, "trimesh": _Later("trimesh"), "scipy.spatial": _Later("scipy.spatial")}
+_MJX = {"warp": None, "trimesh": Later("trimesh"), "scipy.spatial": Later("scipy.spatial")}
 _ENGINES = ("brax.generalized.pipeline", "brax.mjx.pipeline", "brax.positional.pipeline", "brax.spring.pipeline", "brax.io.image")
 
-with contextlib.redirect_stdout(io.StringIO()), _replaced(_MJX):
+with contextlib.redirect_stdout(io.StringIO()), replaced(_MJX):
     importlib.import_module("mujoco.mjx")
 if "brax.envs" not in sys.modules:
     spec = importlib.util.find_spec("brax.envs")
     assert spec
     package = sys.modules["brax"].envs = sys.modules["brax.envs"] = importlib.util.module_from_spec(spec)  # type: ignore[attr-defined]
     package.__class__ = _Unread
-with _replaced({name: _Later(name) for name in _ENGINES}):
+with replaced({name: Later(name) for name in _ENGINES}):
     from brax.envs.base import Env as Env
     from brax.envs.base import State as State
     from brax.envs.base import Wrapper as Wrapper

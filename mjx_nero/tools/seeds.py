@@ -7,8 +7,6 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from scipy import stats
-
 from mjx_nero import files
 from mjx_nero.config import values
 from mjx_nero.config.bounds import NonNegative, Seed, Share, Whole
@@ -136,5 +134,7 @@ def mean_interval(values: Sequence[float], most: float = math.inf) -> tuple[floa
     """Returns Student's 95% interval of the mean of independent values from 0 to ``most``; None for a single value."""
     if len(values) < 2:
         return None
-    half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / math.sqrt(len(values))
+    from scipy.special import stdtrit  # slow to import
+
+    half = float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
     return max(0.0, statistics.mean(values) - half), min(most, statistics.mean(values) + half)
