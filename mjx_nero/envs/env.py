@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_nero.config import bounds, values
 from mjx_nero.envs import identified, reach, things
+from mjx_nero.envs.once import once
 from mjx_nero.envs.task import EnvCfg
 from mjx_nero.envs.view import Viewer
 from mjx_nero.mdp import events, terms
@@ -137,14 +138,14 @@ class ManipulationEnv(Env):
             groups[name] = Drives(home, low, high, speed, open, close, lag, self.dt, cfg.joints)
         return groups
 
-    @functools.cached_property
+    @once
     def physics(self) -> Physics:
         """The physics backend, created at the first step."""
         with jax.ensure_compile_time_eval():  # the first step may run under a trace
             differ = tuple(dict.fromkeys((*self._randomization.names, *self._parts.fields)))
             return make_physics(self.physics_model, self.cfg.sim, self.impl, differ)
 
-    @functools.cached_property
+    @once
     def mj_model(self) -> mujoco.MjModel:
         """The whole scene compiled for MuJoCo, with visual shapes, lights and cameras, for rendering and inspection."""
         return scene.build(self.cfg.robot, self.cfg.scene, self.cfg.sim)
@@ -155,12 +156,12 @@ class ManipulationEnv(Env):
             seen = (*self._parts.seen, *self._look.names)
             return cameras.Cameras(self.mj_model, own, renderer, tuple(dict.fromkeys(seen)))
 
-    @functools.cached_property
+    @once
     def cameras(self) -> cameras.Cameras:
         """The scene's cameras; made when something is first drawn."""
         return self.draw_by(self.cfg.scene.cameras, cameras.renderer(self.cfg.scene.renderer, self.impl))
 
-    @functools.cached_property
+    @once
     def _look(self) -> Look:
         return Look(self.mj_model, self.cfg.look)
 
@@ -182,12 +183,12 @@ class ManipulationEnv(Env):
         """Number of entries of an action."""
         return len(self.home_action)
 
-    @functools.cached_property
+    @once
     def state_shape(self) -> State:
         """The result of ``reset``, with shapes in place of arrays."""
         return jax.eval_shape(lambda: self.reset(jax.random.PRNGKey(0)))  # a key made outside would be compiled
 
-    @functools.cached_property
+    @once
     def observation_size(self) -> dict[str, Any]:
         """The shape of each observation group; a dict of shapes for a group whose terms stay apart."""
         obs = self.state_shape.obs
