@@ -1,6 +1,5 @@
 """All commands: python -m mjx_nero COMMAND ..., or mjx-nero COMMAND ... (each has its --help)."""
 
-import gc
 import importlib
 import signal
 from collections.abc import Sequence
@@ -58,8 +57,7 @@ def program(*command: str) -> NoReturn:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until ``cli.run`` handles it, Ctrl-C ends the imports without a traceback
     from mjx_nero.tools import cli
 
-    # Imports and traces make hundreds of thousands of lasting objects. Python would look through all of them again and again.
-    gc.set_threshold(100_000)
+    cli.collect_seldom()
     cli.run(lambda argv: main([*command, *argv]))
 
 

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import gc
 import importlib
 import importlib.util
 import logging
@@ -279,6 +280,11 @@ def _occupy_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+
+
+def collect_seldom() -> None:
+    """Lets Python look for garbage less often: imports and traces make hundreds of thousands of objects, which last."""
+    gc.set_threshold(100_000)
 
 
 def setup_jax() -> None:

@@ -308,7 +308,7 @@ def test_the_stages_of_a_start(call, tmp_path):
     for found in stages.values():
         assert (
             found["until the first training step"]["seconds"]
-            == found["first iteration"]["begins_s"]
+            == found["first iterations"]["begins_s"]
             > found["imports"]["seconds"]
         )
     assert stages["filled"]["learner, compiled"]["seconds"] < 0.5 * stages["empty"]["learner, compiled"]["seconds"]

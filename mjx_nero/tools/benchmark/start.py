@@ -12,7 +12,8 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from mjx_nero.errors import UserError
-from mjx_nero.runs import compiled
+from mjx_nero.learn import device_memory
+from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
@@ -59,11 +60,11 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> list[Span]:
     if done.returncode:
         raise UserError("the start to be measured failed: see its error above")
     stages = [Span(*row) for row in json.loads(done.stdout.splitlines()[-1])]
-    return [*stages, Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iteration"))]
+    return [*stages, Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iterations"))]
 
 
 def begin(spawned: float, imported: float, run: RunCfg) -> None:
-    """Starts a run, makes one iteration and one evaluation, and prints the stages as one line of JSON.
+    """Starts a run as ``train.py`` does, up to its first call of the learner, and prints the stages as one line of JSON.
 
     Args:
         spawned, imported: when the process was started, and when its imports were done [s since 1970].
@@ -73,12 +74,14 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
     spans = Spans()
     with spans.span("environments"):
         learner = compiled.make_learner(run)
+        device_memory.check(learner)
     before = time.time() - spawned
-    made = compiled.compile(run, learner, 1, lambda: compiled.starter(learner)(0))
-    with spans.span("first iteration"):
-        state, _ = jax.block_until_ready(made.advance(made.state))
+    bank = starts.maker(learner, training.speaker())
+    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank)(0), pathlib.Path("start"))
     with spans.span("first evaluation"):
-        made.evaluate(state)
+        made.evaluate(made.state)
+    with spans.span("first iterations"):
+        jax.block_until_ready(made.advance(made.state))
     stages = [Span("imports", 0.0, imported - spawned), Span("config", imported - spawned, spawned + so_far - imported)]
     stages += [Span(name, begun + so_far, seconds) for name, begun, seconds in spans.found]
     stages += [Span(name, begun + before, seconds) for name, begun, seconds in made.spans]
