@@ -1,17 +1,25 @@
-"""What a start costs: the packages that commands import, and the programs that they compile."""
+"""What a start costs: the packages that commands import, the programs that they compile, and what waits for what."""
 
+import concurrent.futures
+import dataclasses
 import json
 import os
 import pathlib
 import subprocess
 import sys
+import threading
+import time
 
 import jax
 import numpy as np
 import pytest
 
+from mjx_nero.envs import env
 from mjx_nero.learn import checkpoint
 from mjx_nero.learn.play import rollout
+from mjx_nero.runs import cfg, compiled
+from mjx_nero.sim import physics
+from mjx_nero.tasks import registry
 
 ROOT = pathlib.Path(__file__).parents[1]
 # Runs a command, and prints which packages and modules it has imported and the names of the programs that it has compiled.
@@ -30,7 +38,8 @@ from mjx_nero.__main__ import program
 program()
 """
 # Their import takes longer than that of MuJoCo, and what starts here does without.
-SELDOM = {"scipy.spatial", "scipy.optimize", "trimesh", "warp", "jaxopt", "brax.generalized.pipeline", "brax.envs.ant"}
+SELDOM = {"scipy.spatial", "scipy.optimize", "scipy.stats", "trimesh", "warp", "jaxopt"}
+SELDOM |= {"brax.generalized.pipeline", "brax.envs.ant"}
 
 
 def _watched(*argv: str, jax: str = "") -> tuple[set[str], list[str]]:
@@ -40,7 +49,7 @@ def _watched(*argv: str, jax: str = "") -> tuple[set[str], list[str]]:
 
 
 @pytest.fixture
-def compiled():
+def programs():
     """The names of the programs that are compiled from here on."""
     names: list[str] = []
 
@@ -66,6 +75,68 @@ def test_commands_that_compute_nothing_import_little(command, absent):
     assert "mjx_nero.__main__" in modules and not modules & absent and not programs
 
 
+def test_what_a_training_imports_before_it_begins():
+    code = "import json, sys, mjx_nero.tools.train_run, mjx_nero.learn.ppo.learner; print(json.dumps(list(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT, check=True)
+    found = set(json.loads(done.stdout))
+    assert "mjx_nero.runs.training" in found and not found & SELDOM
+
+
+def test_the_evaluation_is_traced_beside_the_first_state(monkeypatch):
+    """A first state waits for the expert, whose program takes seconds to trace and minutes to compile."""
+    run = cfg.resolve("nero_reach", "default", None, {"episode_length_s": 0.2}, {"num_envs": 8}, impl="native")
+    run = dataclasses.replace(run, eval_episodes=2)
+    learner, traced = compiled.make_learner(run), threading.Event()
+    compiler = compiled.Evaluator.compiler
+
+    def noted(self, shapes):
+        traced.set()
+        return compiler(self, shapes)
+
+    def start():
+        assert traced.wait(120)
+        return compiled.starter(learner)(0)
+
+    monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
+    made = compiled.compile(run, learner, 1, start)
+    assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
+
+
+def test_two_threads_make_a_physics_once(monkeypatch):
+    made, both = [], threading.Barrier(2)
+
+    def make(*given):
+        time.sleep(0.1)
+        made.append(physics.make_physics(*given))
+        return made[-1]
+
+    monkeypatch.setattr(env, "make_physics", make)
+    own = env.ManipulationEnv(registry.env_cfg("nero_reach"), "native")
+
+    def ask():
+        both.wait()
+        return own.physics
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        first, second = (call.result() for call in [pool.submit(ask), pool.submit(ask)])
+    assert first is second and len(made) == 1
+
+
+def test_a_log_is_written_without_pytorch(tmp_path):
+    """Its import takes seconds, and TensorBoard's writer would do it for tensors alone."""
+    (tmp_path / "torch.py").write_text("raise SystemExit('imported')")
+    code = """
+import pathlib, sys
+from mjx_nero.runs.logs import Logs
+logs = Logs(pathlib.Path("."), print)
+logs.write({"steps": 1, "loss": 2.0})
+assert "tensorboardX" in sys.modules and not logs.lost
+"""
+    path = os.pathsep.join((str(tmp_path), str(ROOT)))
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    assert (tmp_path / "tensorboard").is_dir()
+
+
 def test_brax_is_whole_for_others():
     code = """
 import mjx_nero.envs.env
@@ -81,20 +152,20 @@ assert mesh.spatial.ConvexHull is scipy.spatial.ConvexHull and mesh.trimesh.Trim
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, cwd=ROOT, env={**os.environ, "JAX_PLATFORMS": "cpu"})
 
 
-def test_reading_a_file_compiles_nothing(compiled, tmp_path):
+def test_reading_a_file_compiles_nothing(programs, tmp_path):
     tree = {str(n): np.full((n, 3), n, np.float32) for n in range(31, 37)}  # shapes that no other test has
     checkpoint.save(tmp_path / "a.safetensors", tree, {})
     found = checkpoint.load(tmp_path / "a.safetensors", tree)
-    assert not compiled
+    assert not programs
     for name, value in tree.items():
         assert isinstance(found[name], jax.Array) and found[name].dtype == np.float32
         np.testing.assert_array_equal(found[name], value)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 + 5, 2**32 - 1])
-def test_keys_of_episodes_are_one_program(compiled, seed):
+def test_keys_of_episodes_are_one_program(programs, seed):
     keys, key = rollout._keys(np.uint32(seed), 37)
-    assert set(compiled) <= {"jit(_keys)"}
+    assert set(programs) <= {"jit(_keys)"}
     k_reset, own = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(seed), 0xE7A1))
     np.testing.assert_array_equal(keys, jax.random.split(k_reset, 37))
     np.testing.assert_array_equal(key, own)

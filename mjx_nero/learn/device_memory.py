@@ -52,6 +52,14 @@ def check(learner: Learner) -> None:
         UserError: the run does not fit.
     """
     Pool(_limit(learner.num_devices), *learner.footprint()).check(learner)
+
+
+def check_outside(learner: Learner) -> None:
+    """Checks what the physics and the renderer keep outside of JAX's memory. It imports them, which takes seconds.
+
+    Raises:
+        UserError: the run does not fit.
+    """
     physics = learner.env.unwrapped.footprint(learner.num_devices)
     if physics.outside:
         Pool(physics.free, 0.0, _SCRATCH * physics.outside).check(learner)

@@ -52,7 +52,10 @@ class Learner(Protocol):
     steps_per_iteration: int
 
     def init(self, key: "Key", bank: "Bank | None" = None) -> Any:
-        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts."""
+        """Makes a new ``State``. ``bank`` goes to the environments' ``reset``, if the task asks for expert starts.
+
+        It must not step the environments: their physics is prepared beside it.
+        """
 
     def place(self, state: Any) -> Any:
         """Spreads the state, or its shapes, over the devices, as ``run`` takes it."""
@@ -65,7 +68,7 @@ class Learner(Protocol):
         """
 
     def policy(self, state: Any) -> Params:
-        """Returns the policy's parameters, on one device."""
+        """Returns the policy's parameters on one device, or their shapes if it gets the state's."""
         return state.normalizer, state.params
 
     def with_policy(self, state: Any, params: Params) -> Any:

@@ -64,7 +64,7 @@ class Evaluator:
         return other
 
     def compiler(self, state: Any) -> Callable[[], None]:
-        """Returns a call that compiles the program: see ``rollout.Runner.compiler``."""
+        """Returns a call that compiles the program, given a state or its shapes: see ``rollout.Runner.compiler``."""
         return self._runner.compiler(self._policy(state))
 
     def __call__(self, state: Any) -> dict[str, Any]:
@@ -108,24 +108,30 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         UserError: the run does not fit into memory.
     """
     begun, env, spans = time.perf_counter(), learner.env.unwrapped, Spans()
-    prepare, start = spans.timed("physics", env.prepare), spans.timed("first state", start)
+    start = spans.timed("first state", start)
+
+    def prepare() -> None:
+        device_memory.check_outside(learner)
+        env.prepare(run.num_envs // learner.num_devices, run.num_devices)
+
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
-        waiting = [side_by_side.submit(prepare, run.num_envs // learner.num_devices, run.num_devices)]
+        physics = side_by_side.submit(spans.timed("physics", prepare))
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
-        starting = side_by_side.submit(_after, waiting[0] if env.cfg.scene.cameras else None, start)
+        starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         with spans.span("learner, traced"):
-            shapes = learner.place(jax.eval_shape(learner.init, jax.random.PRNGKey(0)))
-            program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(shapes, chunk)
+            shapes = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+            program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(learner.place(shapes), chunk)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile), env.physics.compiler_options)
-        state = starting.result()
+        if env.cfg.scene.cameras:
+            starting.result()
         with spans.span("evaluation, traced"):
             evaluate = Evaluator(run, learner)
-            compiler = evaluate.compiler(state)
-        waiting.append(side_by_side.submit(spans.timed("evaluation, compiled", compiler)))
-        advance = compiling.result()
+            compiler = evaluate.compiler(shapes)
+        evaluating = side_by_side.submit(spans.timed("evaluation, compiled", compiler))
+        physics.result()  # if memory is short, its error says how many environments fit
+        state, advance = starting.result(), compiling.result()
         device_memory.check_compiled(learner, advance)
-        for work in waiting:
-            work.result()
+        evaluating.result()
     return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun, spans.found)
 
 

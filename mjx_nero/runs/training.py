@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -111,7 +110,6 @@ def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pat
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
     with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl, jax.default_backend() == "cpu")):
-        importlib.import_module("tensorboardX")  # takes seconds if PyTorch is installed
         made = compiled.compile(run, learner, chunk, start)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""
     speaker()(f"{folder}: compiled in {made.seconds:.0f} s; {learner.env.unwrapped.impl}, {run.num_envs} environments{spread}")

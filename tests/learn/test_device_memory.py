@@ -12,6 +12,8 @@ from mjx_nero.envs import wrappers
 from mjx_nero.learn import device_memory
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import Learner
+from mjx_nero.runs import cfg, compiled
+from mjx_nero.sim.physics import Footprint
 
 
 def learner(num_envs=512, **fields):
@@ -61,6 +63,18 @@ def test_too_many_environments_are_told_how_many_fit(monkeypatch):
     monkeypatch.setattr(device_memory, "_limit", lambda _: fixed)
     with pytest.raises(UserError, match="too little even for 4"):
         device_memory.check(small)
+
+
+def test_what_lies_outside_of_jax_counts_too(monkeypatch):
+    small = learner()
+    env = small.env.unwrapped
+    monkeypatch.setattr(env, "footprint", lambda num_devices: Footprint(outside=8e6, free=1e9))
+    device_memory.check(small)
+    with pytest.raises(UserError, match=r"^512 environments need about 5.1 GB .* has 1.0 GB: pass --num-envs 100 or fewer$"):
+        device_memory.check_outside(small)
+    with pytest.raises(UserError, match="pass --num-envs 100 or fewer"):  # beside the programs, which are compiled meanwhile
+        run = cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 512}, impl="native")
+        compiled.compile(dataclasses.replace(run, eval_episodes=2), small, 1, lambda: small.init(KEY))
 
 
 def test_figures_of_the_message(monkeypatch):

@@ -182,9 +182,11 @@ class Learner(learner.Learner):
         return dataclasses.replace(state, **placed)
 
     def policy(self, state: TrainState) -> tuple:
-        """Returns normalizer and network parameters from the first device, for programs that run only there."""
+        """Returns normalizer and network parameters from the first device, for programs that run only there; or their shapes."""
         params = super().policy(state)
-        return jax.tree.map(lambda x: x.addressable_data(0), params) if self._axis else params
+        if not self._axis or isinstance(jax.tree.leaves(params)[0], jax.ShapeDtypeStruct):
+            return params
+        return jax.tree.map(lambda x: x.addressable_data(0), params)
 
     def with_policy(self, state: TrainState, params: tuple) -> TrainState:
         """Returns a new state that starts from a policy."""
