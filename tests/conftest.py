@@ -55,13 +55,14 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+import mujoco  # noqa: E402
 from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import __main__, control  # noqa: E402
 from mjx_nero.learn import learner  # noqa: E402
 from mjx_nero.learn.ppo import imitation  # noqa: E402
-from mjx_nero.sim import physics  # noqa: E402
+from mjx_nero.sim import physics, render  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tasks import registry  # noqa: E402
 from mjx_nero.tools import cli  # noqa: E402
@@ -162,3 +163,14 @@ def call(monkeypatch, capfd, tmp_path):
         return stop.value.code, *capfd.readouterr()
 
     return run
+
+
+@pytest.fixture
+def without_opengl(monkeypatch):
+    """A machine that cannot draw offscreen."""
+
+    def missing(*_, **__):
+        raise ImportError("no GL")
+
+    monkeypatch.setattr(render, "_lost", False)
+    monkeypatch.setattr(mujoco, "Renderer", missing)

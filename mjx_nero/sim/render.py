@@ -16,6 +16,23 @@ NO_GL = (
     "(Debian and Ubuntu: apt-get install libosmesa6)"
 )
 _APART = 1.5  # [m] least distance between tables that share a picture
+_lost = False  # a renderer was asked for in vain
+
+
+def renderer(model: mujoco.MjModel, height: int, width: int, max_geom: int = 10_000) -> mujoco.Renderer:
+    """Makes a renderer of MuJoCo's. After a failure it does not try again: GLFW's second failure would end the process.
+
+    Raises:
+        UserError: the machine cannot draw offscreen.
+    """
+    global _lost
+    if _lost:
+        raise UserError(NO_GL)
+    try:
+        return mujoco.Renderer(model, height, width, max_geom)
+    except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
+        _lost = True
+        raise UserError(NO_GL) from error
 
 
 class Renderer:
@@ -51,10 +68,7 @@ class Renderer:
         self._option, self._hand = mujoco.MjvOption(), mujoco.MjvPerturb()
         table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "table_top")
         self._apart = max(_APART, 2 * float(model.geom_size[table, :2].max())) if table >= 0 else _APART
-        try:
-            self._renderer = mujoco.Renderer(model, height, width, max_geom=max(10_000, envs * (model.ngeom + 10)))
-        except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
-            raise UserError(NO_GL) from error
+        self._renderer = renderer(model, height, width, max_geom=max(10_000, envs * (model.ngeom + 10)))
 
     def __enter__(self) -> "Renderer":
         return self

@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
+import os
 import pathlib
 import re
+import subprocess
 import sys
 
 import jax
@@ -238,14 +240,27 @@ def test_terms_ask_for_what_is_there(term, camera, message):
         _ = mjx_nero.ManipulationEnv(cfg, impl="native").observation_size
 
 
-def test_a_machine_without_opengl_says_so(monkeypatch):
-    def fails(*args, **kwargs):
-        raise RuntimeError("no display")
-
-    monkeypatch.setattr(mujoco, "Renderer", fails)
+def test_a_machine_without_opengl_says_so(without_opengl):
     cfg = with_cameras({"front": CameraCfg()})
     with pytest.raises(UserError, match=r"no offscreen OpenGL here"):
         cameras.Cameras(scene.build(cfg.robot, cfg.scene, cfg.sim), cfg.scene.cameras, "mujoco")
+
+
+def test_a_process_may_ask_again_for_pictures_that_it_cannot_draw():
+    """GLFW's second failure ends a process, and a program that films many environments asks once for each."""
+    code = """
+import mujoco
+from mjx_nero import UserError
+from mjx_nero.sim.render import Renderer
+for _ in range(3):
+    try:
+        Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    except UserError as error:
+        print(error)
+"""
+    env = {name: value for name, value in os.environ.items() if name != "DISPLAY"} | {"MUJOCO_GL": "glfw"}
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], stdout=subprocess.PIPE, text=True, env=env)
+    assert done.returncode == 0 and done.stdout.count("no offscreen OpenGL here") == 3
 
 
 def test_the_guide_says_what_is_so():

@@ -263,11 +263,7 @@ def test_summary_of_seeds():
     assert learning.summary(rows) == {"seed": "all", "seeds": 4, "reached": 4, **expected}
 
 
-def test_render_without_opengl(env, monkeypatch):
-    def broken(*_):
-        raise ImportError("no GL")
-
-    monkeypatch.setattr(mujoco, "Renderer", broken)
+def test_render_without_opengl(env, without_opengl):
     row = drawing.measure_render(env, 2, 2)
     assert row["note"].startswith("no offscreen OpenGL here") and "frames_per_s" not in row
 

@@ -209,11 +209,7 @@ def test_a_video_of_failures_shows_them_alone(call, tmp_path, monkeypatch):
     assert code == 0 and out.rstrip().endswith("no video: no episode failed") and len(drawn) == 1
 
 
-def test_without_opengl_all_but_the_video(call, tmp_path, monkeypatch):
-    def broken(*_):
-        raise ImportError("no GL")
-
-    monkeypatch.setattr(mujoco, "Renderer", broken)
+def test_without_opengl_all_but_the_video(call, tmp_path, without_opengl):
     code, out, err = call(
         "eval", "--agent", "zero", "--episodes", 1, "--backend", "mujoco", "--video", "lift.mp4", "--json", "r.json"
     )

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool
 
+from mjx_nero.sim import render
 from mjx_nero.sim.cameras import Drawer
 from mjx_nero.sim.cameras.cfg import MARK, CameraCfg
-from mjx_nero.sim.render import NO_GL
-from mjx_nero.types import Picture, UserError
+from mjx_nero.types import Picture
 
 _TYPES = {"rgb": np.uint8, "depth": np.float32, "segmentation": np.int32}
 _FAR = 0.999  # share of the farthest distance beyond which a pixel counts as empty
@@ -65,11 +65,8 @@ class OpenGL(Drawer):
 
     def _open(self) -> None:
         self._data = mujoco.MjData(self._model)
-        try:
-            for shape in {c.shape for c in self._cfg.values()}:
-                self._renderers[shape] = mujoco.Renderer(self._model, *shape)
-        except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
-            raise UserError(NO_GL) from error
+        for shape in {c.shape for c in self._cfg.values()}:
+            self._renderers[shape] = render.renderer(self._model, *shape)
 
     def _draw_all(self, packed: Array) -> list[np.ndarray]:
         """(which cameras are due, qpos, fields) of all worlds -> the images.

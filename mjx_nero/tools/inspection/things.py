@@ -10,7 +10,6 @@ from mjx_nero.sim import render, solids
 from mjx_nero.sim.meshes import body as bodies
 from mjx_nero.sim.scene import ObjectCfg
 from mjx_nero.sim.solids import rests
-from mjx_nero.types import UserError
 
 _COLOURS = ((0.86, 0.37, 0.34), (0.36, 0.6, 0.85), (0.45, 0.7, 0.42), (0.93, 0.72, 0.3), (0.62, 0.45, 0.75), (0.4, 0.72, 0.72))
 
@@ -126,12 +125,9 @@ def picture(thing: Thing, width: int = 1280, height: int = 480) -> np.ndarray:
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    try:
-        with mujoco.Renderer(model, height, width) as renderer:
-            renderer.update_scene(data, camera)
-            return renderer.render()
-    except Exception as error:  # each GL binding fails in its own way
-        raise UserError(render.NO_GL) from error
+    with render.renderer(model, height, width) as renderer:
+        renderer.update_scene(data, camera)
+        return renderer.render()
 
 
 def _floats(values) -> tuple[float, ...]:

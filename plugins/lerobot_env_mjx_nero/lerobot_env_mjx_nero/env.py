@@ -125,7 +125,6 @@ class Env(gymnasium.Env):
         self._renderer: Renderer | None = None
         self._state: Any = None
         self._observed: dict[str, Any] = {}
-        self._without_opengl = False  # known once a renderer was asked for in vain
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict]:
         """Starts an episode; a seed determines all of it."""
@@ -153,14 +152,11 @@ class Env(gymnasium.Env):
 
         ``lerobot-eval`` films every evaluation, and a server that draws with the ray tracer need not have OpenGL.
         """
-        if not (self._renderer or self._without_opengl):
-            try:
-                self._renderer = Renderer(self._programs.env.mj_model)
-            except UserError:
-                if not self._programs.cameras:
-                    raise
-                self._without_opengl = True
-        if self._without_opengl:
+        try:
+            self._renderer = self._renderer or Renderer(self._programs.env.mj_model)
+        except UserError:
+            if not self._programs.cameras:
+                raise
             return next(iter(self._observed["pixels"].values()))
         scenery = jax.device_get(self._programs.scenery(self._state))
         return self._renderer.render(np.asarray(self._state.pipeline_state.qpos), scenery)
