@@ -29,10 +29,23 @@ def renderer(model: mujoco.MjModel, height: int, width: int, max_geom: int = 10_
     if _lost:
         raise UserError(NO_GL)
     try:
-        return mujoco.Renderer(model, height, width, max_geom)
+        return _quiet()(model, height, width, max_geom)
     except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
         _lost = True
         raise UserError(NO_GL) from error
+
+
+def _quiet() -> type[mujoco.Renderer]:
+    """Makes a class of MuJoCo's renderer that prints nothing where Python frees one of another thread, or frees it at its end."""
+
+    class Quiet(mujoco.Renderer):
+        def __del__(self) -> None:
+            try:
+                self.close()
+            except Exception:  # its context belongs to a thread that has ended, or OpenGL's module has been cleared
+                return
+
+    return Quiet
 
 
 class Renderer:

@@ -263,6 +263,26 @@ for _ in range(3):
     assert done.returncode == 0 and done.stdout.count("no offscreen OpenGL here") == 3
 
 
+@pytest.mark.parametrize("gl", ["egl", "osmesa"])
+def test_a_program_that_closes_no_renderer_ends_in_silence(gl):
+    code = """
+import threading, mujoco
+from mjx_nero.sim.render import Renderer
+made = []
+def make():
+    made.append(Renderer(mujoco.MjModel.from_xml_string("<mujoco/>")))
+thread = threading.Thread(target=make)
+thread.start()
+thread.join()
+make()
+"""
+    env = {**os.environ, "MUJOCO_GL": gl, "PYOPENGL_PLATFORM": gl}
+    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=env)
+    if "no offscreen OpenGL" in done.stderr:
+        pytest.skip("no offscreen OpenGL")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_the_guide_says_what_is_so():
     page = (pathlib.Path(__file__).resolve().parents[2] / "docs" / "guides" / "cameras.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
