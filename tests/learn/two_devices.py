@@ -148,11 +148,11 @@ def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
     def stored():
         return json.loads((tmp_path / "run" / "config.json").read_text())
 
-    def train(iterations, **rest):
+    def train(iterations, out="run", **rest):
         run = training.resolve(
             "nero_lift", "default", None, {}, {**sizes, "num_timesteps": iterations * 16 * 4}, impl="native", **rest
         )
-        return training.train(dataclasses.replace(run, out=tmp_path / "run", eval_episodes=2))
+        return training.train(dataclasses.replace(run, out=tmp_path / out, eval_episodes=2))
 
     summary = train(2, num_devices=2)
     assert (summary["num_devices"], summary["env_steps"], summary["stopped"]) == (2, 128, "finished")
@@ -162,6 +162,8 @@ def test_a_run_on_two_devices_goes_on_with_one(tmp_path, monkeypatch):
     summary = training.train(resume.same_run(tmp_path / "run", asked, {"num_devices", "num_timesteps"}, {}))
     assert (summary["num_devices"], summary["env_steps"]) == (1, 256)
     assert (stored()["num_devices"], stored()["hyperparameters"]["minibatch_size"]) == (1, 12_288)
+    policy = tmp_path / "run" / "policy.safetensors"
+    assert train(1, "again", num_devices=2, restore=policy)["num_devices"] == 2  # a policy is told what shapes it must have
 
 
 def test_two_devices_make_as_many_updates_as_one_with_half_the_environments(env):
