@@ -2,6 +2,7 @@
 
 import copy
 import math
+import warnings
 
 import jax.numpy as jnp
 import mujoco
@@ -29,7 +30,8 @@ def renderer(model: mujoco.MjModel, height: int, width: int, max_geom: int = 10_
     if _lost:
         raise UserError(NO_GL)
     try:
-        return _quiet()(model, height, width, max_geom)
+        with warnings.catch_warnings(action="ignore"):  # GLFW's, which the error replaces
+            return _quiet()(model, height, width, max_geom)
     except Exception as error:  # each GL binding fails in its own way: ImportError, RuntimeError, GLError, ...
         _lost = True
         raise UserError(NO_GL) from error
