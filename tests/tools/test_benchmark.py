@@ -307,4 +307,5 @@ def test_the_stages_of_a_start(call, tmp_path):
             == found["first iterations"]["begins_s"]
             > found["imports"]["seconds"]
         )
-    assert stages["filled"]["learner, compiled"]["seconds"] < 0.5 * stages["empty"]["learner, compiled"]["seconds"]
+    compiled = {caches: found["until the first training step"]["compiled"] for caches, found in stages.items()}
+    assert compiled["empty"] > 3 and compiled["filled"] == 0

@@ -43,7 +43,7 @@ _TABLES: dict[tuple[str, ...], tuple[str, ...]] = {  # what -> columns of the ta
     ("reset",): ("what", "impl", "num_envs", "resets_per_s", *_MEMORY),
     ("render",): ("what", "gl", "width", "height", "frames_per_s"),
     ("learning",): (*("impl", "num_envs", "seed", "reached", "seconds", "evaluation_s", "env_steps", "success_rate", *_COUNTS),),
-    ("start",): ("impl", "num_envs", "caches", "stage", "begins_s", "seconds"),
+    ("start",): ("impl", "num_envs", "caches", "stage", "begins_s", "seconds", "compiled"),
     ("ik",): (*("solver", "batch", "ms_per_batch", "solves_per_s", "success", "error_mm", "error_mrad", "compile_s"),),
 }
 

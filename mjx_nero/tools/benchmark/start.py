@@ -18,6 +18,7 @@ from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
 
+_MISSED = "/compilation_cache/cache_misses"  # JAX's event for a program that it compiles
 _CHILD = "from mjx_nero.tools.benchmark import command; command.begin()"
 
 
@@ -36,7 +37,8 @@ def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
     """
     with tempfile.TemporaryDirectory() as folder:
         for caches in ("empty", "filled"):
-            for stage in _started(argv, pathlib.Path(folder)):
+            stages, compiled = _started(argv, pathlib.Path(folder))
+            for stage in stages:
                 seconds = {"begins_s": round(stage.begun, 1), "seconds": round(stage.seconds, 1)}
                 yield {
                     "what": "start",
@@ -45,10 +47,12 @@ def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
                     "caches": caches,
                     "stage": stage.name,
                     **seconds,
+                    **({"compiled": compiled} if stage is stages[-1] else {}),
                 }
 
 
-def _started(argv: Sequence[str], caches: pathlib.Path) -> list[Span]:
+def _started(argv: Sequence[str], caches: pathlib.Path) -> tuple[list[Span], int]:
+    """Returns the stages of a start, and the number of programs that were not in JAX's cache."""
     env = {key: value for key, value in os.environ.items() if key not in ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH")}
     begun = time.time()
     done = subprocess.run(
@@ -59,8 +63,10 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> list[Span]:
     )
     if done.returncode:
         raise UserError("the start to be measured failed: see its error above")
-    stages = [Span(*row) for row in json.loads(done.stdout.splitlines()[-1])]
-    return [*stages, Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iterations"))]
+    rows, compiled = json.loads(done.stdout.splitlines()[-1])
+    stages = [Span(*row) for row in rows]
+    whole = Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iterations"))
+    return [*stages, whole], compiled
 
 
 def begin(spawned: float, imported: float, run: RunCfg) -> None:
@@ -71,7 +77,8 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         run: from ``run_cfg.fit_machine``.
     """
     so_far = time.time() - spawned
-    spans = Spans()
+    spans, missed = Spans(), list[str]()
+    jax.monitoring.register_event_listener(lambda event, **_: missed.append(event) if event.endswith(_MISSED) else None)
     with spans.span("environments"):
         learner = compiled.make_learner(run)
         device_memory.check(learner)
@@ -85,4 +92,4 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
     stages = [Span("imports", 0.0, imported - spawned), Span("config", imported - spawned, spawned + so_far - imported)]
     stages += [Span(name, begun + so_far, seconds) for name, begun, seconds in spans.found]
     stages += [Span(name, begun + before, seconds) for name, begun, seconds in made.spans]
-    print(json.dumps(sorted(stages, key=lambda stage: stage.begun)))
+    print(json.dumps([sorted(stages, key=lambda stage: stage.begun), len(missed)]))
