@@ -38,7 +38,7 @@ def renderer(model: mujoco.MjModel, height: int, width: int, max_geom: int = 10_
 
 
 def _quiet() -> type[mujoco.Renderer]:
-    """Makes a class of MuJoCo's renderer that prints nothing where Python frees one of another thread, or frees it at its end."""
+    """Makes a class of MuJoCo's renderer that prints nothing where Python frees it in another thread, or as Python ends."""
 
     class Quiet(mujoco.Renderer):
         def __del__(self) -> None:

@@ -6,10 +6,12 @@ import os
 import pathlib
 import subprocess
 
+import mujoco
 import numpy as np
 import pytest
 from lerobots import lerobot_python
 
+from mjx_nero.sim import render
 from mjx_nero.types import UserError
 
 HERE = pathlib.Path(__file__).parent
@@ -46,19 +48,24 @@ def test_an_evaluation_is_filmed_without_opengl(monkeypatch):
     plugin = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(plugin)
 
+    asked = []
+
     def absent(*_):
-        raise UserError("no offscreen OpenGL here")
+        asked.append(1)
+        raise ImportError("no GL")
 
     env = plugin.Env("nero_reach", cameras="front+side", size=(24, 16))
     seen, _ = env.reset(seed=1)
     (picture,) = seen["pixels"].values()
     assert env.render().shape == (480, 640, 3)
     env.close()
-    monkeypatch.setattr(plugin, "Renderer", absent)
+    monkeypatch.setattr(render, "_lost", False)
+    monkeypatch.setattr(mujoco, "Renderer", absent)
     np.testing.assert_array_equal(env.render(), picture)
     assert picture.shape == (16, 48, 3) and picture.std() > 5
     seen, *_ = env.step(env.action_space.sample())
     np.testing.assert_array_equal(env.render(), next(iter(seen["pixels"].values())))
+    assert len(asked) == 1  # not for each frame
     blind = plugin.Env("nero_reach")
     blind.reset(seed=1)
     with pytest.raises(UserError, match="no offscreen OpenGL"):

@@ -37,7 +37,7 @@ def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
     """
     with tempfile.TemporaryDirectory() as folder:
         for caches in ("empty", "filled"):
-            stages, compiled = _started(argv, pathlib.Path(folder))
+            stages, misses = _started(argv, pathlib.Path(folder))
             for stage in stages:
                 seconds = {"begins_s": round(stage.begun, 1), "seconds": round(stage.seconds, 1)}
                 yield {
@@ -47,7 +47,7 @@ def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
                     "caches": caches,
                     "stage": stage.name,
                     **seconds,
-                    **({"compiled": compiled} if stage is stages[-1] else {}),
+                    **({"compiled": misses} if stage is stages[-1] else {}),
                 }
 
 
@@ -63,10 +63,10 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> tuple[list[Span], int
     )
     if done.returncode:
         raise UserError("the start to be measured failed: see its error above")
-    rows, compiled = json.loads(done.stdout.splitlines()[-1])
+    rows, misses = json.loads(done.stdout.splitlines()[-1])
     stages = [Span(*row) for row in rows]
     whole = Span("until the first training step", 0.0, max(s.begun for s in stages if s.name == "first iterations"))
-    return [*stages, whole], compiled
+    return [*stages, whole], misses
 
 
 def begin(spawned: float, imported: float, run: RunCfg) -> None:
@@ -77,8 +77,8 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         run: from ``run_cfg.fit_machine``.
     """
     so_far = time.time() - spawned
-    spans, missed = Spans(), list[str]()
-    jax.monitoring.register_event_listener(lambda event, **_: missed.append(event) if event.endswith(_MISSED) else None)
+    spans, misses = Spans(), list[str]()
+    jax.monitoring.register_event_listener(lambda event, **_: misses.append(event) if event.endswith(_MISSED) else None)
     with spans.span("environments"):
         learner = compiled.make_learner(run)
         device_memory.check(learner)
@@ -92,4 +92,4 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
     stages = [Span("imports", 0.0, imported - spawned), Span("config", imported - spawned, spawned + so_far - imported)]
     stages += [Span(name, begun + so_far, seconds) for name, begun, seconds in spans.found]
     stages += [Span(name, begun + before, seconds) for name, begun, seconds in made.spans]
-    print(json.dumps([sorted(stages, key=lambda stage: stage.begun), len(missed)]))
+    print(json.dumps([sorted(stages, key=lambda stage: stage.begun), len(misses)]))
