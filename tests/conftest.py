@@ -55,7 +55,6 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 _hook = jaxtyping.install_import_hook([f"mjx_nero.{name}" for name in _CHECKED], "beartype.beartype")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
-import mujoco  # noqa: E402
 from batches import Batch  # noqa: E402
 
 import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
@@ -173,4 +172,4 @@ def without_opengl(monkeypatch):
         raise ImportError("no GL")
 
     monkeypatch.setattr(render, "_lost", False)
-    monkeypatch.setattr(mujoco, "Renderer", missing)
+    monkeypatch.setattr("mujoco.Renderer", missing)
