@@ -168,8 +168,9 @@ def call(monkeypatch, capfd, tmp_path):
 def without_opengl(monkeypatch):
     """A machine that cannot draw offscreen."""
 
-    def missing(*_, **__):
-        raise ImportError("no GL")
+    class Missing:
+        def __init__(self, *_):
+            raise ImportError("no GL")
 
     monkeypatch.setattr(render, "_lost", False)
-    monkeypatch.setattr("mujoco.Renderer", missing)
+    monkeypatch.setattr("mujoco.Renderer", Missing)
