@@ -44,6 +44,14 @@ def first() -> bool:
     return jax.process_index() == 0
 
 
+def processor() -> jax.Device | None:
+    """Returns JAX's CPU device of this process; None if JAX may not use the CPU."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
+
+
 def devices(each: int) -> list[Any]:
     """Returns the first ``each`` devices of every process."""
     count: dict[int, int] = {}

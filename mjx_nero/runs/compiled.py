@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import copy
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -85,10 +86,24 @@ def fresh(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], 
     """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank."""
     init = jax.jit(learner.init)
 
+    @functools.cache
+    def expected() -> tuple[Any, Any]:  # compiled while an expert plays
+        given = bank.shapes() if isinstance(bank, starts.Maker) else {}
+        return _shapes(given), init.lower(jax.random.PRNGKey(0), **given).compile()
+
     def start(seed: int) -> Any:
-        return init(jax.random.PRNGKey(seed), **bank(seed))  # not every learner takes what it makes
+        with _threads() as beside:
+            compiling = beside.submit(expected)
+            given = bank(seed)
+            shapes, program = compiling.result()
+        make = program if _shapes(given) == shapes else init
+        return make(jax.random.PRNGKey(seed), **given)  # not every learner takes what an expert gives
 
     return start
+
+
+def _shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
 
 
 def starter(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:

@@ -3,9 +3,9 @@ training episodes, and the expert's actions, to imitate.
 
 The task's first controller plays one episode in each of several environments, side by side in one program, through the
 task's own actions (``Chain.invert``). The program compiles and runs on the CPU while the device's programs compile, so every
-machine gets the same states. States are taken along the whole of successful episodes. If the expert rarely succeeds, or
-obstacles are in the way, they end shortly after the grasp. A state is at rest: joints, objects, and the pressure of the fingers.
-Some noise in the actions makes the expert show how to recover (DART, Laskey et al. 2017).
+machine gets the same states; ``kept`` saves them for the next run. States are taken along the whole of successful episodes. If
+the expert rarely succeeds, or obstacles are in the way, they end shortly after the grasp. A state is at rest: joints, objects,
+and the pressure of the fingers. Some noise in the actions makes the expert show how to recover (DART, Laskey et al. 2017).
 """
 
 import dataclasses
@@ -26,7 +26,9 @@ from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.envs.task import CurriculumCfg, EnvCfg, compensated
 from mjx_nero.errors import UserError
 from mjx_nero.learn.learner import DEMONSTRATIONS, ROWS, Learner
+from mjx_nero.learn.machines import processor
 from mjx_nero.mdp import fixtures
+from mjx_nero.runs import kept
 from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
@@ -35,10 +37,13 @@ NOISE = {True: 0.1, False: 0.02}
 _QUICK = {"ik.restarts": 0}  # restarts of inverse kinematics take most of the compiler's time
 # A controller of 64 arms is thousands of operations that are too small to share among threads.
 _ONE_THREAD: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
+# Programs of these controllers run for a moment, once, and XLA's first level compiles them in a third of the time. Programs of
+# the others run for longer at that level than it saves.
+_BRIEF, _COMPILED_FAST = ("pick_up", "pick_place", "grasp_thing"), {"xla_backend_optimization_level": 0}
 COMING, LIFTED = 1.5, 0.3  # [s] time that the hand comes down before the grasp, and time after it until well above the table
 _HOLD = "success.hold"
 
-Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` besides its key
+Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` besides its key: ``none`` or a ``Maker``
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,40 +73,49 @@ def none(seed: int) -> dict[str, Any]:
     return {}
 
 
-def maker(learner: Learner, say: Callable[[str], None], new: bool = True) -> Make:
-    """Returns a function that makes from a seed what an expert gives a learner.
-
-    If the task has no usable expert, it returns nothing and says why in a line.
+class Maker:
+    """Makes from a seed what an expert gives a learner. If the task has no usable expert, it makes nothing and says so.
 
     Args:
         new: the run begins with a new policy. A run from a policy file imitates no expert: that policy knows more.
     """
-    env, imitates = learner.env, new and getattr(learner, "imitates", False)
-    begins = isinstance(env, wrappers.ExpertStarts)
-    episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
-    player = functools.cache(lambda: _player(env.unwrapped, min(episodes, learner.num_envs)))
 
-    def make(seed: int) -> dict[str, Any]:
-        if not begins and not imitates:
+    def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True):
+        self._env, self._say = learner.env.unwrapped, say
+        self._begins = isinstance(learner.env, wrappers.ExpertStarts)
+        self._imitates = new and getattr(learner, "imitates", False)
+        episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
+        self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
+        self._player = _Player(self._env, min(episodes, learner.num_envs))
+
+    def __call__(self, seed: int) -> dict[str, Any]:
+        if not self._begins and not self._imitates:
             return {}
         try:
-            with jax.default_device(_processor()):
-                play = player()
-                begun = time.perf_counter()
-                found, shown = play(seed)
+            with jax.default_device(processor()):
+                found, shown, seconds = self._player(seed)
         except UserError as error:
-            say(f"no expert demonstrates: {error}")
+            self._say(f"no expert demonstrates: {error}")
             return {}
         did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} noisy tries"
-        uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if begins else []
-        uses += ["it is imitated" if found.enough else "it is not imitated"] if imitates else []
-        say(f"{did}: {', '.join(uses)} ({time.perf_counter() - begun:.1f} s)")
+        uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if self._begins else []
+        uses += ["it is imitated" if found.enough else "it is not imitated"] if self._imitates else []
+        self._say(f"{did}: {', '.join(uses)} ({seconds:.1f} s)")
         if not found.enough:
             return {}
-        bank = {"bank": rows(found, learner.num_envs, wrappers.PHASES, seed)} if begins else {}
-        return {**bank, **({"shown": steps(found, shown, ROWS * episodes, seed)} if imitates else {})}
+        states, count = self._sizes
+        return self._asked(lambda: rows(found, states, wrappers.PHASES, seed), lambda: steps(found, shown, count, seed))
 
-    return make
+    def shapes(self) -> dict[str, Any]:
+        """Returns the shapes of what it makes if the expert can do the task."""
+        if not self._player.able:
+            return {}
+        states, _, _, shown = self._player.shapes()
+        rows, steps = self._sizes
+        return self._asked(lambda: _first_axes(states, 2, (rows,)), lambda: _first_axes(shown, 2, (steps,)))
+
+    def _asked(self, bank: Callable[[], Any], shown: Callable[[], Any]) -> dict[str, Any]:
+        return {**({"bank": bank()} if self._begins else {}), **({"shown": shown()} if self._imitates else {})}
 
 
 def rows(way: Way, n: int, phases: int, seed: int) -> Bank:
@@ -129,41 +143,66 @@ def playground(cfg: EnvCfg) -> EnvCfg:
     return dataclasses.replace(compensated(cfg).uncorrupted(), **plain)
 
 
-def _player(own: ManipulationEnv, count: int) -> Callable[[int], tuple[Way, Shown]]:
-    """Compiles a program that plays ``count`` episodes of the expert from a seed.
+class _Player:
+    """Plays ``count`` episodes of the expert from a seed, or reads them if an earlier run has played them."""
 
-    Raises:
-        UserError: the task has no expert.
-    """
-    cfg, name = own.cfg, next(iter(own.cfg.controllers), None)
-    if name is None or _milestone(cfg) is None:
-        raise UserError("the task has no script that grasps")
-    env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
-    quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
-    expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
-    some = jax.random.split(jax.random.PRNGKey(0), count)
-    run = jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile(_ONE_THREAD)
+    def __init__(self, own: ManipulationEnv, count: int):
+        self._own, self._count = own, count
+        self._name = next(iter(own.cfg.controllers), "")
+        self.able = bool(self._name) and _milestone(own.cfg) is not None
+        # Here, where nothing traces: each look at a file gives Python's lock away, and a thread that traces keeps it for 5 ms.
+        self._kept = kept.Shelf(own.cfg, control.CONTROLLERS.get(self._name), count)
 
-    def play(seed: int) -> tuple[Way, Shown]:
-        found: Any = jax.device_get(run(jax.random.split(jax.random.PRNGKey(seed), count)))
+    def __call__(self, seed: int) -> tuple[Way, Shown, float]:
+        """Returns the episodes, their steps, and how long it took without compilation [s].
+
+        Raises:
+            UserError: the task has no expert.
+        """
+        begun, cfg = time.perf_counter(), self._own.cfg
+        if read := self._kept.read(seed, self.shapes):
+            (*arrays, shown), about = read
+            return Way(*arrays, **about), shown, time.perf_counter() - begun
+        run, env = self._compiled
+        begun = time.perf_counter()
+        found: Any = jax.device_get(run(jax.random.split(jax.random.PRNGKey(seed), self._count)))
         states, shown, grasped, won, hold = found
         coming, past = (round(time / env.dt) for time in (COMING, LIFTED))
-        return way(states, grasped, won, hold, coming, past, whole=cfg.obstacles is None), shown
+        chosen = way(states, grasped, won, hold, coming, past, whole=cfg.obstacles is None)
+        about = {"won": chosen.won, "held": chosen.held}
+        self._kept.write(seed, (chosen.states, chosen.begins, chosen.ends, shown), about)
+        return chosen, shown, time.perf_counter() - begun
 
-    return play
+    @functools.cached_property
+    def _compiled(self) -> tuple[Callable[[Array], Any], ManipulationEnv]:
+        """Compiles the program that plays the episodes."""
+        cfg, name, count = self._own.cfg, self._name, self._count
+        if not self.able:
+            raise UserError("the task has no script that grasps")
+        env = ManipulationEnv(playground(cfg), impl="native", num_envs=count)
+        quick = _QUICK if set(_QUICK) <= set(config.flatten(control.CONTROLLERS[name][1])) else {}
+        expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
+        some = jax.random.split(jax.random.PRNGKey(0), count)
+        options: Any = {**_ONE_THREAD, **(_COMPILED_FAST if name in _BRIEF else {})}
+        return jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile(options), env
+
+    def shapes(self) -> tuple[Any, ...]:
+        """Returns the shapes of the states, of where they begin and end, and of the steps."""
+        own, size = self._own, (self._own.episode_length, self._count)
+        state, action = own.state_shape, np.zeros(own.action_size, np.float32)
+        start, ends = jax.eval_shape(own.start, state), np.zeros(self._count, int)
+        states = Bank(_first_axes(start, 0, size), np.zeros(size, bool))  # type: ignore[arg-type]
+        return states, ends, ends, _first_axes(Shown(state.obs, action), 0, size)  # type: ignore[arg-type]
+
+
+def _first_axes(tree: Any, old: int, new: tuple[int, ...]) -> Any:
+    """Returns the shapes of a tree's arrays, with ``new`` in place of their first ``old`` axes."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*new, *x.shape[old:]), x.dtype), tree)
 
 
 def _milestone(cfg: EnvCfg) -> str | None:
     """Returns the name of the metric that says when the hard part is done; None if there is none."""
     return next((name for name, term in cfg.metrics.items() if term.milestone), None)
-
-
-def _processor() -> jax.Device | None:
-    """Returns JAX's CPU device; None if JAX may not use the CPU."""
-    try:
-        return jax.local_devices(backend="cpu")[0]
-    except RuntimeError:
-        return None
 
 
 def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
@@ -220,4 +259,4 @@ def way(states: Bank, grasped: np.ndarray, won: np.ndarray, hold: np.ndarray, co
     through = np.where(won, np.maximum(steps - hold, 1), 0)
     ends = lifted if not whole else through if won.mean() >= HALF else np.where(won, through, lifted)
     begins = np.where(ends > 0, np.clip(grasped.argmax(axis=0) - coming, 0, np.maximum(ends - 1, 0)), 0)
-    return Way(states, begins, ends, float(won.mean()), float(held.mean()))
+    return Way(states, begins.astype(int), ends.astype(int), float(won.mean()), float(held.mean()))

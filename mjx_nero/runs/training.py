@@ -67,7 +67,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             say(note)
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
-        bank = starts.maker(learner, say, new=source is None)
+        bank = starts.Maker(learner, say, new=source is None)
         made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank), folder)
         return carry_out(run, made, tally, meta, folder, command)
 

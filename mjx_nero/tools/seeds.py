@@ -62,7 +62,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
                 raise UserError(f"{home} already holds a run: pass other --seeds or another --out, or --restore {home} alone")
         if note:
             say(note)
-        start = compiled.starter(learner, starts.maker(learner, say))
+        start = compiled.starter(learner, starts.Maker(learner, say))
         made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):

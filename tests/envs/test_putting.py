@@ -122,7 +122,7 @@ def test_the_script_does_it(name, preset):
 
 @pytest.mark.slow
 def test_a_learner_may_begin_where_the_script_was_and_the_block_stays_at_the_goal(env):
-    found, _ = starts._player(env, 8)(0)
+    found, *_ = starts._Player(env, 8)(0)
     # Through the learner's actions, with noise, the script seldom gets the peg in, but it shows a quarter of the way and more.
     assert found.enough and found.states.arrived.all()
     bank = jax.tree.map(jnp.asarray, starts.rows(found, 8, wrappers.PHASES, 0))

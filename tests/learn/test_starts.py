@@ -120,7 +120,7 @@ def batch(env):
 
 
 def asked(env, num_envs=N):
-    """What ``starts.maker`` asks of a learner."""
+    """What ``starts.Maker`` asks of a learner."""
     return types.SimpleNamespace(env=env, num_envs=num_envs)
 
 
@@ -131,7 +131,7 @@ def told():
 
 @pytest.fixture(scope="module")
 def bank(batch, told):
-    found = starts.maker(asked(batch), told.append)(3)
+    found = starts.Maker(asked(batch), told.append)(3)
     assert set(found) == {"bank"}  # its learner imitates nobody
     return found["bank"]
 
@@ -243,14 +243,14 @@ def test_a_task_without_an_expert_says_so():
     told = []
     cfg = env_cfg("nero_push", **{"curriculum.expert_starts": 0.5})
     env = wrappers.for_training(ManipulationEnv(cfg, impl="native"))
-    assert starts.maker(asked(env), told.append)(0) == {}
+    assert starts.Maker(asked(env), told.append)(0) == {}
     assert told == ["no expert demonstrates: the task has no script that grasps"]
 
 
 def test_a_run_that_begins_with_a_policy_imitates_nobody():
     told, env = [], wrappers.for_training(ManipulationEnv(env_cfg("nero_lift"), impl="native"))
     learner = types.SimpleNamespace(**vars(asked(env)), imitates=True)
-    assert starts.maker(learner, told.append, new=False)(0) == {} and not told
+    assert starts.Maker(learner, told.append, new=False)(0) == {} and not told
 
 
 def test_all_that_differs_is_left_out_where_the_expert_plays():

@@ -47,7 +47,7 @@ def measure_learning(run: RunCfg, seeds: int, target: float, kept: Sequence[Row]
 def _measured(run: RunCfg, learner: Learner, chunk: int, seeds: Sequence[int], target: float) -> Iterator[Row]:
     """Compiles the run once and trains these seeds."""
     begun = time.perf_counter()
-    fresh = compiled.starter(learner, starts.maker(learner, training.speaker()))
+    fresh = compiled.starter(learner, starts.Maker(learner, training.speaker()))
     made = compiled.compile(run, learner, chunk, lambda: fresh(0))
     with signals.after_this(training.speaker()) as stop:
         state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call

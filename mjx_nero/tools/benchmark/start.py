@@ -83,7 +83,7 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         learner = compiled.make_learner(run)
         device_memory.check(learner)
     before = time.time() - spawned
-    bank = starts.maker(learner, training.speaker())
+    bank = starts.Maker(learner, training.speaker())
     made = training.prepare(run, learner, lambda: compiled.starter(learner, bank)(0), pathlib.Path("start"))
     with spans.span("first evaluation"):
         made.evaluate(made.state)
