@@ -14,6 +14,7 @@ from brax.training.agents.ppo import losses, networks
 from flax import linen
 
 from mjx_nero.errors import UserError
+from mjx_nero.learn import machines
 from mjx_nero.learn.learner import Act, Observation
 from mjx_nero.learn.ppo import encoders
 from mjx_nero.learn.ppo.cfg import NetworkCfg, described
@@ -58,20 +59,21 @@ def make_networks(sizes: Sizes, action_size: int, cfg: NetworkCfg) -> networks.P
     def normalize(obs, statistics):
         return obs if statistics is None else bounded(obs, statistics)
 
-    made = networks.make_ppo_networks(
-        {name: (_width(apart[name], size),) if name in apart else size for name, size in sizes.items()},
-        action_size,
-        preprocess_observations_fn=normalize,
-        policy_hidden_layer_sizes=tuple(cfg.actor),
-        value_hidden_layer_sizes=tuple(cfg.critic),
-        activation=getattr(linen, cfg.activation),
-        value_obs_key=critic,
-        distribution_type=cfg.distribution,
-        noise_std_type="log",
-        init_noise_std=cfg.init_std,
-        mean_kernel_init_fn=jax.nn.initializers.variance_scaling,  # LeCun's uniform, as in the other layers, times a factor
-        mean_kernel_init_kwargs={"scale": cfg.output_scale**2, "mode": "fan_in", "distribution": "uniform"},
-    )
+    with jax.default_device(machines.processor()):  # Brax makes examples; the first array on a GPU takes two seconds
+        made = networks.make_ppo_networks(
+            {name: (_width(apart[name], size),) if name in apart else size for name, size in sizes.items()},
+            action_size,
+            preprocess_observations_fn=normalize,
+            policy_hidden_layer_sizes=tuple(cfg.actor),
+            value_hidden_layer_sizes=tuple(cfg.critic),
+            activation=getattr(linen, cfg.activation),
+            value_obs_key=critic,
+            distribution_type=cfg.distribution,
+            noise_std_type="log",
+            init_noise_std=cfg.init_std,
+            mean_kernel_init_fn=jax.nn.initializers.variance_scaling,  # LeCun's uniform, as in the other layers, times a factor
+            mean_kernel_init_kwargs={"scale": cfg.output_scale**2, "mode": "fan_in", "distribution": "uniform"},
+        )
     through = functools.partial(_encoded, apart=apart, sizes=sizes, normalize=normalize)
     return made.replace(policy_network=through(made.policy_network, ACTOR), value_network=through(made.value_network, critic))
 
