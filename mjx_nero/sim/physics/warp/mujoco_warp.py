@@ -101,21 +101,16 @@ class WarpPhysics(Physics):
         free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes ask for their own
         return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
 
-    @functools.cached_property
+    @property
     def _bytes(self) -> int:
         """Size of MuJoCo Warp's data of one environment."""
-        import warp as wp
-        from mujoco.mjx.third_party import mujoco_warp
-
-        def size(value) -> int:
-            if isinstance(value, wp.array):
-                return value.capacity
-            return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
-
-        cfg, fields = self._cfg, 4 * sum(math.prod(shape) for shape in self._fields.values())
-        with kernels.WARP, wp.ScopedDevice("cpu"):
-            one = mujoco_warp.make_data(self.model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env)
-        return size(one) + fields
+        cfg, model = self._cfg, self.model
+        sizes = (getattr(model, name) for name in dir(model) if name.startswith("n"))
+        kinds = int(model.opt.cone), int(model.opt.jacobian)
+        key = cfg.contacts_per_env, cfg.constraints_per_env, *kinds, *(x for x in sizes if isinstance(x, int))
+        if key not in _BYTES:
+            _BYTES[key] = _data_bytes(self.model, cfg)
+        return _BYTES[key] + 4 * sum(math.prod(shape) for shape in self._fields.values())
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
         """See ``physics.Physics``."""
@@ -189,6 +184,24 @@ class WarpPhysics(Physics):
             after()
 
         return ours, out
+
+
+# By the sizes of a model and its buffers. An evaluation has those of its training, which holds ``kernels.WARP`` for seconds.
+_BYTES: dict[tuple[int, ...], int] = {}
+
+
+def _data_bytes(model: mujoco.MjModel, cfg: SimCfg) -> int:
+    """Returns the size of MuJoCo Warp's data of one environment."""
+    import warp as wp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    def size(value) -> int:
+        if isinstance(value, wp.array):
+            return value.capacity
+        return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
+
+    with kernels.WARP, wp.ScopedDevice("cpu"):
+        return size(mujoco_warp.make_data(model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env))
 
 
 def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:
