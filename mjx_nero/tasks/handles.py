@@ -140,13 +140,19 @@ class Task:
         )
 
     def cfg(
-        self, success: SuccessCfg, moving: Mapping[str, RewardTerm], command: Term | None = None, limit: bool = True
+        self,
+        success: SuccessCfg,
+        moving: Mapping[str, RewardTerm],
+        command: Term | None = None,
+        limit: bool = True,
+        steps: int = 60_000_000,
     ) -> EnvCfg:
         """Builds the task from its success and from the rewards ``moving``, which lead there.
 
         Args:
             command: draws the command; None: there is none.
             limit: draws the joint's upper limit anew in each episode.
+            steps: env steps of a training run.
         """
         command, joint = command or Term(commands.nothing), f"{self.file}/{self.handle.joint}"
         near = {"handle": self.held, "speed": round(SPEED / self.handle.lever, 4), "near": NEAR}
@@ -172,5 +178,5 @@ class Task:
             curriculum=CurriculumCfg(expert_starts=0.5),
             controllers=self.controllers(),
             training=CALM,
-            budget=Budget(steps=60_000_000, steps_on_cpu=5_000_000),
+            budget=Budget(steps=steps, steps_on_cpu=5_000_000),
         )

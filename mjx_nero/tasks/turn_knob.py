@@ -31,6 +31,7 @@ def default(robot: RobotCfg) -> EnvCfg:
         },
         command=Term(commands.either_side, params={"size": tuple(round(x, 5) for x in ANGLES)}),
         limit=False,
+        steps=150_000_000,
     )
 
 
