@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from mjx_nero.envs import env
 from mjx_nero.learn import checkpoint
 from mjx_nero.learn.play import rollout
-from mjx_nero.runs import cfg, compiled
+from mjx_nero.runs import cfg, compiled, starts
 from mjx_nero.sim import physics
 from mjx_nero.tasks import registry
 
@@ -100,6 +101,36 @@ def test_the_evaluation_is_traced_beside_the_first_state(monkeypatch):
     monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
     made = compiled.compile(run, learner, 1, start)
     assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
+
+
+class Slow(starts.Maker):
+    """An expert that takes until the first state's program is compiled."""
+
+    def __init__(self, programs, gives):
+        self.programs, self.gives = programs, gives
+
+    def shapes(self):
+        return {"bank": np.zeros(3, np.float32)}
+
+    def __call__(self, seed):
+        for _ in range(600):
+            if any("init" in name for name in self.programs):
+                return self.gives
+            time.sleep(0.05)
+        raise AssertionError("the program waits for the expert")
+
+
+@pytest.mark.parametrize("able", [True, False])
+def test_the_first_state_compiles_beside_the_expert(able, programs):
+    """If the expert cannot do the task after all, another program makes the state."""
+
+    def init(key, bank=None):
+        return key[1] + (0.5 if bank is None else bank.sum())
+
+    bank = {"bank": np.arange(3, dtype=np.float32)}
+    start = compiled.fresh(types.SimpleNamespace(init=init), Slow(programs, bank if able else {}))
+    assert float(start(7)) == (10.0 if able else 7.5) and float(start(8)) == (11.0 if able else 8.5)
+    assert sum("init" in name for name in programs) == (1 if able else 2)
 
 
 def test_two_threads_make_a_physics_once(monkeypatch):

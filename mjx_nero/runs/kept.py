@@ -35,7 +35,7 @@ class Outside(Exception):
 
 
 class Shelf:
-    """Where the results of a function are kept on this machine, by seed. Nothing is kept if the function cannot be described.
+    """The kept results of a function on this machine, by seed. Nothing is kept if the function cannot be described.
 
     Args:
         what: configs, numbers and texts that describe the function.

@@ -1,5 +1,6 @@
 """The physics of the scene, on MJX and in MuJoCo's C library."""
 
+import concurrent.futures
 import dataclasses
 import os
 import subprocess
@@ -358,6 +359,19 @@ def test_nothing_of_warp_is_loaded_while_jax_traces(env, monkeypatch):
     monkeypatch.setattr(warp.Module, "load", lambda module, *args: loads.append(module.name))
     text = jax.jit(made.step).lower(sim, sim.ctrl).as_text()
     assert "custom_call" in text and not loads
+
+
+def test_warp_memory_of_a_second_environment_waits_for_no_kernels(env):
+    """An evaluation's, while its training's kernels load, which takes seconds."""
+    pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
+    from mjx_nero.sim.physics.warp import kernels, mujoco_warp
+
+    first, second = (mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim) for _ in range(2))
+    need = first.footprint().outside
+    with kernels.WARP, concurrent.futures.ThreadPoolExecutor() as pool:
+        assert pool.submit(second.footprint).result(timeout=20).outside == need > 1000
+    more = dataclasses.replace(env.cfg.sim, contacts_per_env=2 * env.cfg.sim.contacts_per_env)
+    assert mujoco_warp.WarpPhysics(env.physics_model, more).footprint().outside > need
 
 
 def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
