@@ -45,7 +45,7 @@ class Shelf:
         folder = cache.folder()
         try:
             self._base = folder / "experts" / _fingerprint(what) if folder else None
-        except (Outside, OSError, TypeError):
+        except (Outside, ImportError, OSError, TypeError):  # an ImportError: a package without metadata
             self._base = None
 
     def read(self, seed: int, template: Callable[[], Any]) -> tuple[Any, dict[str, Any]] | None:

@@ -81,12 +81,12 @@ class Maker:
     """
 
     def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True):
-        self._env, self._say = learner.env.unwrapped, say
+        self._say = say
         self._begins = isinstance(learner.env, wrappers.ExpertStarts)
         self._imitates = new and getattr(learner, "imitates", False)
         episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
         self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
-        self._player = _Player(self._env, min(episodes, learner.num_envs))
+        self._player = _Player(learner.env.unwrapped, min(episodes, learner.num_envs))
 
     def __call__(self, seed: int) -> dict[str, Any]:
         if not self._begins and not self._imitates:
