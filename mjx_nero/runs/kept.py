@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import inspect
 import json
 import os
 import pathlib
@@ -19,13 +18,13 @@ from typing import Any
 
 import jax
 
-import mjx_nero
 from mjx_nero.errors import UserError
 from mjx_nero.files import cache
 from mjx_nero.learn import checkpoint
 from mjx_nero.sim.robot import ASSETS
 
 ROOM = 1_000_000_000  # bytes in all; most files have 10 MB, those of 256 long episodes 200 MB
+_HERE = pathlib.Path(__file__).parents[1]
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 _SETTINGS = ("XLA_", "JAX_ENABLE", "JAX_DEFAULT", "JAX_NUMPY")  # environment variables that may change a number
 
@@ -82,9 +81,6 @@ def _fingerprint(what: Sequence[Any]) -> str:
     places = [_HERE, ASSETS, *filter(None, map(_place, _strings(said)))]
     told = json.dumps([said, _machine(), *map(_state, dict.fromkeys(places))])
     return hashlib.sha256(told.encode()).hexdigest()[:32]
-
-
-_HERE = pathlib.Path(inspect.getfile(mjx_nero)).parent
 
 
 def _said(value: Any) -> Any:

@@ -84,12 +84,14 @@ class Maker:
         self._say = say
         self._begins = isinstance(learner.env, wrappers.ExpertStarts)
         self._imitates = new and getattr(learner, "imitates", False)
-        episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
-        self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
-        self._player = _Player(learner.env.unwrapped, min(episodes, learner.num_envs))
+        self._player: _Player | None = None
+        if self._begins or self._imitates:
+            episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
+            self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
+            self._player = _Player(learner.env.unwrapped, min(episodes, learner.num_envs))
 
     def __call__(self, seed: int) -> dict[str, Any]:
-        if not self._begins and not self._imitates:
+        if self._player is None:
             return {}
         try:
             with jax.default_device(processor()):
@@ -103,16 +105,16 @@ class Maker:
         self._say(f"{did}: {', '.join(uses)} ({seconds:.1f} s)")
         if not found.enough:
             return {}
-        states, count = self._sizes
-        return self._asked(lambda: rows(found, states, wrappers.PHASES, seed), lambda: steps(found, shown, count, seed))
+        n, k = self._sizes
+        return self._asked(lambda: rows(found, n, wrappers.PHASES, seed), lambda: steps(found, shown, k, seed))
 
     def shapes(self) -> dict[str, Any]:
         """Returns the shapes of what it makes if the expert can do the task."""
-        if not self._player.able:
+        if self._player is None or not self._player.able:
             return {}
         states, _, _, shown = self._player.shapes()
-        rows, steps = self._sizes
-        return self._asked(lambda: _first_axes(states, 2, (rows,)), lambda: _first_axes(shown, 2, (steps,)))
+        n, k = self._sizes
+        return self._asked(lambda: _first_axes(states, 2, (n,)), lambda: _first_axes(shown, 2, (k,)))
 
     def _asked(self, bank: Callable[[], Any], shown: Callable[[], Any]) -> dict[str, Any]:
         return {**({"bank": bank()} if self._begins else {}), **({"shown": shown()} if self._imitates else {})}

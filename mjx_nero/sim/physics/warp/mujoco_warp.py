@@ -101,7 +101,7 @@ class WarpPhysics(Physics):
         free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes ask for their own
         return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
 
-    @property
+    @functools.cached_property
     def _bytes(self) -> int:
         """Size of MuJoCo Warp's data of one environment."""
         cfg, model = self._cfg, self.model
