@@ -82,19 +82,19 @@ def make_learner(run: RunCfg) -> Learner:
     return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
 
 
-def fresh(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
+def fresh(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int], Any]:
     """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank."""
     init = jax.jit(learner.init)
 
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays
-        given = bank.shapes() if isinstance(bank, starts.Maker) else {}
+        given = bank.shapes() if bank else {}
         return _shapes(given), init.lower(jax.random.PRNGKey(0), **given).compile()
 
     def start(seed: int) -> Any:
         with _threads() as beside:
             compiling = beside.submit(expected)
-            given = bank(seed)
+            given = bank(seed) if bank else {}
             shapes, program = compiling.result()
         make = program if _shapes(given) == shapes else init
         return make(jax.random.PRNGKey(seed), **given)  # not every learner takes what an expert gives
@@ -106,7 +106,7 @@ def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
 
 
-def starter(learner: Learner, bank: starts.Make = starts.none) -> Callable[[int], Any]:
+def starter(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int], Any]:
     """Returns ``fresh``, with the state placed for ``learner.run``."""
     start = fresh(learner, bank)
     return lambda seed: learner.place(start(seed))

@@ -20,7 +20,7 @@ import jax
 
 from mjx_nero.errors import UserError
 from mjx_nero.files import cache
-from mjx_nero.learn import checkpoint
+from mjx_nero.learn import checkpoint, device_memory
 from mjx_nero.sim.robot import ASSETS
 
 ROOM = 1_000_000_000  # bytes in all; most files have 10 MB, those of 256 long episodes 200 MB
@@ -61,7 +61,7 @@ class Shelf:
 
     def write(self, seed: int, tree: Any, meta: dict[str, Any]) -> None:
         """Keeps a tree of arrays, unless the disk is full. Files that were not read for a long time make room for it."""
-        path, left = self._path(seed), ROOM - sum(x.nbytes for x in jax.tree.leaves(tree))
+        path, left = self._path(seed), ROOM - device_memory.size(tree)
         if path is None or left < 0:
             return
         with contextlib.suppress(UserError, OSError):

@@ -236,7 +236,7 @@ def _flag(value: Any) -> str:
     return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
-def state(source: Source | None, learner: Learner, seed: int, bank: starts.Make = starts.none) -> Any:
+def state(source: Source | None, learner: Learner, seed: int, bank: starts.Maker | None = None) -> Any:
     """Makes a new state, or loads a checkpoint's. A policy file gives only its networks.
 
     Args:

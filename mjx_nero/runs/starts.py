@@ -43,8 +43,6 @@ _BRIEF, _COMPILED_FAST = ("pick_up", "pick_place", "grasp_thing"), {"xla_backend
 COMING, LIFTED = 1.5, 0.3  # [s] time that the hand comes down before the grasp, and time after it until well above the table
 _HOLD = "success.hold"
 
-Make = Callable[[int], dict[str, Any]]  # seed -> arguments of ``Learner.init`` besides its key: ``none`` or a ``Maker``
-
 
 @dataclasses.dataclass(frozen=True)
 class Way:
@@ -68,13 +66,9 @@ class Way:
         return bool((self.ends > 0).mean() >= ENOUGH)
 
 
-def none(seed: int) -> dict[str, Any]:
-    """Makes nothing: all episodes start as usual, and no expert is imitated."""
-    return {}
-
-
 class Maker:
-    """Makes from a seed what an expert gives a learner. If the task has no usable expert, it makes nothing and says so.
+    """Makes from a seed what an expert gives a learner: arguments of ``Learner.init`` besides its key. If the task has no usable
+    expert, it makes nothing and says so.
 
     Args:
         new: the run begins with a new policy. A run from a policy file imitates no expert: that policy knows more.

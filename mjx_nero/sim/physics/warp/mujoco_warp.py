@@ -109,7 +109,7 @@ class WarpPhysics(Physics):
         kinds = int(model.opt.cone), int(model.opt.jacobian)
         key = cfg.contacts_per_env, cfg.constraints_per_env, *kinds, *(x for x in sizes if isinstance(x, int))
         if key not in _BYTES:
-            _BYTES[key] = _data_bytes(self.model, cfg)
+            _BYTES[key] = _data_bytes(model, cfg)
         return _BYTES[key] + 4 * sum(math.prod(shape) for shape in self._fields.values())
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
