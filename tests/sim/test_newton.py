@@ -41,13 +41,16 @@ KINDS = """
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("room", [None, 8])  # the Jacobian in shared memory, or too large for it
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_accelerations_are_mujocos(cone, jacobian):
+def test_accelerations_are_mujocos(cone, jacobian, room, monkeypatch):
     from mujoco.mjx.third_party import mujoco_warp
 
     from mjx_nero.sim.physics.warp import newton
 
+    if room:
+        monkeypatch.setattr(newton, "near", lambda njmax, dense: room)
     model = mujoco.MjModel.from_xml_string(KINDS.format(cone=cone, jacobian=jacobian))
     reference, n = mujoco.MjData(model), 8
     rng, states, expected = np.random.default_rng(0), [], []

@@ -79,7 +79,7 @@ def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[
     after = made | {"efc_Ma": data.efc.Ma, "efc_J_rownnz": data.efc.J_rownnz, "efc_J_rowadr": data.efc.J_rowadr}
     after |= _named(data, _INTEGRATE) | {name: int(getattr(data, name)) for name in ("njmax", "njmax_nnz", "naconmax")}
     constants |= {"SPARSE": int(model.is_sparse)}
-    return kernels.make("tree", constants, before, data.nworld), kernels.make("integrate", constants, after, data.nworld)
+    return kernels.make(["tree"], constants, before, data.nworld), kernels.make(["integrate"], constants, after, data.nworld)
 
 
 def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:

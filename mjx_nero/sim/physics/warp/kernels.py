@@ -16,25 +16,31 @@ WARP = threading.Lock()
 
 
 def make(
-    name: str, constants: Mapping[str, int | Iterable[int]], values: Mapping[str, Any], n: int, threads: int = 1
+    names: Iterable[str],
+    constants: Mapping[str, int | Iterable[int]],
+    values: Mapping[str, Any],
+    n: int,
+    threads: int = 1,
+    resident: int = 0,
 ) -> Callable[[], None]:
-    """Makes a function that runs a source of this folder, with ``threads`` threads for each of ``n`` environments.
+    """Makes a function that runs sources of this folder, with ``threads`` threads for each of ``n`` environments.
 
     Args:
-        name: name of the source, without ``.cu``: the body of a function of (tid, problem).
+        names: names of the sources, without ``.cu``: one after another the body of a function of (tid, problem).
         constants: integers and tables to compile it with.
         values: the fields of ``problem``: Warp arrays and integers.
+        resident: blocks of 32 threads that a multiprocessor should have registers for; 0: the compiler decides.
     """
     import warp as wp
 
     Problem, problem = packed("Problem", values)
 
-    source = resources.files(__package__).joinpath(f"{name}.cu").read_text()
+    source = "".join(resources.files(__package__).joinpath(f"{name}.cu").read_text() for name in names)
 
     @wp.func_native("".join(map(_constant, constants, constants.values())) + source)
     def work(tid: int, problem: Problem): ...  # type: ignore[valid-type]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(32, resident) if resident else None)
     def environments(problem: Problem):  # type: ignore[valid-type]
         work(wp.tid(), problem)
 
