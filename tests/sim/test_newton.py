@@ -90,6 +90,39 @@ def test_accelerations_are_mujocos(cone, jacobian, room, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_nothing_holds_what_falls(jacobian):
+    """Without any constraint accelerations are the smooth ones, whatever the last step's were."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from mjx_nero.sim.physics.warp import newton
+
+    xml = f"""
+    <mujoco>
+      <option cone="elliptic" jacobian="{jacobian}"/>
+      <worldbody>
+        <body><joint axis="0 1 0" armature="0.1"/><geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/></body>
+        <body pos="1 0 1"><freejoint/><geom type="box" size="0.05 0.05 0.05"/></body>
+      </worldbody>
+    </mujoco>"""
+    model, n = mujoco.MjModel.from_xml_string(xml), 4
+    reference = mujoco.MjData(model)
+    reference.qvel[:] = np.linspace(-1, 1, model.nv)
+    mujoco.mj_forward(model, reference)
+    assert reference.nefc == 0
+    warp_model = mujoco_warp.put_model(model)
+    data = mujoco_warp.make_data(model, n, naconmax=8 * n, njmax=16)
+    wp.copy(data.qvel, wp.array(np.tile(reference.qvel, (n, 1)).astype(np.float32), dtype=float))
+    mujoco_warp.fwd_position(warp_model, data, factorize=False)
+    mujoco_warp.fwd_velocity(warp_model, data)
+    mujoco_warp.fwd_actuation(warp_model, data)
+    mujoco_warp.fwd_acceleration(warp_model, data, factorize=True)
+    data.qacc_warmstart.fill_(7.0)
+    newton.make(warp_model, data)()
+    np.testing.assert_allclose(data.qacc.numpy(), np.tile(reference.qacc, (n, 1)), rtol=0, atol=1e-3)
+
+
+@pytest.mark.slow
 def test_a_control_step_is_mujocos_while_cubes_are_held():
     """From states of the shipped policy, cubes in the grip or on the table, in single precision."""
     from mjx_nero.sim.physics.warp.mujoco_warp import WarpPhysics

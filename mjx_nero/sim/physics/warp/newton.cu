@@ -33,7 +33,8 @@ UNROLLED
     // the step: Newton's method on the slope along p, kept between steps that are too short and too long
     multiply(p, Mp, Jp, nullptr);
     const float curvature = sum(product(p, Mp));
-    const Part own_part = part(lane < parts ? lane : 0);
+    Part own_part = {};
+    if (lane < parts) own_part = part(lane);
     float step = 1.0f, low = 0.0f, high = infinite;
     for (int k = 0; k < in.ls_iterations; ++k) {
         float d1 = 0.0f, d2 = 0.0f;

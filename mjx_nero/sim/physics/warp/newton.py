@@ -37,7 +37,7 @@ def floats(nv: int, njmax: int, dense: bool) -> int | None:
     if dense:
         size += (nv + near(njmax, dense)) * 4 * (quads | 1)
     else:
-        size += (nv * (nv + 1) // 2 + 3) // 4 * 4 + near(njmax, dense) * 5 // 4 + 3 * rows
+        size += (nv * (nv + 1) // 2 + 3) // 4 * 4 + near(njmax, dense) * 5 // 4 + rows + _DOFS // 4
     return size if nv <= _DOFS and 4 * size <= _SHARED_BYTES else None
 
 

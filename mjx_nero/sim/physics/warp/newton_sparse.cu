@@ -1,15 +1,22 @@
 // J and M of many degrees of freedom. J has nonzeros where a degree of freedom moves one of a contact's two bodies: in the same columns
-// in all of the contact's rows, the last column first. M couples the degrees of freedom of a tree, at most TREE. H is a triangle in
-// shared memory. A lane takes a degree of freedom, its row of H, and the contacts that it moves: lanes of other objects take others.
+// in all of the contact's rows, which follow one another. They are in shared memory if an environment has no more than ROWS of them.
+// M couples the degrees of freedom of a tree, at most TREE. H is a triangle in shared memory.
 
 constexpr int half = 0, width = lanes, turns = (NV + width - 1) / width;
 const int c = lane;  // lane c takes the degrees of freedom c, c + width, ...
 constexpr int triangle = (NV * (NV + 1) / 2 + 3) / 4 * 4, vector = (NV + 3) / 4 * 4;
-float *x = rest, *packed_H = x + vector, *own = packed_H + triangle;  // J, if an environment has no more than ROWS nonzeros
-unsigned long long* columns = (unsigned long long*)(own + ROWS);      // of a row by itself or a contact, one bit each
-unsigned short *begin = (unsigned short*)(columns + many), *filled = begin + many;  // of a row: where its nonzeros begin, and how many
-unsigned char* own_column = (unsigned char*)(filled + many);
+float *x = rest, *packed_H = x + vector, *own = packed_H + triangle;
+unsigned short *begin = (unsigned short*)(own + ROWS), *filled = begin + many;  // of a row: where its nonzeros begin, and how many
+unsigned char *own_column = (unsigned char*)(filled + many), *met = own_column + ROWS;  // ... and columns met while factorising
 auto H = [&](int i, int j) -> float& { return packed_H[i * (i + 1) / 2 + j]; };
+// The pair v <= u at a place of a triangle. Most triangles have fewer places than there are lanes.
+struct Pair { int u, v; };
+auto pair_at = [&](int at) {
+    const float square = 8.0f * at + 1.5f;
+    const int u = (int)(0.5f * (square * inverse_root(square) - 1.0f));
+    return Pair{u, at - u * (u + 1) / 2};
+};
+const Pair mine = pair_at(lane);
 const int* efc_column = in.efc_J_colind.data + (size_t)world * in.efc_J_colind.shape[1] * in.efc_J_colind.shape[2];
 int nonzeros = 0;
 #pragma unroll 2
@@ -45,31 +52,11 @@ UNROLLED
 const float scale = 1.0f / sum(diagonal);
 sync();
 
-for (int at = lane; at < parts; at += lanes) {
-    columns[at] = 0;
-    for (int k = begin[first[at]]; k < begin[first[at]] + filled[first[at]]; ++k) columns[at] |= 1ull << column(k);
-}
-sync();
-// Of 64 parts from ``at`` on, those that a degree of freedom moves, one bit each.
-auto moved = [&](int i, int at) {
-    unsigned long long found = 0;
-    for (int k = 0; k < 64 && at + k < parts; ++k) found |= (columns[at + k] >> i & 1) << k;
-    return found;
-};
-unsigned long long moves[turns];
-UNROLLED
-for (int t = 0; t < turns; ++t) moves[t] = t * width + c < NV ? moved(t * width + c, 0) : 0;
-// Calls ``use`` with the parts that a lane's degree of freedom moves: (row, number of rows, nonzeros in each, the place of the lane's).
-auto each_moved = [&](int t, auto use) {
-    const int i = t * width + c;
-    for (int at = 0; i < NV && at < parts; at += 64) {
-        for (unsigned long long left = at ? moved(i, at) : moves[t]; left; left &= left - 1) {
-            const int k = at + count((left & -left) - 1), row = first[k];
-            int place = begin[row];
-            if (cone[row]) place += count(columns[k] >> i >> 1);
-            else while (column(place) != i) ++place;  // two joints that are coupled are in any order
-            use(row, cone[row] ? cone[row] : 1, filled[row], place);
-        }
+// Friction of a joint's own is alone in its row and its column, so all such rows are added at once, and the others one by one.
+auto alone = [&](int row) { return row >= equalities && row < bilateral && filled[row] == 1; };
+auto each_alone = [&](auto add) {
+    for (int row = equalities + lane; row < bilateral && row < n; row += lanes) {
+        if (alone(row)) add(row, column(begin[row]));
     }
 };
 
@@ -97,86 +84,95 @@ UNROLLED
 };
 // y += J' f
 auto add_forces = [&](float* y) {
-    UNROLLED
-    for (int t = 0; t < turns; ++t) {
-        each_moved(t, [&](int row, int rows, int apart, int place) {
+    for (int i = lane; i < NV; i += lanes) x[i] = 0.0f;
+    sync();
+    each_alone([&](int row, int i) { x[i] = J[begin[row]] * f[row]; });
+    for (int at = 0; at < parts; ++at) {
+        const int row = first[at], rows = cone[row] ? cone[row] : 1;
+        if (f[row] == 0.0f || alone(row)) continue;
+        sync();
+        for (int e = lane; e < filled[row]; e += lanes) {
+            float total = 0.0f;
 #pragma unroll 1
-            for (int k = 0; k < rows; ++k) y[t] += J[place + k * apart] * f[row + k];
-        });
+            for (int k = 0; k < rows; ++k) total += J[begin[row] + k * filled[row] + e] * f[row + k];
+            x[column(begin[row] + e)] += total;
+        }
     }
+    sync();
+UNROLLED
+    for (int t = 0; t < turns; ++t) y[t] += t * width + c < NV ? x[t * width + c] : 0.0f;
+    sync();
+};
+// An entry of J' s''(r) J of a contact that slides: of two columns of J.
+auto sliding = [&](int row, const float* Ji, const float* Jj, int apart) {
+    const float mu_ = mu[row], ratio = along[row], normal_i = mu_ * Ji[0], normal_j = mu_ * Jj[0];
+    float slide_i = 0.0f, slide_j = 0.0f, tangents = 0.0f;
+#pragma unroll 1
+    for (int k = 1; k < cone[row]; ++k) {
+        const float i = Ji[k * apart], j = Jj[k * apart];
+        slide_i += along[row + k] * i, slide_j += along[row + k] * j;
+        tangents += mu[row + k] * mu[row + k] * i * j;
+    }
+    return -weight[row] * (normal_i * normal_j - mu_ * (normal_i * slide_j + normal_j * slide_i) + ratio * slide_i * slide_j +
+                           (mu_ * mu_ - ratio) * tangents);
 };
 // p = -H^-1 g with H = M + J' s''(r) J
 auto direction = [&](const float* g, float* p) {
     for (int at = lane; at < triangle; at += lanes) packed_H[at] = 0.0f;
     sync();
     float y[turns];
-    UNROLLED
+UNROLLED
     for (int t = 0; t < turns; ++t) {
         const int i = t * width + c;
-        UNROLLED
+UNROLLED
         for (int k = 0; k < TREE; ++k) {
             if (i < NV && low[t] + k <= i) H(i, low[t] + k) = m[t][k];
         }
         y[t] = i < NV ? -g[t] : 0.0f;
-        each_moved(t, [&](int row, int rows, int apart, int place) {
-            if (weight[row] == 0.0f) return;
-            float own_J[6], force[6];  // a column of J, and of s''(r) J
-            UNROLLED
-            for (int k = 0; k < 6; ++k) own_J[k] = k < rows ? J[place + k * apart] : 0.0f;
-            if (weight[row] > 0.0f) {
-                UNROLLED
-                for (int k = 0; k < 6; ++k) force[k] = k < rows ? weight[row + k] * own_J[k] : 0.0f;
+    }
+    sync();
+    each_alone([&](int row, int i) { H(i, i) += weight[row] * J[begin[row]] * J[begin[row]]; });
+    for (int at = 0; at < parts; ++at) {
+        const int row = first[at], rows = cone[row] ? cone[row] : 1, apart = filled[row];
+        if (weight[row] == 0.0f || alone(row)) continue;
+        sync();
+        Pair its = mine;
+        for (int e = lane; e < apart * (apart + 1) / 2; e += lanes, its = pair_at(e)) {
+            const float *Ju = J + begin[row] + its.u, *Jv = J + begin[row] + its.v;
+            float total = 0.0f;
+            if (weight[row] < 0.0f) {
+                total = sliding(row, Ju, Jv, apart);
             } else {
-                const float Dm = -weight[row], ratio = along[row], m_ = mu[row], normal = m_ * own_J[0];
-                float slide = 0.0f;
-                UNROLLED
-                for (int k = 1; k < 6; ++k) slide += k < rows ? along[row + k] * own_J[k] : 0.0f;
-                force[0] = Dm * m_ * (normal - m_ * slide);
-                const float push = ratio * slide - m_ * normal;
-                UNROLLED
-                for (int k = 1; k < 6; ++k) {
-                    force[k] = k < rows ? Dm * (along[row + k] * push + (m_ * m_ - ratio) * mu[row + k] * mu[row + k] * own_J[k]) : 0.0f;
-                }
+#pragma unroll 1
+                for (int k = 0; k < rows; ++k) total += weight[row + k] * Ju[k * apart] * Jv[k * apart];
             }
-            for (int at = begin[row]; at < begin[row] + apart; ++at) {
-                const int j = column(at);
-                if (j > i) continue;
-                float total = 0.0f;
-                UNROLLED
-                for (int k = 0; k < 6; ++k) total += k < rows ? force[k] * J[at + k * apart] : 0.0f;
-                H(i, j) += total;
-            }
-        });
+            const int i = column(begin[row] + its.u), j = column(begin[row] + its.v);
+            H(i > j ? i : j, i > j ? j : i) += total;
+        }
     }
     sync();
     // H = L' L, with the inverse of L's diagonal in its place: from the last row on, as objects come last and only what touches them
     // fills their columns. On the way y = -L'^-1 g; then p = L^-1 y.
-    UNROLLED
     for (int t = turns - 1; t >= 0; --t) {
         for (int owner = (t < turns - 1 ? lanes : NV - t * lanes) - 1; owner >= 0; --owner) {
             const int k = t * lanes + owner;
             const float inverse = inverse_root(H(k, k) > 1e-15f ? H(k, k) : 1e-15f), done = of(owner, y[t]) * inverse;
-            float entry[turns];
-            UNROLLED
+            unsigned long long nonzero = 0;
             for (int u = 0; u <= t; ++u) {
                 const int i = u * lanes + lane;
-                entry[u] = i < k ? H(k, i) * inverse : 0.0f;
-                y[u] -= entry[u] * done;
+                const float entry = i < k ? H(k, i) * inverse : 0.0f;
+                nonzero |= bits(entry != 0.0f) << (u * lanes);
+                if (entry == 0.0f) continue;
+                H(k, i) = entry, y[u] -= entry * done;
+                met[count(nonzero & ((1ull << i) - 1))] = i;
             }
             sync();
             if (lane == owner) H(k, k) = inverse, y[t] = done;
-            UNROLLED
-            for (int v = 0; v <= t; ++v) {
-                if (entry[v] != 0.0f) H(k, v * lanes + lane) = entry[v];
-                for (unsigned long long left = bits(entry[v] != 0.0f); left; left &= left - 1) {
-                    const int at = count((left & -left) - 1), j = v * lanes + at;
-                    const float other = of(at, entry[v]);
-                    UNROLLED
-                    for (int u = v; u <= t; ++u) {
-                        const int i = u * lanes + lane;
-                        if (entry[u] != 0.0f && i >= j) H(i, j) -= entry[u] * other;
-                    }
-                }
+            const int found = count(nonzero);
+            Pair its = mine;
+            for (int e = lane; e < found * (found + 1) / 2; e += lanes, its = pair_at(e)) {
+                const int i = met[its.u], j = met[its.v];
+                H(i, j) -= H(k, i) * H(k, j);
             }
             sync();
         }
