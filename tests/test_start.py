@@ -17,6 +17,7 @@ import pytest
 
 from mjx_nero.envs import env
 from mjx_nero.learn import checkpoint
+from mjx_nero.learn.learner import state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import cfg, compiled, starts
 from mjx_nero.sim import physics
@@ -101,6 +102,25 @@ def test_the_evaluation_is_traced_beside_the_first_state(monkeypatch):
     monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
     made = compiled.compile(run, learner, 1, start)
     assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
+
+
+@pytest.mark.parametrize(("env", "learner"), [("nero_reach", "ppo"), ("nero_lift", "pixels"), ("nero_lift", "distill")])
+def test_nothing_comes_to_the_device_before_the_first_state(monkeypatch, env, learner):
+    """A GPU's first array takes two seconds, in which its memory is reserved. Shapes can be had without."""
+    made, key = [], jax.random.PRNGKey
+
+    def noted(seed):
+        found = key(seed)
+        made.append(isinstance(found, jax.core.Tracer))
+        return found
+
+    preset = "rgb" if learner != "ppo" else "default"
+    run = cfg.resolve(env, preset, None, {}, {"num_envs": 8}, impl="native", learner=learner)
+    monkeypatch.setattr(jax.random, "PRNGKey", noted)
+    found = compiled.make_learner(run)
+    found.footprint()
+    state_shape(found)
+    assert made and all(made)
 
 
 class Slow(starts.Maker):

@@ -120,6 +120,13 @@ class Kind:
     graph: Any = None
 
 
+def state_shape(learner: Learner) -> Any:
+    """Returns a new state's shapes. Nothing comes to the device, whose first array takes seconds."""
+    import jax  # not needed for names and configs
+
+    return jax.eval_shape(lambda: learner.init(jax.random.PRNGKey(0)))
+
+
 def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:
     """Repeats an iteration, as ``Learner.run`` does; returns the state and the mean metrics."""
     import jax  # not needed for names and configs

@@ -14,7 +14,7 @@ import jax
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.learn import device_memory, learner
-from mjx_nero.learn.learner import Learner, Metrics
+from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
 from mjx_nero.runs.cfg import RunCfg
@@ -89,7 +89,8 @@ def fresh(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int],
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays
         given = bank.shapes() if bank else {}
-        return _shapes(given), init.lower(jax.random.PRNGKey(0), **given).compile()
+        key = jax.eval_shape(lambda: jax.random.PRNGKey(0))
+        return _shapes(given), init.lower(key, **given).compile()
 
     def start(seed: int) -> Any:
         with _threads() as beside:
@@ -134,7 +135,7 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         with spans.span("learner, traced"):
-            shapes = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+            shapes = state_shape(learner)
             program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(learner.place(shapes), chunk)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile), env.physics.compiler_options)
         if env.cfg.scene.cameras:

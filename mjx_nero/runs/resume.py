@@ -11,7 +11,7 @@ from mjx_nero import config, files
 from mjx_nero.config import values
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
-from mjx_nero.learn.learner import Learner
+from mjx_nero.learn.learner import Learner, state_shape
 from mjx_nero.learn.policy import checkpoint_policy
 from mjx_nero.runs import checkpoints, compiled, starts
 from mjx_nero.runs import trust as trust_of
@@ -247,7 +247,7 @@ def state(source: Source | None, learner: Learner, seed: int, bank: starts.Maker
     """
     if source is None:
         return compiled.starter(learner, bank)(seed)
-    like = jax.eval_shape(learner.init, jax.random.PRNGKey(seed))
+    like = state_shape(learner)
     if not source.is_checkpoint:
         networks = checkpoint_policy(source.path).params  # checked before the slow compilation
         if (found := _shapes(networks)) != (wanted := _shapes(learner.policy(like))):

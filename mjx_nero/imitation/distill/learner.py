@@ -111,7 +111,7 @@ class Learner(learner.Learner):
     def footprint(self) -> tuple[float, float]:
         """See ``learner.Learner``. A rollout keeps pictures; an update keeps the convolutions' outputs for the gradient."""
         cfg, env = self.cfg, self.env.unwrapped
-        state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
+        state = learner.state_shape(self)
         own, seen = device_memory.size(state.env_state), seen_bytes(cfg.student, self.sizes[SEEN])
         obs = device_memory.size({name: state.env_state.obs[name] for name in (SENSED, SEEN, TRUTH)}) / cfg.num_envs
         fixed = 2.0 * (device_memory.size(state) - own) + 3 * self.steps_per_iteration / self._minibatches * seen

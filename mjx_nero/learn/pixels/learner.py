@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from mjx_nero import config
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory
-from mjx_nero.learn.learner import Kind, Observation
+from mjx_nero.learn.learner import Kind, Observation, state_shape
 from mjx_nero.learn.pixels import graph
 from mjx_nero.learn.pixels.cfg import ENVS, PRESETS, PixelsCfg, differing
 from mjx_nero.learn.pixels.networks import (
@@ -145,7 +145,7 @@ class Learner(ppo.Learner):
     def footprint(self) -> tuple[float, float]:
         """See ``learner.Learner``. A rollout keeps pictures; an update keeps the convolutions' outputs for the gradient."""
         cfg, env = self.cfg, self.env.unwrapped
-        state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
+        state = state_shape(self)
         own, seen = device_memory.size(state.env_state), seen_bytes(cfg.student, self.sizes[SEEN])
         step = device_memory.size(state.env_state.obs) / cfg.num_envs + 4 * (3 * self.env.action_size + 7)
         updated = cfg.unroll_length * (step + 3 * seen) / cfg.num_minibatches

@@ -41,7 +41,7 @@ from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, learner, machines
-from mjx_nero.learn.learner import HELD, Kind, Observation, repeated
+from mjx_nero.learn.learner import HELD, Kind, Observation, repeated, state_shape
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
@@ -220,7 +220,7 @@ class Learner(learner.Learner):
         update copies a minibatch, and keeps all activations for the gradient.
         """
         cfg, env = self.cfg, self.env.unwrapped
-        state = jax.eval_shape(self.init, jax.random.PRNGKey(0))
+        state = state_shape(self)
         own = device_memory.size(state.env_state)
         # Observations; actions, their means and deviations; log-probability, value, return, advantage, reward and two ends.
         obs = 4 * sum(map(math.prod, shapes(self.sizes)))
