@@ -10,7 +10,7 @@ for (int t = 0; t < turns; ++t) {
 // A lane's part of the product of two vectors.
 auto product = [&](const float* u, const float* v) {
     float total = 0.0f;
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) total += half == 0 && t * width + c < NV ? u[t] * v[t] : 0.0f;
     return total;
 };
@@ -19,10 +19,10 @@ multiply(a, Ma, r, aref);
 int iteration = 0;
 while (true) {
     forces();
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) away[t] = Ma[t] - smooth[t], g[t] = 0.0f;
     add_forces(g);  // then the gradient, g = M a - smooth - J' f
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) g[t] = away[t] - g[t];
     if (iteration >= in.iterations || scale * sqrtf(sum(product(g, g))) < limit) break;
     direction(g, p);
@@ -33,12 +33,12 @@ UNROLLED
     // the step: Newton's method on the slope along p, kept between steps that are too short and too long
     multiply(p, Mp, Jp, nullptr);
     const float curvature = sum(product(p, Mp));
-    Part own_part = {};
-    if (lane < parts) own_part = part(lane);
+    Part its = {};
+    if (lane < parts) its = part(lane);
     float step = 1.0f, low = 0.0f, high = infinite;
     for (int k = 0; k < in.ls_iterations; ++k) {
         float d1 = 0.0f, d2 = 0.0f;
-        if (lane < parts) add_slope(own_part, step, d1, d2);
+        if (lane < parts) add_slope(its, step, d1, d2);
         for (int at = lane + lanes; at < parts; at += lanes) add_slope(part(at), step, d1, d2);
         sum_both(d1, d2);
         d1 += gauss + step * curvature, d2 += curvature;
@@ -48,7 +48,7 @@ UNROLLED
         step -= over(d1, d2);
         if (!(step > low && step < high)) step = high < infinite ? 0.5f * (low + high) : 2.0f * low;
     }
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) a[t] += step * p[t], Ma[t] += step * Mp[t];
     for (int row = lane; row < n; row += lanes) r[row] += step * Jp[row];
     sync();

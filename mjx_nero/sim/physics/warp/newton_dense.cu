@@ -29,44 +29,44 @@ sync();
 UNROLLED
 for (int k = lane; k < NM; k += lanes) L[M_ROW[k] * stride + M_COLUMN[k]] = L[M_COLUMN[k] * stride + M_ROW[k]] = packed[k];
 sync();
-float m[turns][4 * quads], diagonal = 0.0f;
+float mass[turns][4 * quads], diagonal = 0.0f;
 UNROLLED
 for (int t = 0; t < turns; ++t) {
     const int i = t * width + c;
     diagonal += half == 0 && i < NV ? L[i * stride + i] : 0.0f;
-UNROLLED
+    UNROLLED
     for (int q = 0; q < quads; ++q) {
-        put(m[t] + 4 * q, four(i < NV ? L + i * stride : x, q));  // x holds zeros
+        put(mass[t] + 4 * q, four(i < NV ? L + i * stride : x, q));  // x holds zeros
     }
 }
 const float scale = 1.0f / sum(diagonal);
 sync();
 
-// y = M v, and z = J v - b
-auto multiply = [&](const float* v, float* y, float* z, const float* b) {
-UNROLLED
+// y = M vector, and z = J vector - b
+auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
-        if (t * width + c < NV) x[t * width + c] = v[t];
+        if (t * width + c < NV) x[t * width + c] = vector[t];
     }
     sync();
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         float sums[4] = {};
-UNROLLED
+        UNROLLED
         for (int q = 0; q < quads; ++q) {
-            const Four v4 = four(x, q);
-            sums[0] += m[t][4 * q] * v4.x, sums[1] += m[t][4 * q + 1] * v4.y;
-            sums[2] += m[t][4 * q + 2] * v4.z, sums[3] += m[t][4 * q + 3] * v4.w;
+            const Four v = four(x, q);
+            sums[0] += mass[t][4 * q] * v.x, sums[1] += mass[t][4 * q + 1] * v.y;
+            sums[2] += mass[t][4 * q + 2] * v.z, sums[3] += mass[t][4 * q + 3] * v.w;
         }
         y[t] = total_of(sums);
     }
 #pragma unroll 1
     for (int row = lane; row < n; row += lanes) {
         float sums[4] = {b ? -b[row] : 0.0f, 0.0f, 0.0f, 0.0f};
-UNROLLED
+        UNROLLED
         for (int q = 0; q < quads; ++q) {
-            const Four u = four(J + row * apart, q), v4 = four(x, q);
-            sums[0] += u.x * v4.x, sums[1] += u.y * v4.y, sums[2] += u.z * v4.z, sums[3] += u.w * v4.w;
+            const Four u = four(J + row * apart, q), v = four(x, q);
+            sums[0] += u.x * v.x, sums[1] += u.y * v.y, sums[2] += u.z * v.z, sums[3] += u.w * v.w;
         }
         z[row] = total_of(sums);
     }
@@ -74,7 +74,7 @@ UNROLLED
 };
 // y += J' f
 auto add_forces = [&](float* y) {
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         const int i = t * width + c;
         float total = 0.0f;
@@ -89,18 +89,18 @@ auto direction = [&](const float* g, float* p) {
     const int sliding = list(active + NJ - 1, -1, [&](int row) { return weight[row] < 0.0f; });
     sync();
     float h[turns][4 * quads], y[turns], inverse[turns];
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
-        for (int j = 0; j < 4 * quads; ++j) h[t][j] = half == 0 ? m[t][j] : 0.0f;
+        for (int j = 0; j < 4 * quads; ++j) h[t][j] = half == 0 ? mass[t][j] : 0.0f;
     }
     auto add_row = [&](float* column, const float* row, float times) {
-UNROLLED
+        UNROLLED
         for (int q = 0; q < quads; ++q) add(column + 4 * q, times, four(row, q));
     };
 #pragma unroll 2
     for (int at = half; at < those; at += halves) {
         const int row = active[at];
-UNROLLED
+        UNROLLED
         for (int t = 0; t < turns; ++t) {
             const int i = t * width + c;
             add_row(h[t], J + row * apart, i < NV ? weight[row] * J[row * apart + i] : 0.0f);
@@ -109,35 +109,35 @@ UNROLLED
 #pragma unroll 1
     for (int at = half; at < sliding; at += halves) {
         const int row = active[NJ - 1 - at];
-        const float Dm = -weight[row], ratio = along[row], m_ = mu[row];
-UNROLLED
+        const float Dm = -weight[row], ratio = along[row], m = mu[row];
+        UNROLLED
         for (int t = 0; t < turns; ++t) {
             const int i = t * width + c < NV ? t * width + c : 0;
             const float* at_i = J + row * apart + i;
             float slide = 0.0f;
 #pragma unroll 1
             for (int k = 1; k < cone[row]; ++k) slide += along[row + k] * at_i[k * apart];
-            const float normal = m_ * at_i[0], push = ratio * slide - m_ * normal;
-            add_row(h[t], J + row * apart, Dm * m_ * (normal - m_ * slide));
+            const float normal = m * at_i[0], push = ratio * slide - m * normal;
+            add_row(h[t], J + row * apart, Dm * m * (normal - m * slide));
 #pragma unroll 1
             for (int k = 1; k < cone[row]; ++k) {
-                const float own_part = (m_ * m_ - ratio) * mu[row + k] * mu[row + k] * at_i[k * apart];
-                add_row(h[t], J + (row + k) * apart, Dm * (along[row + k] * push + own_part));
+                const float tangent = (m * m - ratio) * mu[row + k] * mu[row + k] * at_i[k * apart];
+                add_row(h[t], J + (row + k) * apart, Dm * (along[row + k] * push + tangent));
             }
         }
     }
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         for (int j = 0; halves == 2 && j < NV; ++j) h[t][j] += of(lane ^ width, h[t][j]);
         y[t] = -g[t];
     }
     // H = L' L from the last row on, as objects come last; on the way y = L'^-1 y. Then y = L^-1 y.
-UNROLLED
+    UNROLLED
     for (int k = NV - 1; k >= 0; --k) {
         const float pivot = of(k % width, h[k / width][k]), root = inverse_root(pivot > 1e-15f ? pivot : 1e-15f);
         const float done = of(k % width, y[k / width]) * root;
         float entry[turns];
-UNROLLED
+        UNROLLED
         for (int t = 0; t < turns; ++t) {
             const int i = t * width + c;
             entry[t] = h[t][k] * root;
@@ -145,30 +145,30 @@ UNROLLED
             if (i == k) y[t] = done, inverse[t] = root;
         }
         sync();
-UNROLLED
+        UNROLLED
         for (int t = 0; t < turns; ++t) {
-UNROLLED
+            UNROLLED
             for (int q = 0; q < (k + 3) / 4; ++q) {  // what is behind k is not read any more
                 add(h[t] + 4 * q, -entry[t], four(L + k * stride, q));
             }
         }
     }
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         const int i = t * width + c < NV ? t * width + c : 0;
-UNROLLED
+        UNROLLED
         for (int q = 0; q < quads; ++q) {
             put(h[t] + 4 * q, four(L + i * stride, q));
         }
     }
-UNROLLED
+    UNROLLED
     for (int k = 0; k < NV; ++k) {
         const float done = of(k % width, y[k / width] * inverse[k / width]);
-UNROLLED
+        UNROLLED
         for (int t = 0; t < turns; ++t) {
             if (t * width + c > k) y[t] -= h[t][k] * done;
         }
     }
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) p[t] = t * width + c < NV ? y[t] * inverse[t] : 0.0f;
 };

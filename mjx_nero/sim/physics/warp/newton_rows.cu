@@ -7,7 +7,7 @@
 
 const auto& in = problem;
 #if defined(__CUDA_ARCH__)
-#define UNROLLED _Pragma("unroll")  // so that arrays are in registers
+#define UNROLLED _Pragma("unroll")  // keeps an array in registers
 constexpr int lanes = 32;
 const int lane = threadIdx.x % lanes;
 __shared__ __align__(16) float s[SIZE];

@@ -4,8 +4,8 @@
 
 constexpr int half = 0, width = lanes, turns = (NV + width - 1) / width;
 const int c = lane;  // lane c takes the degrees of freedom c, c + width, ...
-constexpr int triangle = (NV * (NV + 1) / 2 + 3) / 4 * 4, vector = (NV + 3) / 4 * 4;
-float *x = rest, *packed_H = x + vector, *own = packed_H + triangle;
+constexpr int triangle = (NV * (NV + 1) / 2 + 3) / 4 * 4, padded = (NV + 3) / 4 * 4;
+float *x = rest, *packed_H = x + padded, *own = packed_H + triangle;
 unsigned short *begin = (unsigned short*)(own + ROWS), *filled = begin + many;  // of a row: where its nonzeros begin, and how many
 unsigned char *own_column = (unsigned char*)(filled + many), *met = own_column + ROWS;  // ... and columns met while factorising
 auto H = [&](int i, int j) -> float& { return packed_H[i * (i + 1) / 2 + j]; };
@@ -37,16 +37,16 @@ UNROLLED
 for (int k = lane; k < NM; k += lanes) H(M_ROW[k], M_COLUMN[k]) = packed[k];
 sync();
 int low[turns];  // the first degree of freedom of a lane's tree
-float m[turns][TREE], diagonal = 0.0f;
+float mass[turns][TREE], diagonal = 0.0f;
 UNROLLED
 for (int t = 0; t < turns; ++t) {
     const int i = t * width + c;
     low[t] = i < NV ? LOW[i] : NV;
     diagonal += i < NV ? H(i, i) : 0.0f;
-UNROLLED
+    UNROLLED
     for (int k = 0; k < TREE; ++k) {
         const int j = low[t] + k;
-        m[t][k] = i < NV && j < HIGH[i] ? (j < i ? H(i, j) : H(j, i)) : 0.0f;
+        mass[t][k] = i < NV && j < HIGH[i] ? (j < i ? H(i, j) : H(j, i)) : 0.0f;
     }
 }
 const float scale = 1.0f / sum(diagonal);
@@ -60,19 +60,19 @@ auto each_alone = [&](auto add) {
     }
 };
 
-// y = M v, and z = J v - b
-auto multiply = [&](const float* v, float* y, float* z, const float* b) {
-UNROLLED
+// y = M vector, and z = J vector - b
+auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
-        if (t * width + c < NV) x[t * width + c] = v[t];
+        if (t * width + c < NV) x[t * width + c] = vector[t];
     }
     sync();
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         y[t] = 0.0f;
-UNROLLED
+        UNROLLED
         for (int k = 0; k < TREE; ++k) {
-            if (low[t] + k < NV) y[t] += m[t][k] * x[low[t] + k];
+            if (low[t] + k < NV) y[t] += mass[t][k] * x[low[t] + k];
         }
     }
     for (int row = lane; row < n; row += lanes) {
@@ -99,13 +99,13 @@ auto add_forces = [&](float* y) {
         }
     }
     sync();
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) y[t] += t * width + c < NV ? x[t * width + c] : 0.0f;
     sync();
 };
 // An entry of J' s''(r) J of a contact that slides: of two columns of J.
 auto sliding = [&](int row, const float* Ji, const float* Jj, int apart) {
-    const float mu_ = mu[row], ratio = along[row], normal_i = mu_ * Ji[0], normal_j = mu_ * Jj[0];
+    const float m = mu[row], ratio = along[row], normal_i = m * Ji[0], normal_j = m * Jj[0];
     float slide_i = 0.0f, slide_j = 0.0f, tangents = 0.0f;
 #pragma unroll 1
     for (int k = 1; k < cone[row]; ++k) {
@@ -113,20 +113,20 @@ auto sliding = [&](int row, const float* Ji, const float* Jj, int apart) {
         slide_i += along[row + k] * i, slide_j += along[row + k] * j;
         tangents += mu[row + k] * mu[row + k] * i * j;
     }
-    return -weight[row] * (normal_i * normal_j - mu_ * (normal_i * slide_j + normal_j * slide_i) + ratio * slide_i * slide_j +
-                           (mu_ * mu_ - ratio) * tangents);
+    return -weight[row] * (normal_i * normal_j - m * (normal_i * slide_j + normal_j * slide_i) + ratio * slide_i * slide_j +
+                           (m * m - ratio) * tangents);
 };
 // p = -H^-1 g with H = M + J' s''(r) J
 auto direction = [&](const float* g, float* p) {
     for (int at = lane; at < triangle; at += lanes) packed_H[at] = 0.0f;
     sync();
     float y[turns];
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) {
         const int i = t * width + c;
-UNROLLED
+        UNROLLED
         for (int k = 0; k < TREE; ++k) {
-            if (i < NV && low[t] + k <= i) H(i, low[t] + k) = m[t][k];
+            if (i < NV && low[t] + k <= i) H(i, low[t] + k) = mass[t][k];
         }
         y[t] = i < NV ? -g[t] : 0.0f;
     }
@@ -188,6 +188,6 @@ UNROLLED
             }
         }
     }
-UNROLLED
+    UNROLLED
     for (int t = 0; t < turns; ++t) p[t] = y[t];
 };
