@@ -1,6 +1,7 @@
 """The GPU's solver and physics step against MuJoCo's C library. Without a GPU Warp runs the same source on the CPU, slowly."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +42,11 @@ KINDS = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", [None, 8])  # the Jacobian in shared memory, or too large for it
+# The Jacobian in shared memory, or too large for it; buffers whose sizes are multiples of 16 bytes or not.
+@pytest.mark.parametrize(("room", "njmax"), [(None, 96), (8, 90), (None, 85)])
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_accelerations_are_mujocos(cone, jacobian, room, monkeypatch):
+def test_accelerations_are_mujocos(cone, jacobian, room, njmax, monkeypatch):
     from mujoco.mjx.third_party import mujoco_warp
 
     from mjx_nero.sim.physics.warp import newton
@@ -71,7 +73,7 @@ def test_accelerations_are_mujocos(cone, jacobian, room, monkeypatch):
     assert {int(x) for x in wanted} <= kinds  # the states have what this is about
 
     warp_model = mujoco_warp.put_model(model)
-    data = mujoco_warp.make_data(model, n, naconmax=20 * n, njmax=96)
+    data = mujoco_warp.make_data(model, n, naconmax=20 * n, njmax=njmax)
     for array, values in zip((data.qpos, data.qvel), zip(*states, strict=True), strict=True):
         wp.copy(array, wp.array(np.array(values, np.float32), dtype=float))
     mujoco_warp.fwd_position(warp_model, data, factorize=False)
@@ -191,6 +193,33 @@ def test_the_engines_own_solver_steps_alike(name):
             moved = max(moved, float(jnp.abs(ours.qpos - sim.qpos).max()))
         state = step(state, action)
     assert moved > 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+@pytest.mark.parametrize("arch", [75, 90])  # the oldest that Warp supports, where some instructions are missing, and an H100
+@pytest.mark.parametrize("name", ["nero_lift", "cobotta_stack", "nero_clutter"])
+def test_kernels_compile_for_gpus_and_keep_arrays_in_registers(name, arch, tmp_path, monkeypatch):
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from mjx_nero.sim.physics.warp import dynamics, newton
+
+    env, kernels = make(name, impl="native", num_envs=1), []
+    model, sim = env.physics_model, env.cfg.sim
+    warp_model = mujoco_warp.put_model(model)
+    data = mujoco_warp.make_data(model, 1, naconmax=sim.contacts_per_env, njmax=sim.constraints_per_env)
+    steps = newton.make(warp_model, data), *dynamics.make(model, warp_model, data)
+    with monkeypatch.context() as patched:
+        patched.setattr(wp, "launch", lambda kernel, **_: kernels.append(kernel))
+        for step in steps:
+            step()
+    assert len(kernels) == 3
+    for kernel in kernels:
+        (path,) = wp.compile_aot_module(kernel.module, arch=arch, module_dir=tmp_path, use_ptx=True)
+        text = path.read_bytes()
+        assert b".entry" in text
+        if kernel is kernels[0]:  # an array in a thread's own memory would be slow
+            assert b".local .align" not in text
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def near(njmax: int, dense: bool) -> int:
 
 def floats(nv: int, njmax: int, dense: bool) -> int | None:
     """Numbers that an environment takes in shared memory; None: the model is too large."""
-    quads, rows = (nv + 3) // 4, (njmax + 3) // 4 * 4
+    quads, rows = (nv + 3) // 4, (njmax + 7) // 8 * 8
     size = 6 * rows + 3 * rows // 2 + 4 * quads
     if dense:
         size += (nv + near(njmax, dense)) * 4 * (quads | 1)

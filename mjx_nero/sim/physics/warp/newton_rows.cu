@@ -22,7 +22,10 @@ auto sum_both = [](float& x, float& y) {  // at once, as each shuffle waits for 
         x += dx, y += dy;
     }
 };
-auto most = [](int x) { return __reduce_max_sync(0xffffffff, x); };
+auto most = [](int x) {
+    for (int offset = 16; offset; offset >>= 1) x = max(x, __shfl_xor_sync(0xffffffff, x, offset));
+    return x;
+};
 auto of = [](int owner, float x) { return __shfl_sync(0xffffffff, x, owner); };
 auto bits = [](bool x) { return (unsigned long long)__ballot_sync(0xffffffff, x); };
 auto count = [](unsigned long long x) { return __popcll(x); };
@@ -53,7 +56,7 @@ const float limit = in.tolerance.data[world % in.tolerance.shape[0]];
 const float ls_limit = in.ls_tolerance.data[world % in.ls_tolerance.shape[0]];
 
 constexpr float infinite = 1e30f;
-constexpr int many = (NJ + 3) / 4 * 4;  // so that all arrays begin at a multiple of 16 bytes
+constexpr int many = (NJ + 7) / 8 * 8;  // so that ``rest``, after numbers and shorts, begins at a multiple of 16 bytes
 float *r = s, *Jp = r + many;
 float* along = Jp;     // of a sliding contact, until Jp takes its place: N mu / T, and the direction in which it slides, times friction
 float* D = Jp + many;  // a row's stiffness ...
