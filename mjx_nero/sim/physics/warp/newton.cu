@@ -1,4 +1,4 @@
-// Newton's method: the rows and M are in the parts before. A lane has its degrees of freedom, t * width + c, in registers.
+// Newton's method: the rows and M are in the parts before. A lane has its degrees of freedom in registers.
 
 float a[turns], Ma[turns], smooth[turns], away[turns], g[turns], p[turns], Mp[turns];  // away = M a - smooth
 UNROLLED

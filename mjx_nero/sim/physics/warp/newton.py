@@ -66,7 +66,7 @@ def make(model, data) -> Callable[[], None]:
         return lambda: mujoco_warp.solve(model, data)
     starts, counts, columns = (getattr(model, name).numpy() for name in ("M_rowadr", "M_rownnz", "M_colind"))
     low = columns[starts]  # the first degree of freedom of each one's tree
-    numbers: dict[str, Any] = {"NV": nv, "NJ": njmax, "ROWS": near(njmax, dense), "SIZE": size}
+    numbers: dict[str, Any] = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "ROWS": near(njmax, dense), "SIZE": size}
     numbers |= {"NM": len(columns), "M_ROW": np.repeat(np.arange(nv), counts), "M_COLUMN": columns}
     numbers |= {"LOW": low, "HIGH": np.searchsorted(low, low, "right"), "TREE": int(np.bincount(low).max())}
     numbers["ELLIPTIC"] = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)

@@ -1,5 +1,5 @@
-// J and M of few degrees of freedom. A lane has a column of H and of M in registers; if half of the lanes suffice for that, each half
-// adds every other row to H. J is in shared memory if an environment has no more than ROWS rows, as nearly all have.
+// J and M of few degrees of freedom. A lane has columns of H and of M in registers; of two halves, each adds every other row to H. J is
+// in shared memory if an environment has no more than ROWS rows, as nearly all have.
 
 #if defined(__CUDA_ARCH__)
 using Four = float4;
@@ -10,11 +10,9 @@ auto total_of = [](const float* x) { return (x[0] + x[1]) + (x[2] + x[3]); };
 auto put = [](float* to, Four v) { to[0] = v.x, to[1] = v.y, to[2] = v.z, to[3] = v.w; };
 auto add = [](float* to, float times, Four v) { to[0] += times * v.x, to[1] += times * v.y, to[2] += times * v.z, to[3] += times * v.w; };
 auto four = [](const float* x, int q) { return ((const Four*)x)[q]; };
-constexpr int halves = lanes == 32 && NV <= 16 ? 2 : 1, width = lanes / halves, turns = (NV + width - 1) / width;
-const int half = lane / width, c = lane % width;  // lane c takes the columns c, c + width, ...
 // An odd number of quads, so that lanes that read one row each meet different banks.
 constexpr int quads = (NV + 3) / 4, stride = 4 * (quads | 1);
-float *x = rest, *L = x + 4 * quads, *own = L + NV * stride;
+float *L = rest, *own = L + NV * stride;
 const bool near = n <= ROWS;
 const float* J = near ? own : efc_J;
 const int apart = near ? stride : in.efc_J.shape[2];
@@ -44,11 +42,7 @@ sync();
 
 // y = M vector, and z = J vector - b
 auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
-    UNROLLED
-    for (int t = 0; t < turns; ++t) {
-        if (t * width + c < NV) x[t * width + c] = vector[t];
-    }
-    sync();
+    share(vector);
     UNROLLED
     for (int t = 0; t < turns; ++t) {
         float sums[4] = {};

@@ -3,7 +3,7 @@
 // The rows of a contact with an elliptic cone follow one another; the first, the normal's, stands for all of them.
 //
 // The body of a function of (tid, problem) in three parts: the rows, here; then newton_dense.cu or newton_sparse.cu, which hold J and
-// M; then newton.cu, the method. newton.py compiles them after the constants NV, NJ, ROWS, TREE, SIZE, ELLIPTIC and FORCES.
+// M; then newton.cu, the method. newton.py compiles them after its constants.
 
 const auto& in = problem;
 #if defined(__CUDA_ARCH__)
@@ -66,7 +66,19 @@ float* weight = f + many;               // s''(r) of a row by itself; of a conta
 short* cone = (short*)(weight + many);  // rows of the contact that begins here; 0: a row by itself, -1: goes with one before
 short* first = cone + many;             // the rows by themselves, and those that begin a contact
 short* active = first + many;           // the rows with weight > 0, and from the end on the contacts that slide
-float* rest = (float*)(active + many);
+float* x = (float*)(active + many);     // of each degree of freedom, for all lanes to read
+float* rest = x + (NV + 3) / 4 * 4;
+
+// Lane c has the degrees of freedom c, c + width, ... If half of the lanes suffice for all, the other half does the same for other rows.
+constexpr int halves = DENSE && lanes == 32 && NV <= 16 ? 2 : 1, width = lanes / halves, turns = (NV + width - 1) / width;
+const int half = lane / width, c = lane % width;
+auto share = [&](const float* vector) {
+    UNROLLED
+    for (int t = 0; t < turns; ++t) {
+        if (t * width + c < NV) x[t * width + c] = vector[t];
+    }
+    sync();
+};
 
 #pragma unroll 2
 for (int row = lane; row < n; row += lanes) {

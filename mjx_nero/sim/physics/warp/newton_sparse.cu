@@ -2,10 +2,8 @@
 // in all of the contact's rows, which follow one another. They are in shared memory if an environment has no more than ROWS of them.
 // M couples the degrees of freedom of a tree, at most TREE. H is a triangle in shared memory.
 
-constexpr int half = 0, width = lanes, turns = (NV + width - 1) / width;
-const int c = lane;  // lane c takes the degrees of freedom c, c + width, ...
-constexpr int triangle = (NV * (NV + 1) / 2 + 3) / 4 * 4, padded = (NV + 3) / 4 * 4;
-float *x = rest, *packed_H = x + padded, *own = packed_H + triangle;
+constexpr int triangle = (NV * (NV + 1) / 2 + 3) / 4 * 4;
+float *packed_H = rest, *own = packed_H + triangle;
 unsigned short *begin = (unsigned short*)(own + ROWS), *filled = begin + many;  // of a row: where its nonzeros begin, and how many
 unsigned char *own_column = (unsigned char*)(filled + many), *met = own_column + ROWS;  // ... and columns met while factorising
 auto H = [&](int i, int j) -> float& { return packed_H[i * (i + 1) / 2 + j]; };
@@ -62,11 +60,7 @@ auto each_alone = [&](auto add) {
 
 // y = M vector, and z = J vector - b
 auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
-    UNROLLED
-    for (int t = 0; t < turns; ++t) {
-        if (t * width + c < NV) x[t * width + c] = vector[t];
-    }
-    sync();
+    share(vector);
     UNROLLED
     for (int t = 0; t < turns; ++t) {
         y[t] = 0.0f;
