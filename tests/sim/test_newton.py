@@ -41,6 +41,21 @@ KINDS = """
 """
 
 
+def to_be_solved(model, states, njmax):
+    """MuJoCo Warp's model, and its data of states (qpos, qvel) with all that precedes the solver."""
+    from mujoco.mjx.third_party import mujoco_warp
+
+    warp_model, n = mujoco_warp.put_model(model), len(states)
+    data = mujoco_warp.make_data(model, n, naconmax=20 * n, njmax=njmax)
+    for array, values in zip((data.qpos, data.qvel), zip(*states, strict=True), strict=True):
+        wp.copy(array, wp.array(np.array(values, np.float32), dtype=float))
+    mujoco_warp.fwd_position(warp_model, data, factorize=False)
+    mujoco_warp.fwd_velocity(warp_model, data)
+    mujoco_warp.fwd_actuation(warp_model, data)
+    mujoco_warp.fwd_acceleration(warp_model, data, factorize=True)
+    return warp_model, data
+
+
 @pytest.mark.slow
 # The Jacobian in shared memory, or too large for it; buffers whose sizes are multiples of 16 bytes or not.
 @pytest.mark.parametrize(("room", "njmax"), [(None, 96), (8, 90), (None, 85)])
@@ -72,14 +87,7 @@ def test_accelerations_are_mujocos(cone, jacobian, room, njmax, monkeypatch):
     wanted |= {mujoco.mjtConstraintState.mjCNSTRSTATE_CONE} if cone == "elliptic" else set()
     assert {int(x) for x in wanted} <= kinds  # the states have what this is about
 
-    warp_model = mujoco_warp.put_model(model)
-    data = mujoco_warp.make_data(model, n, naconmax=20 * n, njmax=njmax)
-    for array, values in zip((data.qpos, data.qvel), zip(*states, strict=True), strict=True):
-        wp.copy(array, wp.array(np.array(values, np.float32), dtype=float))
-    mujoco_warp.fwd_position(warp_model, data, factorize=False)
-    mujoco_warp.fwd_velocity(warp_model, data)
-    mujoco_warp.fwd_actuation(warp_model, data)
-    mujoco_warp.fwd_acceleration(warp_model, data, factorize=True)
+    warp_model, data = to_be_solved(model, states, njmax)
     data.qacc.zero_()
     newton.make(warp_model, data)()
     accelerations = np.array([qacc for qacc, _ in expected])
@@ -95,8 +103,6 @@ def test_accelerations_are_mujocos(cone, jacobian, room, njmax, monkeypatch):
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 def test_nothing_holds_what_falls(jacobian):
     """Without any constraint accelerations are the smooth ones, whatever the last step's were."""
-    from mujoco.mjx.third_party import mujoco_warp
-
     from mjx_nero.sim.physics.warp import newton
 
     xml = f"""
@@ -112,13 +118,7 @@ def test_nothing_holds_what_falls(jacobian):
     reference.qvel[:] = np.linspace(-1, 1, model.nv)
     mujoco.mj_forward(model, reference)
     assert reference.nefc == 0
-    warp_model = mujoco_warp.put_model(model)
-    data = mujoco_warp.make_data(model, n, naconmax=8 * n, njmax=16)
-    wp.copy(data.qvel, wp.array(np.tile(reference.qvel, (n, 1)).astype(np.float32), dtype=float))
-    mujoco_warp.fwd_position(warp_model, data, factorize=False)
-    mujoco_warp.fwd_velocity(warp_model, data)
-    mujoco_warp.fwd_actuation(warp_model, data)
-    mujoco_warp.fwd_acceleration(warp_model, data, factorize=True)
+    warp_model, data = to_be_solved(model, [(reference.qpos, reference.qvel)] * n, 16)
     data.qacc_warmstart.fill_(7.0)
     newton.make(warp_model, data)()
     np.testing.assert_allclose(data.qacc.numpy(), np.tile(reference.qacc, (n, 1)), rtol=0, atol=1e-3)

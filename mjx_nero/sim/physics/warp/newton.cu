@@ -19,11 +19,9 @@ multiply(a, Ma, r, aref);
 int iteration = 0;
 while (true) {
     forces();
+    pull(g);  // then the gradient, g = M a - smooth - J' f
     UNROLLED
-    for (int t = 0; t < turns; ++t) away[t] = Ma[t] - smooth[t], g[t] = 0.0f;
-    add_forces(g);  // then the gradient, g = M a - smooth - J' f
-    UNROLLED
-    for (int t = 0; t < turns; ++t) g[t] = away[t] - g[t];
+    for (int t = 0; t < turns; ++t) away[t] = Ma[t] - smooth[t], g[t] = away[t] - g[t];
     if (iteration >= in.iterations || scale * sqrtf(sum(product(g, g))) < limit) break;
     direction(g, p);
     float gp = product(g, p), gauss = product(p, away);

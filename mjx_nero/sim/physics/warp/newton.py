@@ -33,9 +33,9 @@ def near(njmax: int, dense: bool) -> int:
 def floats(nv: int, njmax: int, dense: bool) -> int | None:
     """Numbers that an environment takes in shared memory; None: the model is too large."""
     quads, rows = (nv + 3) // 4, (njmax + 7) // 8 * 8
-    size = 6 * rows + 3 * rows // 2 + 4 * quads
+    size = 7 * rows + 4 * quads
     if dense:
-        size += (nv + near(njmax, dense)) * 4 * (quads | 1)
+        size += (nv + near(njmax, dense)) * 4 * (quads | 1) + rows // 2
     else:
         size += (nv * (nv + 1) // 2 + 3) // 4 * 4 + near(njmax, dense) * 5 // 4 + rows + _DOFS // 4
     return size if nv <= _DOFS and 4 * size <= _SHARED_BYTES else None

@@ -13,6 +13,7 @@ auto four = [](const float* x, int q) { return ((const Four*)x)[q]; };
 // An odd number of quads, so that lanes that read one row each meet different banks.
 constexpr int quads = (NV + 3) / 4, stride = 4 * (quads | 1);
 float *L = rest, *own = L + NV * stride;
+short* active = (short*)(own + ROWS * stride);  // the rows with weight > 0, and from the end on the contacts that slide
 const bool near = n <= ROWS;
 const float* J = near ? own : efc_J;
 const int apart = near ? stride : in.efc_J.shape[2];
@@ -66,15 +67,15 @@ auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
     }
     sync();
 };
-// y += J' f
-auto add_forces = [&](float* y) {
+// y = J' f
+auto pull = [&](float* y) {
     UNROLLED
     for (int t = 0; t < turns; ++t) {
         const int i = t * width + c;
         float total = 0.0f;
 #pragma unroll 4
         for (int row = half; i < NV && row < n; row += halves) total += J[row * apart + i] * f[row];
-        y[t] += halves == 1 ? total : total + of(lane ^ width, total);
+        y[t] = halves == 1 ? total : total + of(lane ^ width, total);
     }
 };
 // p = -H^-1 g with H = M + J' s''(r) J

@@ -65,8 +65,7 @@ float* f = mu + many;
 float* weight = f + many;               // s''(r) of a row by itself; of a contact that slides -Dm, then zeros
 short* cone = (short*)(weight + many);  // rows of the contact that begins here; 0: a row by itself, -1: goes with one before
 short* first = cone + many;             // the rows by themselves, and those that begin a contact
-short* active = first + many;           // the rows with weight > 0, and from the end on the contacts that slide
-float* x = (float*)(active + many);     // of each degree of freedom, for all lanes to read
+float* x = (float*)(first + many);      // of each degree of freedom, for all lanes to read
 float* rest = x + (NV + 3) / 4 * 4;
 
 // Lane c has the degrees of freedom c, c + width, ... If half of the lanes suffice for all, the other half does the same for other rows.

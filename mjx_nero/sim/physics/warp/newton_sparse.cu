@@ -76,8 +76,8 @@ auto multiply = [&](const float* vector, float* y, float* z, const float* b) {
     }
     sync();
 };
-// y += J' f
-auto add_forces = [&](float* y) {
+// y = J' f
+auto pull = [&](float* y) {
     for (int i = lane; i < NV; i += lanes) x[i] = 0.0f;
     sync();
     each_alone([&](int row, int i) { x[i] = J[begin[row]] * f[row]; });
@@ -94,7 +94,7 @@ auto add_forces = [&](float* y) {
     }
     sync();
     UNROLLED
-    for (int t = 0; t < turns; ++t) y[t] += t * width + c < NV ? x[t * width + c] : 0.0f;
+    for (int t = 0; t < turns; ++t) y[t] = t * width + c < NV ? x[t * width + c] : 0.0f;
     sync();
 };
 // An entry of J' s''(r) J of a contact that slides: of two columns of J.
