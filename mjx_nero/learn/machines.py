@@ -63,6 +63,14 @@ def devices(each: int) -> list[Any]:
     return found
 
 
+def untuned() -> dict[str, str | bool | int | float] | None:
+    """Returns XLA's options for a program that runs once or now and then.
+
+    On a GPU XLA compiles hundreds of kernels to find the fastest ones, on all cores and for longer than such a program runs.
+    """
+    return {"xla_gpu_autotune_level": 0} if jax.default_backend() == "gpu" else None
+
+
 def gather(values: list[float]) -> np.ndarray:
     """Collects the values of all processes [processes, n]; the first process comes first."""
     mine = np.array(values, np.float64)

@@ -13,7 +13,7 @@ import jax
 
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory, learner
+from mjx_nero.learn import device_memory, learner, machines
 from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
@@ -84,7 +84,7 @@ def make_learner(run: RunCfg) -> Learner:
 
 def fresh(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int], Any]:
     """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank."""
-    init = jax.jit(learner.init)
+    init = jax.jit(learner.init, compiler_options=machines.untuned())
 
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_nero.control import Controller
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory, waiting
+from mjx_nero.learn import device_memory, machines, waiting
 from mjx_nero.learn.play import figures, recorder
 from mjx_nero.learn.play.recorder import Record
 from mjx_nero.types import Key, Scenery
@@ -221,7 +221,7 @@ def runner(
     device_memory.check_batch(env, episodes, "episodes:", env.episode_length * _step_bytes(env, episodes, record))
     agent = act if isinstance(act, Agent) else policy_agent(act)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=machines.untuned())
     def run(params, keys: Key, key: Key):
         def step(carry, key):
             (state, totals, active), memory = carry
