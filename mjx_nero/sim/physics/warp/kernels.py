@@ -22,6 +22,7 @@ def make(
     n: int,
     threads: int = 1,
     resident: int = 0,
+    block: int = 32,
 ) -> Callable[[], None]:
     """Makes a function that runs sources of this folder, with ``threads`` threads for each of ``n`` environments.
 
@@ -29,7 +30,8 @@ def make(
         names: names of the sources, without ``.cu``: one after another the body of a function of (tid, problem).
         constants: integers and tables to compile it with.
         values: the fields of ``problem``: Warp arrays and integers.
-        resident: blocks of 32 threads that a multiprocessor should have registers for; 0: the compiler decides.
+        resident: blocks that a multiprocessor should have registers for; 0: the compiler decides.
+        block: threads of a block.
     """
     import warp as wp
 
@@ -40,12 +42,12 @@ def make(
     @wp.func_native("".join(map(_constant, constants, constants.values())) + source)
     def work(tid: int, problem: Problem): ...  # type: ignore[valid-type]
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(32, resident) if resident else None)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(block, resident) if resident else None)
     def environments(problem: Problem):  # type: ignore[valid-type]
         work(wp.tid(), problem)
 
-    block = 32 if wp.get_device().is_cuda else 1
-    return lambda: wp.launch(environments, dim=n * threads, inputs=[problem], block_dim=block)
+    size = block if wp.get_device().is_cuda else 1
+    return lambda: wp.launch(environments, dim=n * threads, inputs=[problem], block_dim=size)
 
 
 def packed(name: str, values: Mapping[str, Any]) -> tuple[Any, Any]:

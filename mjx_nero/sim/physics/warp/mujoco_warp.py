@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero.sim import readings
 from mjx_nero.sim.physics import Footprint, Physics, possible
-from mjx_nero.sim.physics.warp import dynamics, kernels, newton, sensing
+from mjx_nero.sim.physics.warp import contact_rows, dynamics, kernels, newton, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -175,11 +175,12 @@ class WarpPhysics(Physics):
         if not own or dynamics.missing(self.model) or not newton.fits(model, data):
             return engines, out
         before, after = dynamics.make(self.model, model, data)
+        rows = contact_rows.make(self.model, model, data)
 
         def ours(last: bool):
             before()
             mujoco_warp.collision(model, data)
-            mujoco_warp.make_constraint(model, data)
+            rows()
             constrained(last)
             after()
 
