@@ -1,13 +1,14 @@
 """The motion of trees of joints, as two GPU kernels: before the contacts and after the constraints' forces.
 
 MuJoCo Warp goes through a tree level by level and quantity by quantity, in about ninety kernels per physics step, most of which
-take microseconds for thousands of environments. Here a thread takes one environment from its positions to all that does not
+take microseconds for thousands of environments. Here a thread takes one tree from its positions to all that does not
 depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them MuJoCo
 Warp finds the contacts, and ``newton`` the forces.
 
 The sources compile for the CPU as well, for tests.
 """
 
+import itertools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -79,7 +80,8 @@ def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[
     after = made | {"efc_Ma": data.efc.Ma, "efc_J_rownnz": data.efc.J_rownnz, "efc_J_rowadr": data.efc.J_rowadr}
     after |= _named(data, _INTEGRATE) | {name: int(getattr(data, name)) for name in ("njmax", "njmax_nnz", "naconmax")}
     constants |= {"SPARSE": int(model.is_sparse)}
-    return kernels.make(["tree"], constants, before, data.nworld), kernels.make(["integrate"], constants, after, data.nworld)
+    n = data.nworld * (len(_parts(m)) - 1)
+    return kernels.make(["tree"], constants, before, n), kernels.make(["integrate"], constants, after, n)
 
 
 def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
@@ -91,6 +93,7 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
     free = _free(m)
     assert (m.M_rowadr + m.M_rownnz)[:-1].tolist() == m.M_rowadr[1:].tolist()
     found: dict[str, int | Iterable[int]] = {
+        "PART": _parts(m),
         "PARENT": m.body_parentid,
         "ROOT": m.body_rootid,
         "MOCAP": m.body_mocapid,
@@ -120,6 +123,13 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
     }
     found |= {name: int(OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE")}
     return found
+
+
+def _parts(m: mujoco.MjModel) -> list[int]:
+    """Splits the bodies into parts that no joint couples: their first bodies, and one past the last. Still bodies go with others."""
+    ends = [*(b for b in range(1, m.nbody) if m.body_parentid[b] == 0), m.nbody]
+    moving = [begin for begin, end in itertools.pairwise(ends) if m.body_dofnum[begin:end].any()]
+    return [1, *moving[1:], m.nbody]
 
 
 def _free(m: mujoco.MjModel) -> list[int]:

@@ -1,4 +1,4 @@
-// One environment, one thread: MuJoCo's integrator "implicitfast" (mujoco.readthedocs.io, Computation, "Numerical integration"),
+// One tree of one environment, one thread: MuJoCo's integrator "implicitfast" (mujoco.readthedocs.io, Computation, "Numerical integration"),
 //
 //     v <- v + h x,  (M - h dF/dv) x = M qacc,   q <- q + h v
 //
@@ -6,7 +6,8 @@
 //
 // The body of a function of (tid, problem) that dynamics.py compiles, after the model's sizes and tables.
 
-const int world = tid;
+const int worlds = problem.qpos.shape[0], world = tid % worlds, part = tid / worlds;
+const int first_dof = FIRST_DOF[PART[part]], end_dof = FIRST_DOF[PART[part + 1]];
 const auto& in = problem;
 const float h = in.timestep.data[world % in.timestep.shape[0]];
 const float* M = in.M.data + (size_t)world * in.M.shape[1];
@@ -17,10 +18,10 @@ float x[NV];
 
 // A = M - h dF/dv = L' D L from the last row on, L and D's inverse in A's place; rows of ancestors are prefixes of those below them.
 float A[NM];
-for (int k = 0; k < NM; ++k) A[k] = M[k];
-for (int i = 0; i < NV; ++i) x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
+for (int k = ROW[first_dof]; k < ROW[end_dof]; ++k) A[k] = M[k];
+for (int i = first_dof; i < end_dof; ++i) x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
 #pragma unroll 1
-for (int i = NV - 1; i >= 0; --i) {
+for (int i = end_dof - 1; i >= first_dof; --i) {
     const int begin = ROW[i], last = ROW[i + 1] - 1;
     const float inverse = 1.0f / A[last];
     A[last] = inverse;
@@ -34,7 +35,7 @@ for (int i = NV - 1; i >= 0; --i) {
     }
 }
 #pragma unroll 1
-for (int i = 0; i < NV; ++i) {
+for (int i = first_dof; i < end_dof; ++i) {
     x[i] *= A[ROW[i + 1] - 1];
     for (int k = ROW[i]; k < ROW[i + 1] - 1; ++k) x[i] -= A[k] * x[COLUMN[k]];
 }
@@ -43,6 +44,7 @@ for (int i = 0; i < NV; ++i) {
 #pragma unroll 1
 for (int f = 0; f < NFREE; ++f) {
     const int i = FIRST_DOF[FREE_BODY[f]];
+    if (i < first_dof || i >= end_dof) continue;
     const float* spin = in.spin.data + (size_t)world * in.spin.shape[1] + 18 * f;
     float B[6][6], y[6];
     for (int r = 0; r < 6; ++r) {
@@ -71,11 +73,11 @@ for (int f = 0; f < NFREE; ++f) {
     }
 }
 
-for (int i = 0; i < NV; ++i) {
+for (int i = first_dof; i < end_dof; ++i) {
     qvel[i] += h * x[i], in.qacc_warmstart.data[(size_t)world * NV + i] = qacc[i];
 }
 #pragma unroll 1
-for (int j = 0; j < NJ; ++j) {
+for (int j = FIRST_JOINT[PART[part]]; j < FIRST_JOINT[PART[part + 1]]; ++j) {
     float* q = qpos + QPOS[j];
     const float* v = qvel + DOF[j];
     if (TYPE[j] != FREE) {
@@ -92,6 +94,7 @@ for (int j = 0; j < NJ; ++j) {
 }
 
 // What did not fit into the buffers: see MuJoCo Warp's OverflowType.
+if (part > 0) return;
 const int rows = in.nefc.data[world];
 int lost = 0;
 if (rows > in.njmax) {

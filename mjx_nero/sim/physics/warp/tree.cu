@@ -1,4 +1,4 @@
-// One environment, one thread: from positions, velocities and targets to all that does not depend on contacts. In MuJoCo's terms
+// One tree of one environment, one thread: from positions, velocities and targets to all that does not depend on contacts. In MuJoCo's terms
 // (mujoco.readthedocs.io, Computation, "Forward dynamics"): kinematics, the bias forces by recursive Newton-Euler (Featherstone,
 // "Rigid Body Dynamics Algorithms", 5.3), the joint-space inertia M by composite rigid bodies (6.2), passive forces and drives.
 //
@@ -8,7 +8,10 @@
 //
 // The body of a function of (tid, problem) that dynamics.py compiles, after the model's sizes and tables.
 
-const int world = tid;
+const int worlds = problem.qpos.shape[0], world = tid % worlds, part = tid / worlds;
+const int first_body = PART[part], last_body = PART[part + 1] - 1;
+const int first_joint = FIRST_JOINT[first_body], end_joint = FIRST_JOINT[last_body + 1];
+const int first_dof = FIRST_DOF[first_body], end_dof = FIRST_DOF[last_body + 1];
 struct V {
     float x, y, z;
     CUDA_CALLABLE V operator+(V b) const { return {x + b.x, y + b.y, z + b.z}; }
@@ -93,7 +96,7 @@ S velocity[NB], acceleration[NB], force[NB], dof[NV];
     Q q = turned[0] = {1, {0, 0, 0}};
     S v = velocity[0] = {{0, 0, 0}, {0, 0, 0}}, a = acceleration[0] = {{0, 0, 0}, down * -1.0f};
 #pragma unroll 1  // here and below: unrolled, the whole tree would not fit the instruction cache
-    for (int b = 1; b < NB; ++b) {
+    for (int b = first_body; b <= last_body; ++b) {
         const int p = PARENT[b];
         if (p != b - 1) x = at[p], q = turned[p], v = velocity[p], a = acceleration[p];
         x = x + rotate(q, MOCAP[b] < 0 ? vector(body_pos, b) : vector(mocap_pos, MOCAP[b]));
@@ -175,10 +178,10 @@ float M[NM], smooth[NV], implicit[NV];
 {
     const float *armature = of(in.dof_armature), *damping = of(in.dof_damping), *curve = of(in.dof_dampingpoly);
     const float *stiffness = of(in.jnt_stiffness), *stiffening = of(in.jnt_stiffnesspoly), *rest = of(in.qpos_spring);
-    S f = force[NB - 1];
-    I carried = inertia[NB - 1];
+    S f = force[last_body];
+    I carried = inertia[last_body];
 #pragma unroll 1
-    for (int b = NB - 1; b > 0; --b) {
+    for (int b = last_body; b >= first_body; --b) {
 #pragma unroll 1
         for (int i = FIRST_DOF[b + 1] - 1; i >= FIRST_DOF[b]; --i) {
             const S along_it = momentum(carried, dof[i]);
@@ -200,7 +203,7 @@ float M[NM], smooth[NV], implicit[NV];
         else if (p > 0) force[p] = force[p] + below, inertia[p] = sum(inertia[p], lower);
     }
 #pragma unroll 1
-    for (int j = 0; j < NJ; ++j) {
+    for (int j = first_joint; j < end_joint; ++j) {
         if (TYPE[j] == FREE) continue;  // dynamics.py: has none
         const float x = qpos[QPOS[j]] - rest[QPOS[j]];
         smooth[DOF[j]] -= x * (stiffness[j] + (stiffening[2 * j] + stiffening[2 * j + 1] * x) * x);
@@ -212,10 +215,11 @@ float M[NM], smooth[NV], implicit[NV];
     const float *ctrl = in.ctrl.data + (size_t)world * in.ctrl.shape[1], *gain = of(in.actuator_gainprm), *bias = of(in.actuator_biasprm);
     const float *gear = of(in.actuator_gear), *most = of(in.actuator_forcerange), *reach = of(in.actuator_ctrlrange);
     float driven[NV], slope[NV];
-    for (int i = 0; i < NV; ++i) driven[i] = slope[i] = 0.0f;
+    for (int i = first_dof; i < end_dof; ++i) driven[i] = slope[i] = 0.0f;
 #pragma unroll 1
     for (int u = 0; u < NU; ++u) {
         const int j = JOINT_OF_DRIVE[u], i = DOF[j];
+        if (j < first_joint || j >= end_joint) continue;
         const float g = gear[6 * u], *b = bias + 10 * u, target = CTRL_LIMITED[u] ? within(ctrl[u], reach + 2 * u) : ctrl[u];
         float f = gain[10 * u] * target, df = 0.0f;
         if (AFFINE[u]) f += b[0] + (b[1] * qpos[QPOS[j]] + b[2] * qvel[i]) * g, df = b[2];
@@ -225,17 +229,17 @@ float M[NM], smooth[NV], implicit[NV];
     }
     const float* joint_most = of(in.jnt_actfrcrange);
 #pragma unroll 1
-    for (int j = 0; j < NJ; ++j) {
+    for (int j = first_joint; j < end_joint; ++j) {
         const int i = DOF[j];
         if (!JOINT_LIMITED[j]) continue;
         const float f = within(driven[i], joint_most + 2 * j);
         if (f != driven[i]) driven[i] = f, slope[i] = 0.0f;
     }
-    for (int i = 0; i < NV; ++i) smooth[i] += driven[i], implicit[i] -= slope[i];
+    for (int i = first_dof; i < end_dof; ++i) smooth[i] += driven[i], implicit[i] -= slope[i];
 }
 
-for (int k = 0; k < NM; ++k) in.M.data[(size_t)world * in.M.shape[1] + k] = M[k];
-for (int i = 0; i < NV; ++i) {
+for (int k = ROW[first_dof]; k < ROW[end_dof]; ++k) in.M.data[(size_t)world * in.M.shape[1] + k] = M[k];
+for (int i = first_dof; i < end_dof; ++i) {
     in.qfrc_smooth.data[(size_t)world * NV + i] = smooth[i], in.implicit.data[(size_t)world * NV + i] = implicit[i];
     float* to = (float*)(in.cdof.data + (size_t)world * NV + i);
     put(to, dof[i].a), put(to + 3, dof[i].l);
@@ -248,6 +252,7 @@ for (int i = 0; i < NV; ++i) {
 #pragma unroll 1
 for (int f = 0; f < NFREE; ++f) {
     const int b = FREE_BODY[f], i = FIRST_DOF[b];
+    if (b < first_body || b > last_body) continue;
     const R ways = matrix(turned[b]);
     const float m = inertia[b].m;
     const V s = inertia[b].h * (1.0f / m), w = ways.x * qvel[i + 3] + ways.y * qvel[i + 4] + ways.z * qvel[i + 5], ws = cross(w, s);
