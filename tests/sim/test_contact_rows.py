@@ -19,7 +19,8 @@ SCENE = """
       <joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
       <body pos="0.3 0 0">
         <joint axis="0 1 0" frictionloss="0.1" range="-1 0.2" limited="true"/>
-        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" solref="0.03 0.7" solimp="0.5 0.9 0.01 0.3 3" friction="0.6 0.02 0.003"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" solref="0.03 0.7" solimp="0.5 0.9 0.01 0.3 3"
+          friction="0.6 0.02 0.003"/>
         <body pos="0.1 0 -0.1"><joint type="slide" axis="1 0 0"/><geom size="0.05" solref="0.002 1"/></body>
       </body>
     </body>

@@ -148,7 +148,6 @@ def begin() -> None:
     from mjx_nero.sim.physics import resolve_impl
     from mjx_nero.tools.benchmark import jobs, start
 
-    cli.collect_seldom()
     imported, spawned, argv = time.time(), float(sys.argv[1]), sys.argv[2:]
     args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _fields)
     cli.setup_jax()

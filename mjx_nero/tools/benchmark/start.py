@@ -19,7 +19,8 @@ from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
 
 _MISSED = "/compilation_cache/cache_misses"  # JAX's event for a program that it compiles
-_CHILD = "from mjx_nero.tools.benchmark import command; command.begin()"
+# As ``train.py`` begins.
+_CHILD = "from mjx_nero.tools import cli; cli.collect_seldom(); from mjx_nero.tools.benchmark import command; command.begin()"
 
 
 def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:

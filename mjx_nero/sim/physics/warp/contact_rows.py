@@ -1,7 +1,7 @@
 """The contacts' rows of the constraints, as one GPU kernel.
 
-MuJoCo Warp makes them in three, and each of its threads goes through the degrees of freedom again for its one row. Here a thread
-makes all rows of a contact at once (``contact_rows.cu``). The rows of equalities, friction in joints and limits are MuJoCo Warp's.
+MuJoCo Warp makes them in three, which read a contact and its bodies' chains again for each row. Here a few threads make all rows of
+a contact at once (``contact_rows.cu``). The rows of equalities, of friction in joints and of limits are MuJoCo Warp's.
 
 The source compiles for the CPU as well, for tests.
 """
@@ -57,9 +57,9 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
         nonzeros: wp.array(dtype=int),  # type: ignore
     ):
         world = wp.tid()
-        end = int(0)
-        for row in range(wp.min(nefc[world], njmax)):  # type: ignore
-            end = wp.max(end, rowadr[world, row] + rownnz[world, row])  # type: ignore
+        end = int(0)  # noqa: UP018 (Warp: a number that a loop changes)
+        for row in range(wp.min(nefc[world], njmax)):
+            end = wp.max(end, rowadr[world, row] + rownnz[world, row])
         nonzeros[world] = end
 
     def rows() -> None:

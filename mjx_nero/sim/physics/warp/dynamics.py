@@ -126,7 +126,7 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
 
 
 def _parts(m: mujoco.MjModel) -> list[int]:
-    """Splits the bodies into parts that no joint couples: their first bodies, and one past the last. Still bodies go with others."""
+    """Splits the bodies into parts that no joint couples: their first bodies, and one past the last. Still ones go with others."""
     ends = [*(b for b in range(1, m.nbody) if m.body_parentid[b] == 0), m.nbody]
     moving = [begin for begin, end in itertools.pairwise(ends) if m.body_dofnum[begin:end].any()]
     return [1, *moving[1:], m.nbody]
