@@ -1,7 +1,7 @@
 """The contacts' rows of the constraints, as one GPU kernel.
 
-MuJoCo Warp makes them in three, which read a contact and its bodies' chains again for each row. Here a few threads make all rows of
-a contact at once (``contact_rows.cu``). The rows of equalities, of friction in joints and of limits are MuJoCo Warp's.
+MuJoCo Warp makes them in three, which read a contact and its bodies' chains again for each row. Here a few threads make all rows
+of a contact at once (``contact_rows.cu``). The rows of equalities, of friction in joints and of limits are MuJoCo Warp's.
 
 The source compiles for the CPU as well, for tests.
 """

@@ -1,9 +1,9 @@
 """The motion of trees of joints, as two GPU kernels: before the contacts and after the constraints' forces.
 
 MuJoCo Warp goes through a tree level by level and quantity by quantity, in about ninety kernels per physics step, most of which
-take microseconds for thousands of environments. Here a thread takes one tree from its positions to all that does not
-depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them MuJoCo
-Warp finds the contacts, and ``newton`` the forces.
+take microseconds for thousands of environments. Here a thread takes one tree of an environment from its positions to all that does
+not depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them MuJoCo
+Warp finds the contacts, ``contact_rows`` makes their constraints and ``newton`` the forces.
 
 The sources compile for the CPU as well, for tests.
 """
@@ -126,7 +126,7 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
 
 
 def _parts(m: mujoco.MjModel) -> list[int]:
-    """Splits the bodies into parts that no joint couples: their first bodies, and one past the last. Still ones go with others."""
+    """Splits the bodies into parts that no joint couples: returns their first bodies, and one past the last of all."""
     ends = [*(b for b in range(1, m.nbody) if m.body_parentid[b] == 0), m.nbody]
     moving = [begin for begin, end in itertools.pairwise(ends) if m.body_dofnum[begin:end].any()]
     return [1, *moving[1:], m.nbody]
