@@ -1,9 +1,9 @@
 """The motion of trees of joints, as two GPU kernels: before the contacts and after the constraints' forces.
 
 MuJoCo Warp goes through a tree level by level and quantity by quantity, in about ninety kernels per physics step, most of which
-take microseconds for thousands of environments. Here a thread takes one tree of an environment from its positions to all that does
-not depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them MuJoCo
-Warp finds the contacts, ``contact_rows`` makes their constraints and ``newton`` the forces.
+take microseconds for thousands of environments. Here a thread takes one tree of an environment from its positions to all that
+does not depend on contacts (``tree.cu``), and from the constraints' forces to its next positions (``integrate.cu``). Between them
+MuJoCo Warp finds the contacts, ``contact_rows`` makes their constraints and ``newton`` the forces.
 
 The sources compile for the CPU as well, for tests.
 """
