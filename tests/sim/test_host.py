@@ -19,7 +19,8 @@ hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if name.endswith("cache_hits") else None)
 def double(x, y):
     y[:] = 2 * x
-f = jax.jit(lambda x: host.call(7, double, jax.ShapeDtypeStruct(x.shape, np.float32), x) + 1)
+host.offer(7, double)
+f = jax.jit(lambda x: host.call(7, jax.ShapeDtypeStruct(x.shape, np.float32), x) + 1)
 print(float(f(jnp.ones(3))[0]), len(hits))
 """
 
@@ -31,7 +32,8 @@ def sums(x, y):
 
 
 def call(x, key=1, work=sums):
-    return host.call(key, work, jax.ShapeDtypeStruct((*x.shape[:-1], 1), jnp.float32), x)
+    host.offer(key, work)
+    return host.call(key, jax.ShapeDtypeStruct((*x.shape[:-1], 1), jnp.float32), x)
 
 
 def test_jit_and_vmap():

@@ -99,7 +99,7 @@ class RayTracer(Drawer):
             "depth_out": wp.array(dtype=float, ndim=2),
             "segmentation_out": wp.array(dtype=wp.vec2i, ndim=2),
         }
-        call = kernels.as_jax(draw, outputs=3)
+        call, _ = kernels.as_jax(draw, outputs=3)
 
         def batched(given, *due):
             lead, rows = given.shape[:-1], given.reshape(-1, given.shape[-1])

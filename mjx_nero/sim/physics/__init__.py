@@ -6,13 +6,15 @@ A backend is one module or folder with one class; ``make_physics`` picks it by n
 
 import contextlib
 import dataclasses
+import hashlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.config import values
@@ -38,7 +40,12 @@ class Footprint:
 
 @runtime_checkable
 class Physics(Protocol):
-    """A compiled model, stepped at control rate."""
+    """A compiled model, stepped at control rate.
+
+    Attributes:
+        operations: names of the custom operations in its programs, if they mean the same in every process that has made an equal
+            physics. May be missing: then the programs are not kept between runs.
+    """
 
     @property
     def compiler_options(self) -> dict[str, str | bool]:
@@ -119,6 +126,13 @@ def make_physics(model: mujoco.MjModel, cfg: SimCfg, impl: str, fields: Sequence
         UserError: the backend cannot compute this model.
     """
     return BACKENDS[impl](model, cfg, fields)
+
+
+def identity(model: mujoco.MjModel, *settings: Any) -> bytes:
+    """Returns 32 bytes that identify a model and settings, whose ``repr`` tells all of them, in this process and in others."""
+    whole = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, whole)
+    return hashlib.sha256(whole.tobytes() + repr(settings).encode()).digest()
 
 
 def fusion() -> dict[str, str | bool]:

@@ -15,25 +15,33 @@ import numpy as np
 # Writes its result, float32, into the second array.
 Work = Callable[[np.ndarray, np.ndarray], None]
 
-_TARGET = "mjx_nero_host"
+TARGET = "mjx_nero_host"
 _VERSION = 0, 1  # of the interface; XLA takes this and newer ones
 _METADATA = 1  # XLA_FFI_Extension_Metadata: asks for the version, and calls nothing
 _INTERNAL = 13  # XLA_FFI_Error_Code_INTERNAL
 _known: dict[int, Work] = {}
 
 
-def call(key: int, work: Work, result: jax.ShapeDtypeStruct, given: jax.Array) -> jax.Array:
-    """Calls ``work`` with one float32 array and gives one back; under ``jit`` and ``vmap``, on a CPU.
+def offer(key: int, work: Work) -> None:
+    """Lets programs call ``work``, those included that another process has traced or compiled.
 
     Args:
         key: identifies ``work``, in this process and in others. Functions with the same key have to do the same; the first one
             is called, and kept as long as the process lives.
         work: called while Python's lock is held. An exception becomes an error of the program.
-        result: shape and type of the result, with the same leading axes as ``given``.
     """
     _register()
     _known.setdefault(key, work)
-    return jax.ffi.ffi_call(_TARGET, result, vmap_method="broadcast_all")(given, key=np.int64(key))
+
+
+def call(key: int, result: jax.ShapeDtypeStruct, given: jax.Array) -> jax.Array:
+    """Calls what was offered with one float32 array and gives one back; under ``jit`` and ``vmap``, on a CPU.
+
+    Args:
+        key: see ``offer``.
+        result: shape and type of the result, with the same leading axes as ``given``.
+    """
+    return jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")(given, key=np.int64(key))
 
 
 class _Extension(ctypes.Structure):
@@ -116,7 +124,7 @@ class _Frame(ctypes.Structure):
 def _register() -> Callable:
     """Registers the operation with XLA, and keeps the function alive."""
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))(_handle)
-    jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(handler), platform="cpu")
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
     return handler
 
 

@@ -25,6 +25,8 @@ LINE_SEARCH = 20
 class JaxPhysics(Physics):
     """See ``physics.Physics``."""
 
+    operations: tuple[str, ...] = ()
+
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         if "geom_dataid" in fields:
             raise UserError("MJX-JAX cannot give an object another shape in each episode (bank): use --impl native or warp")

@@ -64,24 +64,42 @@ def packed(name: str, values: Mapping[str, Any]) -> tuple[Any, Any]:
     return Packed, made
 
 
-def as_jax(function: Callable[..., None], outputs: int) -> Callable[..., Any]:
+def as_jax(function: Callable[..., None], outputs: int, key: str = "") -> tuple[Callable[..., Any], str]:
     """Turns a function of Warp's arrays into a function of JAX's, which XLA calls on the stream that it computes on.
 
     Graph mode is off, because it would capture the function for every set of addresses that XLA uses. Nothing is loaded while JAX
     traces: another thread may be adding kernels to the same module, and then the load ends with a KeyError.
 
     Args:
-        function: takes arrays, annotated as Warp's; the last ``outputs`` of them are written.
+        function: takes arrays, annotated as Warp's, of float32 up to the last ``outputs`` of them, which are written.
+        key: identifies what ``function`` does, in this process and in others. A process calls this once for each key.
+
+    Returns:
+        JAX's function, and the name of its operation, which follows from the function's name and the key.
     """
     import warp as wp
 
-    return wp.jax_callable(
+    function.__qualname__ = f"{function.__name__}_{key}"
+    call = wp.jax_callable(
         function,
         num_outputs=outputs,
         vmap_method=None,
         graph_mode=wp.JaxCallableGraphMode.NONE,
         module_preload_mode=wp.JaxModulePreloadMode.NONE,
     )
+    one_by_one = threading.Lock()
+
+    def numbered(*inputs: Any, output_dims: Mapping[str, tuple[int, ...]]) -> Any:
+        # Warp numbers the calls as JAX traces them, and looks the number up when one runs. All are number 0, so that programs are
+        # the same in every process, and run in one that has not traced them.
+        with one_by_one:
+            call.call_id = 0
+            return call(*inputs, output_dims=output_dims)
+
+    ones = {name: (1,) * array.ndim for name, array in function.__annotations__.items()}
+    inputs = [jax.ShapeDtypeStruct(shape, np.float32) for shape in ones.values()]
+    jax.eval_shape(functools.partial(numbered, output_dims=ones), *inputs[:-outputs])  # so that number 0 is known
+    return numbered, call.name
 
 
 def batched(function: Callable[..., tuple], outputs: int) -> Callable[..., tuple]:

@@ -8,6 +8,7 @@ arrays are copied out. The engine recomputes everything else from them, so the f
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_nero.sim import readings
-from mjx_nero.sim.physics import Footprint, Physics, possible
+from mjx_nero.sim.physics import Footprint, Physics, identity, possible
 from mjx_nero.sim.physics.warp import contact_rows, dynamics, kernels, newton, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
@@ -28,17 +29,29 @@ _LOST = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 3
 # Fields of MuJoCo's C library alone. A mesh that a world lacks has no contact bits there; here its geom has no mesh.
 _OF_C = ("dof_M0", "geom_contype", "geom_conaffinity")
 
+# The parts of an instance that equal ones share, by what identifies it.
+_MADE: dict[str, tuple[kernels.Programs, Callable, str]] = {}
+_MAKING = threading.Lock()
+
 
 class WarpPhysics(Physics):
-    """See ``physics.Physics``. The first step with a batch size on a device makes the buffers, which are kept."""
+    """See ``physics.Physics``. The first step with a batch size on a device makes the buffers, which are kept.
+
+    Of equal instances the first does the work of all, because a program names its operation by what it does.
+    """
 
     def __init__(self, model: mujoco.MjModel, cfg: SimCfg, fields: Sequence[str] = ()):
         self.model, self.decimation, self._cfg = model, cfg.decimation, cfg
         self._fields = {name: np.shape(getattr(model, name)) for name in fields if name not in _OF_C}
         self._readings = readings.of(model)
         self._numbers = readings.size(self._readings)
-        self._get = kernels.Programs(self._make)
-        self._batched = self._as_jax()
+        with _MAKING:
+            key = identity(model, cfg, tuple(fields)).hex()[:16]
+            if key not in _MADE:
+                self._get = kernels.Programs(self._make)
+                _MADE[key] = self._get, *self._as_jax(key)
+            self._get, self._batched, name = _MADE[key]
+        self.operations = (name,)
 
     def step(self, sim: Sim, ctrl: Float[Array, "*batch nu"]) -> tuple[Sim, Float[Array, "*batch"]]:
         """Computes one control step; leading axes are environments."""
@@ -55,7 +68,7 @@ class WarpPhysics(Physics):
             after = dataclasses.replace(after, readings=readings.split(self._readings, force))
         return after, ((overflow & _LOST) != 0).astype(jnp.float32)
 
-    def _as_jax(self) -> Callable:
+    def _as_jax(self, key: str) -> tuple[Callable, str]:
         import warp as wp
 
         def control_step(qpos, qvel, given, warmstart, qpos_out, qvel_out, warmstart_out, overflow_out, force_out):
@@ -81,7 +94,7 @@ class WarpPhysics(Physics):
             "overflow_out": wp.array(dtype=int),
             "force_out": wp.array(dtype=float, ndim=2),
         }
-        call = kernels.as_jax(control_step, outputs=5)
+        call, name = kernels.as_jax(control_step, outputs=5, key=key)
         nq, nv = self.model.nq, self.model.nv
 
         def batched(*inputs):
@@ -92,7 +105,7 @@ class WarpPhysics(Physics):
             sizes["force_out"] = n, max(1, self._numbers)
             return tuple(x.reshape(lead + x.shape[1:]) for x in call(*inputs, output_dims=sizes))
 
-        return kernels.batched(batched, outputs=5)
+        return kernels.batched(batched, outputs=5), name
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the size of MuJoCo Warp's data, and the free memory."""
