@@ -147,7 +147,7 @@ def test_summary_by_hand():
         "reward/a": np.array([1.0, 2, 3, 4]),
     }
     returns, lengths = np.array([1.0, 2, 3, 6]), np.array([250.0, 250, 10, 250])
-    summary = rollout.Episodes(metrics, returns, lengths, NOTHING, np.zeros((250, 4)), (), GRASPING).summary()
+    summary = rollout.Episodes(metrics, returns, lengths, NOTHING, np.zeros((250, 4)), (), terms=GRASPING).summary()
     assert summary["success_rate"] == 0.5 and summary["grasp_rate"] == 0.5 and summary["dropped_rate"] == 0.25
     assert summary["diverged"] == 1  # the second, a failure that is in no mean
     assert summary["time_to_grasp_mean"] == 2.0  # of those that grasped
@@ -162,7 +162,9 @@ def test_summary_by_hand():
 def test_summary_of_nothing_but_divergence():
     metrics = dict.fromkeys(("success", "final_distance", "grasped", "grasp_time", "dropped", "overflow"), np.zeros(2))
     metrics |= {"nan": np.array([1.0, 0]), "reward/a": np.zeros(2)}
-    summary = rollout.Episodes(metrics, np.array([0.0, np.nan]), np.ones(2), NOTHING, np.zeros((5, 2)), (), GRASPING).summary()
+    summary = rollout.Episodes(
+        metrics, np.array([0.0, np.nan]), np.ones(2), NOTHING, np.zeros((5, 2)), (), terms=GRASPING
+    ).summary()
     assert summary["grasp_rate"] == 0 and summary["time_to_grasp_mean"] is None
     assert summary["diverged"] == 2 and summary["success_rate"] == 0
     assert summary["return_mean"] is None and summary["final_distance_median"] is None

@@ -66,45 +66,20 @@ def through_actions(env: ManipulationEnv, agent: Agent) -> Agent:
 
 
 @dataclasses.dataclass(frozen=True)
-class Episodes:
-    """Played episodes, one entry each.
+class Totals:
+    """Sums over played episodes, one entry each.
 
     Attributes:
         metrics: name -> sums over each episode's steps [n] (see ``ManipulationEnv.finish``).
         returns: returns of the episodes [n].
         lengths: lengths of the episodes in control steps [n].
-        record: records of the first k episodes [steps, k, ...], if asked for; an ended episode stands still.
-        distance: the distance that success judges, in m [steps, n]; an ended episode's stays.
-        memory: the agent's memory after the last step.
         terms: the task's metric terms, which say how metrics become figures.
     """
 
     metrics: dict[str, np.ndarray]
     returns: np.ndarray
     lengths: np.ndarray
-    record: Record
-    distance: np.ndarray
-    memory: Any
-    terms: figures.Terms = dataclasses.field(default_factory=dict)
-
-    @property
-    def qpos(self) -> np.ndarray:
-        """Positions of the recorded episodes [steps, k, nq]."""
-        return np.asarray(self.record.qpos)
-
-    @property
-    def scenery(self) -> Scenery:
-        """Everything that a picture shows besides ``qpos`` [steps, k, ...]."""
-        return self.record.scenery
-
-    @property
-    def pictures(self) -> list[np.ndarray]:
-        """Colour pictures of the policy's cameras, uint8 [steps, k, height, width, 3], one entry per camera."""
-        return [np.asarray(x) for x in jax.tree.leaves(self.record.obs) if x.ndim == 5 and x.dtype == np.uint8]
-
-    def episode(self, index: int) -> Record:
-        """Returns a recorded episode up to its end [steps, ...]."""
-        return self.record[: int(self.lengths[index]), index]
+    terms: figures.Terms = dataclasses.field(default_factory=dict, kw_only=True)
 
     def summary(self) -> dict:
         """Computes the figures to show and to write as JSON: distances in m, times in s.
@@ -139,6 +114,40 @@ class Episodes:
     def _whole(self) -> np.ndarray:
         return ~(self.metrics["nan"] > 0) & np.isfinite(self.returns)
 
+
+@dataclasses.dataclass(frozen=True)
+class Episodes(Totals):
+    """Played episodes, one entry each.
+
+    Attributes:
+        record: records of the first k episodes [steps, k, ...], if asked for; an ended episode stands still.
+        distance: the distance that success judges, in m [steps, n]; an ended episode's stays.
+        memory: the agent's memory after the last step.
+    """
+
+    record: Record
+    distance: np.ndarray
+    memory: Any
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Positions of the recorded episodes [steps, k, nq]."""
+        return np.asarray(self.record.qpos)
+
+    @property
+    def scenery(self) -> Scenery:
+        """Everything that a picture shows besides ``qpos`` [steps, k, ...]."""
+        return self.record.scenery
+
+    @property
+    def pictures(self) -> list[np.ndarray]:
+        """Colour pictures of the policy's cameras, uint8 [steps, k, height, width, 3], one entry per camera."""
+        return [np.asarray(x) for x in jax.tree.leaves(self.record.obs) if x.ndim == 5 and x.dtype == np.uint8]
+
+    def episode(self, index: int) -> Record:
+        """Returns a recorded episode up to its end [steps, ...]."""
+        return self.record[: int(self.lengths[index]), index]
+
     def recorded(self, which: np.ndarray) -> "Episodes":
         """Returns the same episodes with only the records at the indices ``which``: int [any]."""
         return dataclasses.replace(self, record=self.record[:, which])
@@ -157,17 +166,9 @@ class Runner:
         self._run, self._episodes, self._terms = run, episodes, terms
 
     def __call__(self, params: Any, seed: int) -> Episodes:
-        totals, frames, memory = waiting.result_of(self._run, params, *_keys(np.uint32(seed), self._episodes))
-        return _collect(totals, frames, memory, self._terms)
-
-    def compiler(self, params: Any) -> Callable[[], None]:
-        """Traces the program, and returns a call that compiles it in any thread."""
-        lowered = self._run.lower(params, *_keys(np.uint32(0), self._episodes))
-
-        def compile() -> None:
-            self._run = lowered.compile()
-
-        return compile
+        found, frames, memory = waiting.result_of(self._run, params, *keys_of(seed, self._episodes))
+        totals, (record, distance) = totals_of(found, self._terms), jax.device_get(frames)
+        return Episodes(totals.metrics, totals.returns, totals.lengths, record, distance, memory, terms=self._terms)
 
 
 def wilson(successes: float, n: int) -> tuple[float, float]:
@@ -209,7 +210,19 @@ def runner(
     record: int = 0,
     start: Callable[[Any, State], State] | None = None,
 ) -> Runner:
-    """Compiles a program that plays ``episodes`` at once, on the environment's physics.
+    """Compiles a program that plays ``episodes`` at once: see ``player``."""
+    run = player(env, act, episodes, record, start)
+    return Runner(jax.jit(run, compiler_options=machines.untuned()), episodes, env.cfg.metrics)
+
+
+def player(
+    env: ManipulationEnv,
+    act: Act | Agent,
+    episodes: int,
+    record: int = 0,
+    start: Callable[[Any, State], State] | None = None,
+) -> Callable[[Any, Key, Key], tuple[dict, Any, Any]]:
+    """Returns the function that plays ``episodes`` at once, on the environment's physics: the first argument of ``Runner``.
 
     Args:
         record: number of episodes whose steps are kept.
@@ -221,7 +234,6 @@ def runner(
     device_memory.check_batch(env, episodes, "episodes:", env.episode_length * _step_bytes(env, episodes, record))
     agent = act if isinstance(act, Agent) else policy_agent(act)
 
-    @functools.partial(jax.jit, compiler_options=machines.untuned())
     def run(params, keys: Key, key: Key):
         def step(carry, key):
             (state, totals, active), memory = carry
@@ -236,7 +248,12 @@ def runner(
         ((_, totals, _), memory), frames = jax.lax.scan(step, ((state, totals, active), agent.init(state)), keys)
         return totals, frames, memory
 
-    return Runner(run, episodes, env.cfg.metrics)
+    return run
+
+
+def keys_of(seed: int, episodes: int) -> tuple[Key, Key]:
+    """Returns the keys of the episodes of a seed, and the key of what is drawn while they are played."""
+    return _keys(np.uint32(seed), episodes)
 
 
 @functools.partial(jax.jit, static_argnums=1)  # each operation would be a program of its own
@@ -247,8 +264,7 @@ def _keys(seed: jax.Array, episodes: int) -> tuple[Key, Key]:
     return jax.random.split(k_reset, episodes), key
 
 
-def _collect(totals: dict, frames: tuple, memory: Any, terms: figures.Terms) -> Episodes:
-    totals = {name: np.asarray(value, np.float64) for name, value in totals.items()}
-    returns, lengths = totals.pop("return"), totals.pop("length")
-    record, distance = jax.device_get(frames)
-    return Episodes(totals, returns, lengths, record, distance, memory, terms)
+def totals_of(found: dict[str, jax.Array], terms: figures.Terms) -> Totals:
+    """Makes the totals of the first result of ``player``'s function."""
+    metrics = {name: np.asarray(value, np.float64) for name, value in found.items()}
+    return Totals(metrics, metrics.pop("return"), metrics.pop("length"), terms=terms)
