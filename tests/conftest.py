@@ -61,6 +61,7 @@ import mjx_nero  # noqa: E402  (sets XLA_FLAGS, before JAX starts its backend)
 from mjx_nero import __main__, control  # noqa: E402
 from mjx_nero.learn import learner  # noqa: E402
 from mjx_nero.learn.ppo import imitation  # noqa: E402
+from mjx_nero.runs import programs  # noqa: E402
 from mjx_nero.sim import physics, render  # noqa: E402
 from mjx_nero.sim.physics.mjx import JaxPhysics  # noqa: E402
 from mjx_nero.tasks import registry  # noqa: E402
@@ -86,6 +87,14 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if item.get_closest_marker("gpu"):
                 item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def programs_are_traced():
+    """Tests change code while they run, which no file tells: no program is kept but where a test asks for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programs, "_settings", lambda: programs_are_traced)  # code from outside
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -5,6 +5,7 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,11 +14,12 @@ import jax
 
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import device_memory, learner, machines
+from mjx_nero.learn import device_memory, learner, machines, waiting
 from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
 
@@ -52,11 +54,12 @@ class Evaluator:
     It uses MuJoCo's C library, or Warp if training does.
     """
 
-    def __init__(self, run: RunCfg, learner: Learner):
+    def __init__(self, run: RunCfg, learner: Learner, programs: Programs):
         impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
-        env = ManipulationEnv(run.env.uncorrupted(), impl=impl, num_envs=run.eval_episodes)
-        self._seed, self._policy = run.seed, learner.policy
-        self._runner = rollout.runner(env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
+        self._env = ManipulationEnv(run.env.uncorrupted(), impl=impl, num_envs=run.eval_episodes)
+        self._seed, self._policy, self._programs = run.seed, learner.policy, programs
+        self._play = rollout.player(self._env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
+        self._program: Any = None
 
     def of_seed(self, seed: int) -> "Evaluator":
         """Returns the same program with another seed's episodes."""
@@ -65,11 +68,25 @@ class Evaluator:
         return other
 
     def compiler(self, state: Any) -> Callable[[], None]:
-        """Returns a call that compiles the program, given a state or its shapes: see ``rollout.Runner.compiler``."""
-        return self._runner.compiler(self._policy(state))
+        """Lowers the program, given a state or its shapes, and returns a call that compiles it in any thread."""
+
+        def totals(*args: Any) -> tuple[Any, dict[str, jax.Array]]:
+            return (), self._play(*args)[0]
+
+        n = self._env.num_envs
+        args = self._policy(state), *rollout.keys_of(0, n)
+        lowered = self._programs.lower(f"evaluation-{n}", totals, args, (), self._env, options=machines.untuned())
+
+        def compile() -> None:
+            self._program = lowered.compile()
+
+        return compile
 
     def __call__(self, state: Any) -> dict[str, Any]:
-        return self._runner(self._policy(state), self._seed).summary()
+        """Plays the episodes; ``compiler``'s call comes first."""
+        keys = rollout.keys_of(self._seed, self._env.num_envs)
+        _, totals = waiting.result_of(self._program, self._policy(state), *keys)
+        return rollout.totals_of(totals, self._env.cfg.metrics).summary()
 
 
 def make_learner(run: RunCfg) -> Learner:
@@ -82,23 +99,36 @@ def make_learner(run: RunCfg) -> Learner:
     return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
 
 
-def fresh(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int], Any]:
-    """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank."""
-    init = jax.jit(learner.init, compiler_options=machines.untuned())
+def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs | None = None) -> Callable[[int], Any]:
+    """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank.
+
+    Args:
+        programs: where that program is kept; None: nowhere.
+    """
+
+    def init(key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
+        return learner.init(key, **given), {}
+
+    untuned = machines.untuned()
 
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays
         given = bank.shapes() if bank else {}
-        key = jax.eval_shape(lambda: jax.random.PRNGKey(0))
-        return _shapes(given), init.lower(key, **given).compile()
+        args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
+        if programs:
+            name = f"init-{hashlib.sha256(repr(_shapes(given)).encode()).hexdigest()[:16]}"
+            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=untuned)
+        else:
+            lowered = jax.jit(init, compiler_options=untuned).lower(*args)
+        return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
         with _threads() as beside:
             compiling = beside.submit(expected)
             given = bank(seed) if bank else {}
             shapes, program = compiling.result()
-        make = program if _shapes(given) == shapes else init
-        return make(jax.random.PRNGKey(seed), **given)  # not every learner takes what an expert gives
+        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
+        return make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
 
     return start
 
@@ -107,9 +137,9 @@ def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
 
 
-def starter(learner: Learner, bank: starts.Maker | None = None) -> Callable[[int], Any]:
+def starter(learner: Learner, bank: starts.Maker | None = None, programs: Programs | None = None) -> Callable[[int], Any]:
     """Returns ``fresh``, with the state placed for ``learner.run``."""
-    start = fresh(learner, bank)
+    start = fresh(learner, bank, programs)
     return lambda seed: learner.place(start(seed))
 
 
@@ -126,6 +156,9 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
     begun, env, spans = time.perf_counter(), learner.env.unwrapped, Spans()
     start = spans.timed("first state", start)
 
+    def advance(state: Any) -> tuple[Any, Metrics]:
+        return learner.run(state, chunk)
+
     def prepare() -> None:
         device_memory.check_outside(learner)
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
@@ -134,21 +167,22 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         physics = side_by_side.submit(spans.timed("physics", prepare))
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
-        with spans.span("learner, traced"):
-            shapes = state_shape(learner)
-            program = jax.jit(learner.run, static_argnums=1, donate_argnums=0).lower(learner.place(shapes), chunk)
-        compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile), env.physics.compiler_options)
+        with spans.span("learner, lowered"):
+            shapes, programs = state_shape(learner), Programs(run, learner)
+            given, options = (learner.place(shapes),), env.physics.compiler_options
+            program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
+        compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
         if env.cfg.scene.cameras:
             starting.result()
-        with spans.span("evaluation, traced"):
-            evaluate = Evaluator(run, learner)
+        with spans.span("evaluation, lowered"):
+            evaluate = Evaluator(run, learner, programs)
             compiler = evaluate.compiler(shapes)
         evaluating = side_by_side.submit(spans.timed("evaluation, compiled", compiler))
         physics.result()  # if memory is short, its error says how many environments fit
-        state, advance = starting.result(), compiling.result()
-        device_memory.check_compiled(learner, advance)
+        state, made = starting.result(), compiling.result()
+        device_memory.check_compiled(learner, made)
         evaluating.result()
-    return Compiled(learner, chunk, advance, state, evaluate, time.perf_counter() - begun, spans.found)
+    return Compiled(learner, chunk, made, state, evaluate, time.perf_counter() - begun, spans.found)
 
 
 def _after(first: concurrent.futures.Future | None, start: Callable[[], Any]) -> Any:

@@ -1,7 +1,7 @@
-"""The expert's episodes, kept between runs in the user's cache: to trace and play them again takes seconds of every start.
+"""Results that take seconds of every start, kept between runs in the user's cache: an expert's episodes, and lowered programs.
 
-They are a pure function of the task, the seed, the program and the machine, which all are in the name of their file. A task with
-code from outside of the package is not kept, because nothing says when that code changes.
+They are pure functions of the task, the package and the machine, which all are in the names of their files. A task with code from
+outside of the package is not kept, because nothing says when that code changes.
 """
 
 import contextlib
@@ -20,10 +20,10 @@ import jax
 
 from mjx_nero.errors import UserError
 from mjx_nero.files import cache
-from mjx_nero.learn import checkpoint, device_memory
+from mjx_nero.learn import checkpoint, device_memory, machines
 from mjx_nero.sim.robot import ASSETS
 
-ROOM = 1_000_000_000  # bytes in all; most files have 10 MB, those of 256 long episodes 200 MB
+ROOM = 1_000_000_000  # bytes of a folder; programs have 1 MB, most episodes 10 MB, 256 long ones 200 MB
 _HERE = pathlib.Path(__file__).parents[1]
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 _SETTINGS = ("XLA_", "JAX_ENABLE", "JAX_DEFAULT", "JAX_NUMPY")  # environment variables that may change a number
@@ -34,34 +34,42 @@ class Outside(Exception):
 
 
 class Shelf:
-    """The kept results of a function on this machine, by seed. Nothing is kept if the function cannot be described.
+    """The kept results of a function on this machine, by name. Nothing is kept if the function cannot be described.
 
     Args:
+        kind: name of their folder in the cache.
         what: configs, numbers and texts that describe the function.
     """
 
-    def __init__(self, *what: Any):
+    def __init__(self, kind: str, *what: Any):
         folder = cache.folder()
         try:
-            self._base = folder / "experts" / _fingerprint(what) if folder else None
+            self._base = folder / kind / _fingerprint(what) if folder else None
         except (Outside, ImportError, OSError, TypeError):  # an ImportError: a package without metadata
             self._base = None
 
-    def read(self, seed: int, template: Callable[[], Any]) -> tuple[Any, dict[str, Any]] | None:
-        """Reads what ``write`` has written, as a tree like the one that ``template`` makes; None if it is missing or damaged."""
-        path = self._path(seed)
+    def __bool__(self) -> bool:
+        """False if nothing is kept."""
+        return self._base is not None
+
+    def read(self, name: int | str, template: Callable[[dict[str, Any]], Any]) -> tuple[Any, dict[str, Any]] | None:
+        """Reads what ``write`` has written, as a tree like the one that ``template`` makes of the description; None if it is
+        missing or damaged."""
+        path = self._path(name)
         if path is None or not path.is_file():
             return None
         try:
-            found = jax.device_get(checkpoint.load(path, template())), checkpoint.load_meta(path)
+            about = checkpoint.load_meta(path)
+            with jax.default_device(machines.processor()):  # a GPU's first array takes seconds
+                found = jax.device_get(checkpoint.load(path, template(about)))
             path.touch()
-            return found
+            return found, about
         except (UserError, OSError):
             return None
 
-    def write(self, seed: int, tree: Any, meta: dict[str, Any]) -> None:
+    def write(self, name: int | str, tree: Any, meta: dict[str, Any]) -> None:
         """Keeps a tree of arrays, unless the disk is full. Files that were not read for a long time make room for it."""
-        path, left = self._path(seed), ROOM - device_memory.size(tree)
+        path, left = self._path(name), ROOM - device_memory.size(tree)
         if path is None or left < 0:
             return
         with contextlib.suppress(UserError, OSError):
@@ -72,8 +80,8 @@ class Shelf:
                     old.unlink()
             checkpoint.save(path, tree, meta)
 
-    def _path(self, seed: int) -> pathlib.Path | None:
-        return self._base and self._base.with_name(f"{self._base.name}-{seed}.safetensors")
+    def _path(self, name: int | str) -> pathlib.Path | None:
+        return self._base and self._base.with_name(f"{self._base.name}-{name}.safetensors")
 
 
 def _fingerprint(what: Sequence[Any]) -> str:

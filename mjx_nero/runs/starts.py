@@ -147,7 +147,7 @@ class _Player:
         self._name = next(iter(own.cfg.controllers), "")
         self.able = bool(self._name) and _milestone(own.cfg) is not None
         # Here, where nothing traces: each look at a file gives Python's lock away, and a thread that traces keeps it for 5 ms.
-        self._kept = kept.Shelf(own.cfg, control.CONTROLLERS.get(self._name), count)
+        self._kept = kept.Shelf("experts", own.cfg, control.CONTROLLERS.get(self._name), count)
 
     def __call__(self, seed: int) -> tuple[Way, Shown, float]:
         """Returns the episodes, their steps, and how long it took without compilation [s].
@@ -156,7 +156,7 @@ class _Player:
             UserError: the task has no expert.
         """
         begun, cfg = time.perf_counter(), self._own.cfg
-        if read := self._kept.read(seed, self.shapes):
+        if read := self._kept.read(seed, lambda _: self.shapes()):
             (*arrays, shown), about = read
             return Way(*arrays, **about), shown, time.perf_counter() - begun
         run, env = self._compiled

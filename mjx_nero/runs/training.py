@@ -23,6 +23,7 @@ from mjx_nero.runs.checkpoints import Checkpoints, NotWritten, saved
 from mjx_nero.runs.compiled import Compiled
 from mjx_nero.runs.logs import Logs
 from mjx_nero.runs.loop import Loop, Tally
+from mjx_nero.runs.programs import Programs
 
 __all__ = ["RunCfg", "carry_out", "describe", "film", "fit_machine", "learner_cfg", "prepare", "resolve", "speaker", "train"]
 
@@ -67,8 +68,8 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             say(note)
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
-        bank = starts.Maker(learner, say, new=source is None)
-        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank), folder)
+        bank, programs = starts.Maker(learner, say, new=source is None), Programs(run, learner)
+        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank, programs), folder)
         return carry_out(run, made, tally, meta, folder, command)
 
 

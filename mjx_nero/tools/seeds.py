@@ -17,6 +17,7 @@ from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs import folder as run_folder
 from mjx_nero.runs.cfg import RunCfg, fit_machine
 from mjx_nero.runs.loop import Diverged, Tally
+from mjx_nero.runs.programs import Programs
 
 SEEDS = "seeds.json"
 Row = dict[str, Any]
@@ -62,7 +63,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
                 raise UserError(f"{home} already holds a run: pass other --seeds or another --out, or --restore {home} alone")
         if note:
             say(note)
-        start = compiled.starter(learner, starts.Maker(learner, say))
+        start = compiled.starter(learner, starts.Maker(learner, say), Programs(run, learner))
         made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):

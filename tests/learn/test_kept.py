@@ -28,13 +28,13 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "mjx_nero" / "experts"
 
 
-def like():
+def like(about=None):
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), TREE)
 
 
 def test_what_was_written_is_read_by_a_later_process(folder):
-    kept.Shelf(env_cfg("nero_lift"), 64).write(3, TREE, {"won": 0.27})
-    tree, meta = kept.Shelf(env_cfg("nero_lift"), 64).read(3, like)
+    kept.Shelf("experts", env_cfg("nero_lift"), 64).write(3, TREE, {"won": 0.27})
+    tree, meta = kept.Shelf("experts", env_cfg("nero_lift"), 64).read(3, like)
     assert meta == {"won": 0.27} and all(isinstance(x, np.ndarray) for x in tree.values())
     assert all(np.array_equal(TREE[name], tree[name]) and TREE[name].dtype == tree[name].dtype for name in TREE)
     assert len(list(folder.iterdir())) == 1
@@ -42,11 +42,11 @@ def test_what_was_written_is_read_by_a_later_process(folder):
 
 def test_another_task_number_or_seed_finds_nothing():
     cfg = env_cfg("nero_lift")
-    kept.Shelf(cfg, 64).write(3, TREE, {})
-    assert kept.Shelf(cfg, 64).read(4, like) is None
-    assert kept.Shelf(cfg, 32).read(3, like) is None
-    assert kept.Shelf(env_cfg("nero_lift", **{"rewards.holding_object.weight": 7.0}), 64).read(3, like) is None
-    assert kept.Shelf(env_cfg("piper_lift"), 64).read(3, like) is None
+    kept.Shelf("experts", cfg, 64).write(3, TREE, {})
+    assert kept.Shelf("experts", cfg, 64).read(4, like) is None
+    assert kept.Shelf("experts", cfg, 32).read(3, like) is None
+    assert kept.Shelf("experts", env_cfg("nero_lift", **{"rewards.holding_object.weight": 7.0}), 64).read(3, like) is None
+    assert kept.Shelf("experts", env_cfg("piper_lift"), 64).read(3, like) is None
 
 
 def test_a_changed_file_finds_nothing(tmp_path, monkeypatch):
@@ -59,17 +59,17 @@ def test_a_changed_file_finds_nothing(tmp_path, monkeypatch):
     for file in (code, mesh):
         file.write_text("one")
     for changed in (code, mesh):
-        kept.Shelf(str(mesh.parent)).write(0, TREE, {})
-        assert kept.Shelf(str(mesh.parent)).read(0, like)
+        kept.Shelf("experts", str(mesh.parent)).write(0, TREE, {})
+        assert kept.Shelf("experts", str(mesh.parent)).read(0, like)
         changed.write_text("more")
-        assert kept.Shelf(str(mesh.parent)).read(0, like) is None
+        assert kept.Shelf("experts", str(mesh.parent)).read(0, like) is None
 
 
 def test_another_setting_of_xla_finds_nothing(monkeypatch):
-    kept.Shelf("x").write(0, TREE, {})
+    kept.Shelf("experts", "x").write(0, TREE, {})
     kept._machine.cache_clear()
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=1")
-    assert kept.Shelf("x").read(0, like) is None
+    assert kept.Shelf("experts", "x").read(0, like) is None
     kept._machine.cache_clear()
 
 
@@ -82,19 +82,22 @@ def test_code_from_outside_is_not_kept(func, folder):
     """Nothing says when a user's function changes."""
     cfg = env_cfg("nero_lift")
     cfg = dataclasses.replace(cfg, rewards={**cfg.rewards, "mine": RewardTerm(func, weight=1.0)})
-    kept.Shelf(cfg).write(0, TREE, {})
-    assert kept.Shelf(cfg).read(0, like) is None and not folder.exists()
+    kept.Shelf("experts", cfg).write(0, TREE, {})
+    assert kept.Shelf("experts", cfg).read(0, like) is None and not folder.exists()
 
 
 def test_what_a_partial_holds_counts():
     at = CONTROLLERS["pick_up"][0]
-    kept.Shelf(functools.partial(at, 1)).write(0, TREE, {})
-    assert kept.Shelf(functools.partial(at, 1)).read(0, like) and kept.Shelf(functools.partial(at, 2)).read(0, like) is None
+    kept.Shelf("experts", functools.partial(at, 1)).write(0, TREE, {})
+    assert (
+        kept.Shelf("experts", functools.partial(at, 1)).read(0, like)
+        and kept.Shelf("experts", functools.partial(at, 2)).read(0, like) is None
+    )
 
 
 @pytest.mark.parametrize("damage", [lambda x: x[:-9], lambda x: x[:-9] + b"\1" + x[-8:], lambda x: b"", lambda x: b"\xff" * 99])
 def test_a_damaged_file_is_made_anew(damage, folder):
-    shelf = kept.Shelf("x")
+    shelf = kept.Shelf("experts", "x")
     shelf.write(0, TREE, {})
     (file,) = folder.iterdir()
     file.write_bytes(damage(file.read_bytes()))
@@ -104,14 +107,14 @@ def test_a_damaged_file_is_made_anew(damage, folder):
 
 
 def test_a_tree_of_another_form_is_made_anew():
-    shelf = kept.Shelf("x")
+    shelf = kept.Shelf("experts", "x")
     shelf.write(0, TREE, {})
-    assert shelf.read(0, lambda: {**like(), "c": np.zeros(3)}) is None
-    assert shelf.read(0, lambda: {**like(), "a": np.zeros((2, 4), np.float32)}) is None
+    assert shelf.read(0, lambda _: {**like(), "c": np.zeros(3)}) is None
+    assert shelf.read(0, lambda _: {**like(), "a": np.zeros((2, 4), np.float32)}) is None
 
 
 def test_the_files_that_nobody_reads_go(folder, monkeypatch):
-    shelf = kept.Shelf("x")
+    shelf = kept.Shelf("experts", "x")
     for seed in range(2):
         shelf.write(seed, TREE, {})
         (file,) = folder.glob(f"*-{seed}.safetensors")
@@ -123,7 +126,7 @@ def test_the_files_that_nobody_reads_go(folder, monkeypatch):
 
 
 def test_a_large_tree_a_full_disk_and_no_cache_keep_nothing(folder, monkeypatch):
-    shelf = kept.Shelf("x")
+    shelf = kept.Shelf("experts", "x")
     with monkeypatch.context() as small:
         small.setattr(kept, "ROOM", 10)
         shelf.write(0, TREE, {})
@@ -136,8 +139,8 @@ def test_a_large_tree_a_full_disk_and_no_cache_keep_nothing(folder, monkeypatch)
         shelf.write(0, TREE, {})
     assert shelf.read(0, like) is None and not list(folder.glob("*"))
     monkeypatch.setattr(cache, "folder", lambda: None)
-    kept.Shelf("x").write(0, TREE, {})
-    assert kept.Shelf("x").read(0, like) is None
+    kept.Shelf("experts", "x").write(0, TREE, {})
+    assert kept.Shelf("experts", "x").read(0, like) is None
 
 
 @pytest.mark.slow

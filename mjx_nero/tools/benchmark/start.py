@@ -15,6 +15,7 @@ from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory
 from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
 
@@ -84,8 +85,8 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         learner = compiled.make_learner(run)
         device_memory.check(learner)
     before = time.time() - spawned
-    bank = starts.Maker(learner, training.speaker())
-    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank)(0), pathlib.Path("start"))
+    bank, programs = starts.Maker(learner, training.speaker()), Programs(run, learner)
+    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank, programs)(0), pathlib.Path("start"))
     with spans.span("first evaluation"):
         made.evaluate(made.state)
     with spans.span("first iterations"):
