@@ -25,9 +25,9 @@ def learner(run):
     return _learners[key]
 
 
-def starter(learner, bank):
+def starter(learner, bank, programs=None):
     if id(learner) not in _starters:
-        _starters[id(learner)] = _start(learner, bank)
+        _starters[id(learner)] = _start(learner, bank, programs)
     return _starters[id(learner)]
 
 
