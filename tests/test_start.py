@@ -20,6 +20,7 @@ from mjx_nero.learn import checkpoint
 from mjx_nero.learn.learner import state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import cfg, compiled, starts
+from mjx_nero.runs.programs import Programs
 from mjx_nero.sim import physics
 from mjx_nero.tasks import registry
 
@@ -100,7 +101,7 @@ def test_the_evaluation_is_traced_beside_the_first_state(monkeypatch):
         return compiled.starter(learner)(0)
 
     monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
-    made = compiled.compile(run, learner, 1, start)
+    made = compiled.compile(run, learner, 1, start, Programs(run, learner))
     assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
 
 

@@ -143,12 +143,13 @@ def starter(learner: Learner, bank: starts.Maker | None = None, programs: Progra
     return lambda seed: learner.place(start(seed))
 
 
-def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any]) -> Compiled:
+def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any], programs: Programs) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile.
 
     Args:
         chunk: iterations per call.
         start: makes the first state, placed on the devices.
+        programs: where the run's programs are kept.
 
     Raises:
         UserError: the run does not fit into memory.
@@ -168,7 +169,7 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any])
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         with spans.span("learner, lowered"):
-            shapes, programs = state_shape(learner), Programs(run, learner)
+            shapes = state_shape(learner)
             given, options = (learner.place(shapes),), env.physics.compiler_options
             program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))

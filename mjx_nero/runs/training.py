@@ -69,7 +69,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
         bank, programs = starts.Maker(learner, say, new=source is None), Programs(run, learner)
-        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank, programs), folder)
+        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank, programs), folder, programs)
         return carry_out(run, made, tally, meta, folder, command)
 
 
@@ -106,12 +106,12 @@ def describe(run: RunCfg, learner: Learner) -> dict[str, Any]:
     return {**meta, "num_envs": run.num_envs}
 
 
-def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pathlib.Path) -> Compiled:
+def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pathlib.Path, programs: Programs) -> Compiled:
     """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
     with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl, jax.default_backend() == "cpu")):
-        made = compiled.compile(run, learner, chunk, start)
+        made = compiled.compile(run, learner, chunk, start, programs)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""
     speaker()(f"{folder}: compiled in {made.seconds:.0f} s; {learner.env.unwrapped.impl}, {run.num_envs} environments{spread}")
     return made

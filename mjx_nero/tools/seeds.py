@@ -63,8 +63,9 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
                 raise UserError(f"{home} already holds a run: pass other --seeds or another --out, or --restore {home} alone")
         if note:
             say(note)
-        start = compiled.starter(learner, starts.Maker(learner, say), Programs(run, learner))
-        made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder)
+        programs = Programs(run, learner)
+        start = compiled.starter(learner, starts.Maker(learner, say), programs)
+        made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder, programs)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):
             say(f"seed {seed}, {i + 1} of {len(seeds)}")

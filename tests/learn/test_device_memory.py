@@ -13,6 +13,7 @@ from mjx_nero.learn import device_memory
 from mjx_nero.learn.ppo.cfg import NetworkCfg
 from mjx_nero.learn.ppo.learner import Learner
 from mjx_nero.runs import cfg, compiled
+from mjx_nero.runs.programs import Programs
 from mjx_nero.sim.physics import Footprint
 
 
@@ -74,7 +75,7 @@ def test_what_lies_outside_of_jax_counts_too(monkeypatch):
         device_memory.check_outside(small)
     with pytest.raises(UserError, match="pass --num-envs 100 or fewer"):  # beside the programs, which are compiled meanwhile
         run = cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 512}, impl="native")
-        compiled.compile(dataclasses.replace(run, eval_episodes=2), small, 1, lambda: small.init(KEY))
+        compiled.compile(dataclasses.replace(run, eval_episodes=2), small, 1, lambda: small.init(KEY), Programs(run, small))
 
 
 def test_figures_of_the_message(monkeypatch):

@@ -11,6 +11,7 @@ import jax
 from mjx_nero.learn.learner import Learner
 from mjx_nero.runs import compiled, signals, starts, training
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.programs import Programs
 from mjx_nero.tools.benchmark.program import Row
 
 _EVALUATIONS = 24  # per full run, unless --eval-every is given
@@ -46,9 +47,9 @@ def measure_learning(run: RunCfg, seeds: int, target: float, kept: Sequence[Row]
 
 def _measured(run: RunCfg, learner: Learner, chunk: int, seeds: Sequence[int], target: float) -> Iterator[Row]:
     """Compiles the run once and trains these seeds."""
-    begun = time.perf_counter()
-    fresh = compiled.starter(learner, starts.Maker(learner, training.speaker()))
-    made = compiled.compile(run, learner, chunk, lambda: fresh(0))
+    begun, programs = time.perf_counter(), Programs(run, learner)
+    fresh = compiled.starter(learner, starts.Maker(learner, training.speaker()), programs)
+    made = compiled.compile(run, learner, chunk, lambda: fresh(0), programs)
     with signals.after_this(training.speaker()) as stop:
         state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call
         made.evaluate(state)

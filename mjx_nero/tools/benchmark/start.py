@@ -86,7 +86,7 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         device_memory.check(learner)
     before = time.time() - spawned
     bank, programs = starts.Maker(learner, training.speaker()), Programs(run, learner)
-    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank, programs)(0), pathlib.Path("start"))
+    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank, programs)(0), pathlib.Path("start"), programs)
     with spans.span("first evaluation"):
         made.evaluate(made.state)
     with spans.span("first iterations"):
