@@ -103,7 +103,7 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
     """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank.
 
     Args:
-        programs: where that program is kept; None: nowhere.
+        programs: where that program and the state are kept; None: nowhere.
     """
 
     def init(key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
@@ -123,12 +123,20 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
+        names = bank.names if bank else ()
+        if programs and (kept := programs.state(learner, seed, names)):
+            if bank:
+                bank.say(f"the first state of seed {seed} is the one that an earlier run made")
+            return kept
         with _threads() as beside:
             compiling = beside.submit(expected)
             given = bank(seed) if bank else {}
             shapes, program = compiling.result()
         make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
-        return make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
+        state = make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
+        if programs:
+            programs.keep(state, seed, names)
+        return state
 
     return start
 

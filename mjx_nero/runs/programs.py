@@ -1,7 +1,8 @@
-"""A run's programs as JAX lowers them, kept between runs: to trace them takes seconds of every start, under Python's lock.
+"""A run's programs as JAX lowers them, and its first state, kept between runs.
 
-JAX's own cache keeps what XLA makes of them. A program has the same form whether it was traced or read, so that JAX finds it
-there.
+To trace the programs takes seconds of every start, under Python's lock. JAX's own cache keeps what XLA makes of them. A program
+has the same form whether it was traced or read, so that JAX finds it there. The first state is a pure function of the run and its
+seed; to clone an expert for it takes more than ten seconds on two cores.
 """
 
 from collections.abc import Callable
@@ -12,19 +13,21 @@ import numpy as np
 from jax import export
 
 from mjx_nero.envs.env import ManipulationEnv
-from mjx_nero.learn import machines
-from mjx_nero.learn.learner import Learner
+from mjx_nero.learn import device_memory, machines
+from mjx_nero.learn.learner import Learner, state_shape
 from mjx_nero.runs import kept
 from mjx_nero.runs.cfg import RunCfg
 
 # What a program computes of its arguments: a tree whose form is known without tracing, and arrays by name.
 Function = Callable[..., tuple[Any, dict[str, jax.Array]]]
+_LARGEST = kept.ROOM / 10  # bytes of a first state; that of a lift with 8,192 environments has 20 MB
 # What ``export`` raises if it cannot serialize a program, or has not all that it needs for that.
 _REFUSED = (ValueError, TypeError, NotImplementedError, ImportError)
 
 
 class Programs:
-    """The programs of a run. Those are not kept that draw pictures, run on several devices, or call code from outside."""
+    """The programs and first states of a run. Nothing is kept that draws pictures, runs on several devices, or calls code from
+    outside."""
 
     def __init__(self, run: RunCfg, learner: Learner):
         env = learner.env.unwrapped
@@ -33,6 +36,20 @@ class Programs:
             # A run's seed and outputs are no part of its programs.
             parts = type(learner), type(env), type(env.physics), env.impl, run.env, env.cfg, run.hyperparameters
             self._shelf = kept.Shelf("programs", *parts, run.num_envs, machines.versions(), _settings())
+
+    def state(self, learner: Learner, seed: int, names: tuple[str, ...]) -> Any:
+        """Returns the first state that an earlier run has made from a seed; None if there is none.
+
+        Args:
+            names: what an expert gave for it.
+        """
+        read = self._shelf.read(_state_name(seed, names), lambda _: state_shape(learner)) if self._shelf else None
+        return read and jax.device_put(read[0])
+
+    def keep(self, state: Any, seed: int, names: tuple[str, ...]) -> None:
+        """Keeps a first state, unless it is too large."""
+        if self._shelf and device_memory.size(state) <= _LARGEST:
+            self._shelf.write(_state_name(seed, names), state, {})
 
     def lower(
         self,
@@ -56,6 +73,10 @@ class Programs:
         """
         whole = _kept(self._shelf, name, function, args, tree, env) if self._shelf else None
         return jax.jit(whole or function, donate_argnums=donate, compiler_options=options).lower(*args)
+
+
+def _state_name(seed: int, names: tuple[str, ...]) -> str:
+    return "-".join(("state", *names, str(seed)))
 
 
 def _kept(

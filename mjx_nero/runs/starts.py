@@ -75,7 +75,7 @@ class Maker:
     """
 
     def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True):
-        self._say = say
+        self.say = say
         self._begins = isinstance(learner.env, wrappers.ExpertStarts)
         self._imitates = new and getattr(learner, "imitates", False)
         self._player: _Player | None = None
@@ -91,16 +91,21 @@ class Maker:
             with jax.default_device(processor()):
                 found, shown, seconds = self._player(seed)
         except UserError as error:
-            self._say(f"no expert demonstrates: {error}")
+            self.say(f"no expert demonstrates: {error}")
             return {}
         did = f"the scripted expert grasps in {found.held:.0%} and succeeds in {found.won:.0%} of {len(found.ends)} noisy tries"
         uses = [f"{'some' if found.enough else 'no'} episodes start from its states"] if self._begins else []
         uses += ["it is imitated" if found.enough else "it is not imitated"] if self._imitates else []
-        self._say(f"{did}: {', '.join(uses)} ({seconds:.1f} s)")
+        self.say(f"{did}: {', '.join(uses)} ({seconds:.1f} s)")
         if not found.enough:
             return {}
         n, k = self._sizes
         return self._asked(lambda: rows(found, n, wrappers.PHASES, seed), lambda: steps(found, shown, k, seed))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What it makes if the expert can do the task."""
+        return (*(("bank",) if self._begins else ()), *(("shown",) if self._imitates else ()))
 
     def shapes(self) -> dict[str, Any]:
         """Returns the shapes of what it makes if the expert can do the task."""

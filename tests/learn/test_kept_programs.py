@@ -69,7 +69,7 @@ def read_or_lowered(run, learner=None):
 @pytest.mark.slow
 def test_a_later_start_traces_nothing_and_computes_the_same(traced, folder, monkeypatch):
     first, told, evaluation = started(asked())
-    assert sorted(traced) == WHOLE and len(list(folder.iterdir())) == 3
+    assert sorted(traced) == WHOLE and len(list(folder.iterdir())) == 4  # three programs and the state
     memory = first.advance.memory_analysis()
     assert memory.alias_size_in_bytes > 0.9 * sum(x.nbytes for x in jax.tree.leaves(first.learner.init(jax.random.PRNGKey(0))))
 
@@ -84,6 +84,32 @@ def test_a_later_start_traces_nothing_and_computes_the_same(traced, folder, monk
     monkeypatch.setattr(kept.cache, "folder", lambda: None)
     _, without, evaluated = started(asked())
     assert without == told and evaluated == evaluation and sorted(traced) == WHOLE
+
+
+@pytest.mark.slow
+def test_the_first_state_of_a_seed_is_kept(folder, monkeypatch):
+    lowered, lower = [], programs.Programs.lower
+
+    def noted(self, name, *rest, **options):
+        lowered.append(name.partition("-")[0])
+        return lower(self, name, *rest, **options)
+
+    monkeypatch.setattr(programs.Programs, "lower", noted)
+    run = asked()
+    _, told, _ = started(run)
+    assert sorted(lowered) == ["evaluation", "init", "run"]
+    (state,) = folder.glob("*-state-0.safetensors")
+    lowered.clear()
+    assert started(run)[1] == told and sorted(lowered) == ["evaluation", "run"]
+    data = state.read_bytes()
+    state.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
+    lowered.clear()
+    assert started(run)[1] == told and "init" in lowered
+    assert state.read_bytes() == data
+    assert started(dataclasses.replace(run, seed=7))[1] != told and len(list(folder.glob("*-state-7.safetensors"))) == 1
+    monkeypatch.setattr(programs, "_LARGEST", 10)
+    started(dataclasses.replace(run, seed=8))
+    assert not list(folder.glob("*-state-8.safetensors"))
 
 
 def test_what_a_program_depends_on(traced, folder, monkeypatch, tmp_path):

@@ -46,7 +46,7 @@ def test_equal_physics_have_one_text_whatever_was_traced_before():
 
 
 @pytest.mark.slow
-def test_a_program_that_was_not_traced_here_calls_its_own_physics():
+def test_a_program_read_from_its_bytes_calls_its_own_physics():
     """Two models of the same sizes: their programs differ in nothing but the name of the operation."""
     env, _ = made("nero_reach")
     sim = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
