@@ -26,8 +26,10 @@ _REFUSED = (ValueError, TypeError, NotImplementedError, ImportError)
 
 
 class Programs:
-    """The programs and first states of a run. Nothing is kept that draws pictures, runs on several devices, or calls code from
-    outside."""
+    """The programs and first states of a run.
+
+    Nothing is kept of a run that draws pictures, takes several devices, or calls code from outside of the package.
+    """
 
     def __init__(self, run: RunCfg, learner: Learner):
         env = learner.env.unwrapped
@@ -44,7 +46,7 @@ class Programs:
             names: what an expert gave for it.
         """
         read = self._shelf.read(_state_name(seed, names), lambda _: state_shape(learner)) if self._shelf else None
-        return read and jax.device_put(read[0])
+        return jax.device_put(read[0]) if read else None
 
     def keep(self, state: Any, seed: int, names: tuple[str, ...]) -> None:
         """Keeps a first state, unless it is too large."""
