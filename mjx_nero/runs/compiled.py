@@ -123,7 +123,7 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
-        names = bank.names if bank else ()
+        names = bank.names if programs and bank else ()
         if programs and (kept := programs.state(learner, seed, names)) is not None:
             if bank:
                 bank.say(f"the first state of seed {seed} is the one that an earlier run made")
