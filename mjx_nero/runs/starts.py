@@ -104,7 +104,7 @@ class Maker:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What it makes if the expert can do the task."""
+        """Names of what it makes if the expert can do the task."""
         return (*(("bank",) if self._begins else ()), *(("shown",) if self._imitates else ()))
 
     def shapes(self) -> dict[str, Any]:
