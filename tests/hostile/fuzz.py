@@ -32,6 +32,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import urdf_files as make  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
+from matplotlib import font_manager  # noqa: E402
 
 from mjx_nero import UserError, config, files  # noqa: E402
 from mjx_nero.control import rmpflow_config  # noqa: E402
@@ -418,6 +419,7 @@ def _small_policy() -> bytes:
 _RUNS = ("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 _OWN = (sys.prefix, sys.base_prefix, str(HERE.parents[1]), "/proc/", "/sys/", "/dev/null", "/dev/urandom")
 _OWN += (matplotlib.get_cachedir(), matplotlib.get_configdir())  # where it keeps its list of fonts
+_OWN += tuple({os.path.dirname(font.fname) for font in font_manager.fontManager.ttflist})  # some are the system's
 _watched: list[str] = []  # the folder of the file that is being judged, while one is
 _seen: list[str] = []
 
