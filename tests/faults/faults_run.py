@@ -31,9 +31,9 @@ def starter(learner, bank, programs=None):
     return _starters[id(learner)]
 
 
-def compile(run, learner, chunk, start):
+def compile(run, learner, chunk, start, programs):
     if (id(learner), chunk) not in _programs:
-        _programs[id(learner), chunk] = _compile(run, learner, chunk, start)
+        _programs[id(learner), chunk] = _compile(run, learner, chunk, start, programs)
     return dataclasses.replace(_programs[id(learner), chunk], state=start())
 
 

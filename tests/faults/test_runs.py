@@ -279,8 +279,8 @@ def diverging(monkeypatch, at, spoil):
     """Spoils what ``advance`` gives at its calls number ``at``."""
     calls = []
 
-    def compile(run, learner, chunk, start, original=compiled.compile):
-        made = original(run, learner, chunk, start)
+    def compile(*given, original=compiled.compile):
+        made = original(*given)
 
         def advance(state):
             calls.append(1)

@@ -180,6 +180,7 @@ class Runs:
     """A learner of ten steps an iteration that only counts, and an evaluator that reads its success from a list a seed."""
 
     steps_per_iteration = 10
+    num_devices = 2  # programs of several devices are not kept
     env = types.SimpleNamespace(unwrapped=types.SimpleNamespace(impl="native"))
 
     def __init__(self, success):
@@ -193,7 +194,7 @@ class Runs:
         return {**state, "iteration": state["iteration"] + iterations}, {"sum/nan": nans, "sum/overflow": jnp.zeros(())}
 
     @staticmethod
-    def compiled(run, runs, chunk, start):
+    def compiled(run, runs, chunk, start, programs):
         return compiled.Compiled(runs, chunk, lambda state: runs.run(state, chunk), start(), runs.evaluate, 0.0)
 
     def evaluate(self, state):
