@@ -105,7 +105,8 @@ def test_the_first_state_of_a_seed_is_kept(folder, monkeypatch):
     state.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
     lowered.clear()
     assert started(run)[1] == told and "init" in lowered
-    assert state.read_bytes() == data
+    lowered.clear()
+    assert started(run)[1] == told and "init" not in lowered
     assert started(dataclasses.replace(run, seed=7))[1] != told and len(list(folder.glob("*-state-7.safetensors"))) == 1
     monkeypatch.setattr(programs, "_LARGEST", 10)
     started(dataclasses.replace(run, seed=8))
