@@ -5,7 +5,6 @@ import contextlib
 import copy
 import dataclasses
 import functools
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -116,15 +115,14 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         given = bank.shapes() if bank else {}
         args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
         if programs:
-            name = f"init-{hashlib.sha256(repr(_shapes(given)).encode()).hexdigest()[:16]}"
+            name = "-".join(("init", *_names(bank)))
             lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=untuned)
         else:
             lowered = jax.jit(init, compiler_options=untuned).lower(*args)
         return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
-        names = bank.names if programs and bank else ()
-        if programs and (kept := programs.state(learner, seed, names)) is not None:
+        if programs and (kept := programs.state(learner, seed, _names(bank))) is not None:
             if bank:
                 bank.say(f"the first state of seed {seed} is the one that an earlier run made")
             return kept
@@ -135,10 +133,15 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
         state = make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
         if programs:
-            programs.keep(state, seed, names)
+            programs.keep(state, seed, _names(bank))
         return state
 
     return start
+
+
+def _names(bank: starts.Maker | None) -> tuple[str, ...]:
+    """Returns the names of what an expert gives a first state, which with the run and its seed decide what state that is."""
+    return bank.names if bank else ()
 
 
 def _shapes(tree: Any) -> Any:

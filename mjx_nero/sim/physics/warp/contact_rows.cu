@@ -38,7 +38,8 @@ if (contact >= in.nacon.data[0] || !(in.contact_type.data[contact] & CONSTRAINT)
 const float gap = in.contact_dist.data[contact] - in.contact_includemargin.data[contact];
 if (gap >= 0.0f) return;
 const int world = in.contact_worldid.data[contact], dim = in.contact_dim.data[contact];
-const int rows = ELLIPTIC || dim == 1 ? dim : 2 * (dim - 1);
+const bool pyramid = !ELLIPTIC && dim > 1;
+const int rows = pyramid ? 2 * (dim - 1) : dim;
 const int* geoms = (const int*)(in.contact_geom.data + contact);
 auto moves = [](int geom) { return (unsigned long long)(unsigned)MOVES_HIGH[geom] << 32 | (unsigned)MOVES_LOW[geom]; };
 const unsigned long long second = moves(geoms[1]), moved = moves(geoms[0]) ^ second;  // what moves both moves neither to the other
@@ -83,8 +84,7 @@ for (int i = lane; fits && i < NV; i += lanes) {
     UNROLLED
     for (int k = 0; k < MOST; ++k) {
         if (k >= fit) break;
-        const bool cone = ELLIPTIC || dim == 1;
-        const float entry = k == 0 && cone ? normal : cone ? along(k) : normal + (k % 2 ? -1 : 1) * friction[k / 2] * along(k / 2 + 1);
+        const float entry = pyramid ? normal + (k % 2 ? -1 : 1) * friction[k / 2] * along(k / 2 + 1) : along(k);
         J[k * apart + e] = entry, velocity[k] += entry * speed;
         if (SPARSE) in.efc_J_colind.data[(size_t)world * in.efc_J_colind.shape[1] * in.efc_J_colind.shape[2] + start + k * apart + e] = i;
     }
@@ -118,7 +118,7 @@ const float* invweight = (const float*)((const char*)in.body_invweight0.data +
                                         (size_t)(world % in.body_invweight0.shape[0]) * in.body_invweight0.strides[0]);
 const float shrink = in.impratio_invsqrt.data[world % in.impratio_invsqrt.shape[0]], mu = friction[0];
 float A = invweight[2 * BODY[geoms[0]]] + invweight[2 * BODY[geoms[1]]];
-if (!ELLIPTIC && dim > 1) A = (A + mu * mu * A) * 2.0f * mu * mu * shrink * shrink;
+if (pyramid) A = (A + mu * mu * A) * 2.0f * mu * mu * shrink * shrink;
 const float D = 1.0f / atleast(A * (1.0f - imp) / imp);
 UNROLLED
 for (int k = 0; k < MOST; ++k) {
