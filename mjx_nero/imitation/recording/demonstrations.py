@@ -1,7 +1,8 @@
 """Demonstrations: episodes that an agent plays side by side, as episodes of a data set.
 
-An episode depends only on its number and the seed, so each can be replayed. Noise on the agent's actions takes it to states that
-it would not reach by itself. The executed action is kept beside its label, the action without noise (Laskey et al. 2017, DART).
+An episode depends only on its number and the seed, so each can be replayed. Its last digits also depend on how many are played
+side by side: XLA rounds products of another number of rows differently. Noise on the agent's actions takes it to states that it
+would not reach by itself. The executed action is kept beside its label, the action without noise (Laskey et al. 2017, DART).
 """
 
 import dataclasses

@@ -41,7 +41,7 @@ class DemosCfg:
             GPU.
         form: lerobot (LeRobotDataset v3.0, the extra demos) or arrays (safetensors).
         task: sentence that says what the robot does (default: the environment's).
-        side_by_side: number of episodes played at once and written as one piece.
+        side_by_side: number of episodes played at once and written as one piece; episodes' last digits depend on it.
     """
 
     env_name: str
