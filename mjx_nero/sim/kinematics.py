@@ -5,6 +5,7 @@ of a few joints is cheap to compute wherever it is read. So terms see poses cons
 after a reset, and controllers need neither a simulator nor its data.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -18,8 +19,11 @@ from mjx_nero import math
 from mjx_nero.sim import linkage, quats
 
 Pose = tuple[Float[Array, "3"], Float[Array, "4"]]
+Poses = tuple[Float[Array, "3 _"], Float[Array, "4 _"]]  # a column each
+Transform = tuple[np.ndarray, np.ndarray]
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _STILL = np.array([1.0, 0.0, 0.0, 0.0])
+_NOWHERE: Transform = (np.zeros(3), _STILL)
 _ITSELF = (0.0, 1.0)
 
 
@@ -27,11 +31,31 @@ class _Node(NamedTuple):
     """A moving joint, with its frame at the anchor."""
 
     driver: int  # place in q of the joint that moves it: itself, or the one that it follows
-    parent: int  # node that carries it; -1: the world
-    fixed: tuple[np.ndarray, np.ndarray]  # transform from there
+    parent: int  # node that carries it; 0: the world
+    fixed: Transform  # from there
     axis: np.ndarray
     slide: bool
     powers: tuple[float, ...]  # its offset from qpos0, as a polynomial in the driver's offset
+
+
+_WORLD = _Node(-1, 0, _NOWHERE, np.zeros(3), False, (0.0,))
+
+
+class _Links:
+    """Transforms of nodes from what carries them, one column per node, as functions of their offsets."""
+
+    def __init__(self, nodes: Sequence[_Node]):
+        # position + slide * off, and quaternion * cos(half off) + turned * sin(half off)
+        slides = np.array([node.slide for node in nodes])
+        self._position, self._quaternion = _columns([node.fixed for node in nodes])
+        slide, turned = _columns([_moves(node.axis, node.fixed[1]) for node in nodes])
+        self._slide, self._turned, self._half = slide * slides, turned * ~slides, np.float32(0.5) * ~slides
+
+    def at(self, off: Float[Array, " n"]) -> Poses:
+        """Computes the transforms; ``off`` are distances from ``qpos0`` [rad or m]."""
+        angle = off * self._half
+        quat = jnp.asarray(self._quaternion) * jnp.cos(angle) + self._turned * jnp.sin(angle)
+        return jnp.asarray(self._position) + self._slide * off, quat
 
 
 class Chain:
@@ -63,21 +87,16 @@ class Chain:
         limited = model.jnt_limited[ids].astype(bool)
         self.lower = np.where(limited, model.jnt_range[ids, 0], -np.inf).astype(np.float32)
         self.upper = np.where(limited, model.jnt_range[ids, 1], np.inf).astype(np.float32)
-        self._nodes: list[_Node] = []
+        self._nodes = [_WORLD]
         self._qpos0 = np.array(model.qpos0[model.jnt_qposadr[ids]], np.float32)  # where a joint displaces nothing
         self._moved = _moved(model, ids)
-        self._last: dict[int, tuple[int, tuple[np.ndarray, np.ndarray]]] = {0: (-1, (np.zeros(3), _STILL))}
+        self._last: dict[int, tuple[int, Transform]] = {0: (0, _NOWHERE)}
         self._model = model
         self._ends = [self._end(name) for name in frames]
-        # path[f, n]: node n moves frame f
-        self._path = np.zeros((len(self.frames), len(self._nodes)), np.float32)
-        for f, (node, _) in enumerate(self._ends):
-            while node >= 0:
-                self._path[f, node] = 1.0
-                node = self._nodes[node].parent
         del self._model, self._last, self._moved
+        self._tabulate()
 
-    def _body(self, body: int, frame: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+    def _body(self, body: int, frame: str) -> tuple[int, Transform]:
         """Returns the node that carries a body and the fixed transform from there. Adds nodes on the way."""
         if body in self._last:
             return self._last[body]
@@ -95,7 +114,7 @@ class Chain:
         self._last[body] = node, fixed
         return node, fixed
 
-    def _end(self, name: str) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+    def _end(self, name: str) -> tuple[int, Transform]:
         m = self._model
         site = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SITE, name)
         if site < 0:
@@ -103,50 +122,73 @@ class Chain:
         node, fixed = self._body(int(m.site_bodyid[site]), name)
         return node, _compose(fixed, (m.site_pos[site], m.site_quat[site]))
 
-    def path(self, frame: int) -> tuple[list[tuple[int, tuple[np.ndarray, np.ndarray], np.ndarray, bool]], tuple]:
-        """Returns a frame's joints, from the world on: (index in ``q``, fixed transform, axis, slide?); and its own transform."""
-        node, end = self._ends[frame]
-        links = []
-        while node >= 0:
-            i, node, fixed, axis, slides, _ = self._nodes[node]
-            links.append((i, fixed, axis, slides))
-        return links[::-1], end
+    def _tabulate(self) -> None:
+        """Makes the tables that the methods compute with: a column for each node or frame."""
+        nodes = self._nodes
+        self._links, self._fixed = _Links(nodes), _columns([fixed for _, fixed in self._ends])
+        self._axes = np.array([node.axis for node in nodes], np.float32).T
+        self._slides = np.array([node.slide for node in nodes])
+        self._rounds = _rounds([node.parent for node in nodes])
+        # path[f, n]: node n moves frame f
+        self._path = np.zeros((len(self.frames), len(nodes)), np.float32)
+        for f in range(len(self.frames)):
+            self._path[f, self.path(f)] = 1.0
+        # By joint: the nodes that it moves, filled up with the world's, which moves nothing.
+        moved = [[n for n, node in enumerate(nodes) if node.driver == j] for j in range(len(self.joints))]
+        most = max([1, *map(len, moved)])
+        self._columns = [[(*each, *[0] * most)[k] for each in moved] for k in range(most)]
+        self._powers = None
+        if any(node.powers != _ITSELF for node in nodes[1:]):
+            self._powers = np.zeros((max(len(node.powers) for node in nodes), len(nodes)), np.float32)
+            for n, node in enumerate(nodes):
+                self._powers[: len(node.powers), n] = node.powers
+
+    def path(self, frame: int) -> list[int]:
+        """Lists the nodes that move a frame, from the world on."""
+        node, found = self._ends[frame][0], list[int]()
+        while node:
+            found.append(node)
+            node = self._nodes[node].parent
+        return found[::-1]
 
     def poses(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
         """Computes positions [m] and orientations (wxyz) of the frames in the world."""
-        return self._frames(self._forward(q))
+        pos, quat = self._frames(self._forward(q)[0])
+        return pos.T, quat.T
 
     def jacobians(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
         """Computes ``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
-        nodes = self._forward(q)
-        pos, quat = self._frames(nodes)
-        columns: list[Array] = [jnp.zeros((len(self.frames), 6))] * len(self.joints)
-        off = q - self._qpos0
-        for n, (node, (anchor, turn)) in enumerate(zip(self._nodes, nodes, strict=True)):
-            axis_w = jnp.broadcast_to(math.rotate(turn, jnp.asarray(node.axis, jnp.float32)), pos.shape)
-            linear = axis_w if node.slide else jnp.cross(axis_w, pos - anchor)
-            column = jnp.concatenate([linear, jnp.zeros_like(linear) if node.slide else axis_w], axis=1)
-            ratio = _polynomial(tuple(np.polynomial.polynomial.polyder(node.powers)), off[node.driver])
-            columns[node.driver] += self._path[:, n, None] * ratio * column
-        return pos, quat, jnp.stack(columns, axis=-1)
+        (anchor, turn), ratio = self._forward(q)
+        pos, quat = self._frames((anchor, turn))
+        axis = jnp.broadcast_to(math.rotate(turn, jnp.asarray(self._axes))[:, None], (3, *self._path.shape))
+        linear, angular = jnp.cross(axis, pos[:, :, None] - anchor[:, None], axis=0), axis
+        if self._slides.any():
+            linear, angular = jnp.where(self._slides, axis, linear), jnp.where(self._slides, 0.0, axis)
+        columns = jnp.concatenate([linear, angular]) * self._path * ratio
+        moved = sum(_picked(columns, nodes) for nodes in self._columns)
+        return pos.T, quat.T, jnp.moveaxis(jnp.asarray(moved), 1, 0)
 
-    def _forward(self, q: Float[Array, " nj"]) -> list[Pose]:
-        nodes: list[Pose] = []
-        q = q - self._qpos0
-        for i, parent, fixed, axis, slide, powers in self._nodes:
-            pos, quat = _attach(nodes, parent, fixed)
-            along, off = jnp.asarray(axis, jnp.float32), _polynomial(powers, q[i])
-            if slide:
-                pos = pos + math.rotate(quat, along * off)
-            else:
-                quat = math.quat_mul(quat, math.axis_angle(along, off))
-            # Without a barrier XLA recomputes a link's pose for every number that depends on it: ten times the work.
-            nodes.append(jax.lax.optimization_barrier((pos, quat)))
-        return nodes
+    def _forward(self, q: Float[Array, " nj"]) -> tuple[Poses, Float[Array, " n"]]:
+        """Returns the nodes' poses, the world's first, and how much of their drivers' offsets they make."""
+        off = jnp.concatenate([jnp.zeros(1), _picked(q - self._qpos0, [node.driver for node in self._nodes[1:]])])
+        ratio = jnp.ones(len(self._nodes))
+        if self._powers is not None:
+            off, ratio = _polynomial(self._powers, off), _polynomial(np.polynomial.polynomial.polyder(self._powers), off)
+        pos, quat = self._links.at(off)
+        for first, carriers in self._rounds:
+            at, turn = _picked(pos, carriers), _picked(quat, carriers)
+            joined = at + math.rotate(turn, pos[:, first:]), math.quat_mul(turn, quat[:, first:])
+            # Rounds are a third of the operations that links one by one are, and compile so much faster. Without a barrier XLA
+            # recomputes a round for every number of the next.
+            pos, quat = jax.lax.optimization_barrier(
+                tuple(jnp.concatenate([old[:, :first], new], axis=1) for old, new in zip((pos, quat), joined, strict=True))
+            )
+        return (pos, quat), ratio
 
-    def _frames(self, nodes: list[Pose]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
-        ends = [_attach(nodes, node, fixed) for node, fixed in self._ends]
-        return jnp.stack([pos for pos, _ in ends]), jnp.stack([quat for _, quat in ends])
+    def _frames(self, nodes: Poses) -> Poses:
+        at, turn = (_picked(x, [node for node, _ in self._ends]) for x in nodes)
+        pos, quat = self._fixed
+        return at + math.rotate(turn, pos), math.quat_mul(turn, quat)
 
 
 def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " nq"]], Pose]:
@@ -160,26 +202,13 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
         ValueError: a ball or free joint lies between the world and the site.
     """
     joints = [j for j in range(model.njnt) if model.jnt_type[j] in (_HINGE, _SLIDE)]
-    links, (end_pos, end_quat) = Chain(model, [model.joint(j).name for j in joints], [site]).path(0)
-    at = model.jnt_qposadr[[joints[i] for i, *_ in links]]
-    # Of each link, in its parent's frame: position + slide * q, and quaternion * cos(half q) + turned * sin(half q).
-    position, slide, quaternion, turned = (np.zeros((n, len(links) + 1), np.float32) for n in (3, 3, 4, 4))
-    half = np.zeros(len(links) + 1, np.float32)
-    for k, (_, (pos, quat), axis, slides) in enumerate(links):
-        position[:, k], quaternion[:, k], half[k] = pos, quat, 0.0 if slides else 0.5
-        if slides:
-            slide[:, k] = _compose((np.zeros(3), quat), (axis, _STILL))[0]
-        else:
-            turned[:, k] = _compose((np.zeros(3), quat), (np.zeros(3), np.array([0.0, *axis])))[1]
-    position[:, -1], quaternion[:, -1] = end_pos, end_quat
-    still = model.qpos0[at].astype(np.float32)
+    chain = Chain(model, [model.joint(j).name for j in joints], [site])
+    nodes = [chain._nodes[n] for n in chain.path(0)]
+    at = model.jnt_qposadr[[joints[node.driver] for node in nodes]]
+    links, still = _Links([*nodes, _WORLD._replace(fixed=chain._ends[0][1])]), model.qpos0[at].astype(np.float32)
 
     def pose(qpos: Float[Array, " nq"]) -> Pose:
-        q = jnp.append(qpos[at] - still, 0.0)
-        angle = q * half
-        # One column per link.
-        pos = jnp.asarray(position) + slide * q
-        quat = jnp.asarray(quaternion) * jnp.cos(angle) + turned * jnp.sin(angle)
+        pos, quat = links.at(jnp.append(qpos[at] - still, 0.0))
         while (count := pos.shape[1]) > 1:
             pairs = count // 2 * 2
             inner, outer = slice(0, pairs, 2), slice(1, pairs, 2)
@@ -208,24 +237,48 @@ def _moved(model: mujoco.MjModel, ids: Sequence[int]) -> dict[int, tuple[int, tu
     return moved
 
 
-def _polynomial(powers: tuple[float, ...], x: Float[Array, ""]) -> Float[Array, ""]:
-    """Value at ``x`` of a polynomial given by its coefficients, the constant one first."""
-    if powers == _ITSELF:
-        return x
+def _rounds(parents: Sequence[int]) -> list[tuple[int, list[int]]]:
+    """Lists the rounds that compose links: the first node that changes, and what carries it and each later one.
+
+    A round doubles the links that are composed, so that a chain of seven takes three.
+    """
+    found, carriers = list[tuple[int, list[int]]](), list(parents)
+    while any(carriers):
+        first = next(n for n, carrier in enumerate(carriers) if carrier)
+        found.append((first, carriers[first:]))
+        carriers = [carriers[node] for node in carriers]
+    return found
+
+
+def _picked(x: Float[Array, "*rows n"], columns: Sequence[int]) -> Float[Array, "*rows m"]:
+    """Picks columns by slices, which XLA fuses, in place of a gather."""
+    if not columns:
+        return x[..., :0]
+    begins = [k for k, column in enumerate(columns) if not k or column != columns[k - 1] + 1]
+    runs = [(columns[k], columns[end - 1] + 1) for k, end in itertools.pairwise([*begins, len(columns)])]
+    return jnp.concatenate([jax.lax.slice_in_dim(x, a, b, axis=-1) for a, b in runs], axis=-1)
+
+
+def _columns(transforms: Sequence[Transform]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [3, n] and quaternions [4, n]."""
+    n = len(transforms)
+    pos, quat = (np.array([each[k] for each in transforms], np.float32).reshape(n, 3 + k).T for k in range(2))
+    return pos, quat
+
+
+def _moves(axis: np.ndarray, quat: np.ndarray) -> Transform:
+    """What a joint adds to a link: times its offset to the position, times the sine of half of that to the quaternion."""
+    return quats.rotated(axis, quat), quats.product(quat, [0.0, *axis])
+
+
+def _polynomial(powers: np.ndarray, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Values at ``x`` of polynomials given by their coefficients [powers, n], the constant ones first."""
     out = jnp.zeros_like(x)
     for power in powers[::-1]:
         out = out * x + power
     return out
 
 
-def _attach(nodes: list[Pose], parent: int, fixed: tuple[np.ndarray, np.ndarray]) -> Pose:
-    pos, quat = jnp.asarray(fixed[0], jnp.float32), jnp.asarray(fixed[1], jnp.float32)
-    if parent < 0:
-        return pos, quat
-    at, turn = nodes[parent]
-    return at + math.rotate(turn, pos), math.quat_mul(turn, quat)
-
-
-def _compose(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _compose(a: Transform, b: Transform) -> Transform:
     """Composes two transforms, in double precision: ``b`` given in the frame ``a``."""
     return a[0] + quats.rotated(b[0], a[1]), quats.product(a[1], b[1])
