@@ -200,7 +200,7 @@ class InverseKinematics:
             return restart + 1, self._descents(start, target, poses, solved, found)
 
         if not isinstance(restarts, int) or restarts:
-            _, found = jax.lax.while_loop(unsolved, again, (0, found))
+            _, found = jax.lax.while_loop(unsolved, again, (_zero(poses.q0), found))
         return jax.tree.map(lambda x, none: jnp.where(valid.reshape(b, *[1] * (x.ndim - 1)), x, none), found, nothing)
 
     def _starts(self, key: Key, pos: Float[Array, "n 3"], quat: Float[Array, "n 4"]) -> Float[Array, "n nj"]:
@@ -229,8 +229,9 @@ class InverseKinematics:
             return i + 1, trial, jnp.where(trial.success[:, None], q, following)
 
         n, q0 = len(target), poses.q0
-        trial = Solution(start, jnp.zeros(n, bool), jnp.full(n, jnp.inf), jnp.full(n, jnp.inf))
-        _, trial, _ = jax.lax.while_loop(going, step, (0, trial, start))
+        begin = _zero(start)
+        far = jnp.full(n, jnp.inf) + begin
+        _, trial, _ = jax.lax.while_loop(going, step, (begin, Solution(start, far < 0, far, far), start))
         # The same pose, with each joint as close to the warm start as whole turns bring it.
         q = trial.q - 2 * jnp.pi * self._hinge * jnp.round((trial.q - q0[target]) / (2 * jnp.pi))
         trial = dataclasses.replace(trial, q=jnp.where(q == self._within(q), q, trial.q))
@@ -278,6 +279,11 @@ class InverseKinematics:
 
     def _within(self, q: Float[Array, "*n nj"]) -> Float[Array, "*n nj"]:
         return jnp.clip(q, self.chain.lower, self.chain.upper)
+
+
+def _zero(x: Array) -> Int[Array, ""]:
+    """0, batched wherever ``x`` is. Of a loop, ``jax.vmap`` traces the body again for all that becomes batched only there."""
+    return jnp.where(jnp.isnan(x).any(), 0, 0)
 
 
 def _residual(
