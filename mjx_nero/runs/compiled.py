@@ -108,7 +108,8 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
     def init(key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
         return learner.init(key, **given), {}
 
-    untuned = machines.untuned()
+    # Networks that imitate an expert take longer to train than to compile well.
+    options = {**(learner.env.unwrapped.physics.compiler_options if _names(bank) else {}), **machines.untuned()}
 
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays
@@ -116,9 +117,9 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
         if programs:
             name = "-".join(("init", *_names(bank)))
-            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=untuned)
+            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=options)
         else:
-            lowered = jax.jit(init, compiler_options=untuned).lower(*args)
+            lowered = jax.jit(init, compiler_options=options).lower(*args)
         return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
@@ -130,7 +131,7 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
             compiling = beside.submit(expected)
             given = bank(seed) if bank else {}
             shapes, program = compiling.result()
-        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
+        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=options)
         state = make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
         if programs:
             programs.keep(state, seed, _names(bank))
@@ -177,13 +178,14 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any],
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
         physics = side_by_side.submit(spans.timed("physics", prepare))
-        # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
-        starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         with spans.span("learner, lowered"):
             shapes = state_shape(learner)
             given, options = (learner.place(shapes),), env.physics.compiler_options
             program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
+        # Only now, because an expert's program takes seconds of Python's lock, too, and XLA takes the longest for the learner.
+        # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
+        starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         if env.cfg.scene.cameras:
             starting.result()
         with spans.span("evaluation, lowered"):
