@@ -267,7 +267,7 @@ def _columns(transforms: Sequence[Transform]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _moves(axis: np.ndarray, quat: np.ndarray) -> Transform:
-    """What a joint adds to a link: times its offset to the position, times the sine of half of that to the quaternion."""
+    """Returns a joint's part of a link: times its offset of the position, times the sine of half of that of the quaternion."""
     return quats.rotated(axis, quat), quats.product(quat, [0.0, *axis])
 
 
