@@ -108,8 +108,7 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
     def init(key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
         return learner.init(key, **given), {}
 
-    # Networks that imitate an expert take longer to train than to compile well.
-    options = {**(learner.env.unwrapped.physics.compiler_options if _names(bank) else {}), **machines.untuned()}
+    untuned = machines.untuned()
 
     @functools.cache
     def expected() -> tuple[Any, Any]:  # compiled while an expert plays
@@ -117,9 +116,9 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
         args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
         if programs:
             name = "-".join(("init", *_names(bank)))
-            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=options)
+            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=untuned)
         else:
-            lowered = jax.jit(init, compiler_options=options).lower(*args)
+            lowered = jax.jit(init, compiler_options=untuned).lower(*args)
         return _shapes(given), lowered.compile()
 
     def start(seed: int) -> Any:
@@ -131,7 +130,7 @@ def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs
             compiling = beside.submit(expected)
             given = bank(seed) if bank else {}
             shapes, program = compiling.result()
-        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=options)
+        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
         state = make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
         if programs:
             programs.keep(state, seed, _names(bank))
