@@ -136,7 +136,7 @@ class Chain:
         # By joint: the nodes that it moves, filled up with the world's, which moves nothing.
         moved = [[n for n, node in enumerate(nodes) if node.driver == j] for j in range(len(self.joints))]
         most = max([1, *map(len, moved)])
-        self._columns = [[(*each, *[0] * most)[k] for each in moved] for k in range(most)]
+        self._movers = [[(*each, *[0] * most)[k] for each in moved] for k in range(most)]
         self._powers = None
         if any(node.powers != _ITSELF for node in nodes[1:]):
             self._powers = np.zeros((max(len(node.powers) for node in nodes), len(nodes)), np.float32)
@@ -153,27 +153,32 @@ class Chain:
 
     def poses(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"]]:
         """Computes positions [m] and orientations (wxyz) of the frames in the world."""
-        pos, quat = self._frames(self._forward(q)[0])
+        pos, quat = self._frames(self._forward(q))
         return pos.T, quat.T
 
     def jacobians(self, q: Float[Array, " nj"]) -> tuple[Float[Array, "nf 3"], Float[Array, "nf 4"], Float[Array, "nf 6 nj"]]:
         """Computes ``poses`` and the geometric Jacobians: rows are linear, then angular velocity in the world frame."""
-        (anchor, turn), ratio = self._forward(q)
+        anchor, turn = self._forward(q)
         pos, quat = self._frames((anchor, turn))
         axis = jnp.broadcast_to(math.rotate(turn, jnp.asarray(self._axes))[:, None], (3, *self._path.shape))
         linear, angular = jnp.cross(axis, pos[:, :, None] - anchor[:, None], axis=0), axis
         if self._slides.any():
             linear, angular = jnp.where(self._slides, axis, linear), jnp.where(self._slides, 0.0, axis)
-        columns = jnp.concatenate([linear, angular]) * self._path * ratio
-        moved = sum(_picked(columns, nodes) for nodes in self._columns)
+        columns = jnp.concatenate([linear, angular]) * self._path
+        if self._powers is not None:
+            columns *= _polynomial(np.polynomial.polynomial.polyder(self._powers), self._driven(q))
+        moved = sum(_picked(columns, nodes) for nodes in self._movers)
         return pos.T, quat.T, jnp.moveaxis(jnp.asarray(moved), 1, 0)
 
-    def _forward(self, q: Float[Array, " nj"]) -> tuple[Poses, Float[Array, " n"]]:
-        """Returns the nodes' poses, the world's first, and how much of their drivers' offsets they make."""
-        off = jnp.concatenate([jnp.zeros(1), _picked(q - self._qpos0, [node.driver for node in self._nodes[1:]])])
-        ratio = jnp.ones(len(self._nodes))
+    def _driven(self, q: Float[Array, " nj"]) -> Float[Array, " n"]:
+        """Returns the offset of each node's driver, the world's first."""
+        return jnp.concatenate([jnp.zeros(1), _picked(q - self._qpos0, [node.driver for node in self._nodes[1:]])])
+
+    def _forward(self, q: Float[Array, " nj"]) -> Poses:
+        """Returns the nodes' poses, the world's first."""
+        off = self._driven(q)
         if self._powers is not None:
-            off, ratio = _polynomial(self._powers, off), _polynomial(np.polynomial.polynomial.polyder(self._powers), off)
+            off = _polynomial(self._powers, off)
         pos, quat = self._links.at(off)
         for first, carriers in self._rounds:
             at, turn = _picked(pos, carriers), _picked(quat, carriers)
@@ -183,7 +188,7 @@ class Chain:
             pos, quat = jax.lax.optimization_barrier(
                 tuple(jnp.concatenate([old[:, :first], new], axis=1) for old, new in zip((pos, quat), joined, strict=True))
             )
-        return (pos, quat), ratio
+        return pos, quat
 
     def _frames(self, nodes: Poses) -> Poses:
         at, turn = (_picked(x, [node for node, _ in self._ends]) for x in nodes)
