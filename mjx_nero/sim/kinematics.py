@@ -7,7 +7,7 @@ after a reset, and controllers need neither a simulator nor its data.
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -181,8 +181,7 @@ class Chain:
             off = _polynomial(self._powers, off)
         pos, quat = self._links.at(off)
         for first, carriers in self._rounds:
-            at, turn = _picked(pos, carriers), _picked(quat, carriers)
-            joined = at + math.rotate(turn, pos[:, first:]), math.quat_mul(turn, quat[:, first:])
+            joined = _joined((_picked(pos, carriers), _picked(quat, carriers)), (pos[:, first:], quat[:, first:]))
             # Rounds are a third of the operations that links one by one are, and compile so much faster. Without a barrier XLA
             # recomputes a round for every number of the next.
             pos, quat = jax.lax.optimization_barrier(
@@ -191,9 +190,8 @@ class Chain:
         return pos, quat
 
     def _frames(self, nodes: Poses) -> Poses:
-        at, turn = (_picked(x, [node for node, _ in self._ends]) for x in nodes)
-        pos, quat = self._fixed
-        return at + math.rotate(turn, pos), math.quat_mul(turn, quat)
+        pos, quat = (_picked(x, [node for node, _ in self._ends]) for x in nodes)
+        return _joined((pos, quat), self._fixed)
 
 
 def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " nq"]], Pose]:
@@ -217,7 +215,7 @@ def site_pose_fn(model: mujoco.MjModel, site: str) -> Callable[[Float[Array, " n
         while (count := pos.shape[1]) > 1:
             pairs = count // 2 * 2
             inner, outer = slice(0, pairs, 2), slice(1, pairs, 2)
-            joined = pos[:, inner] + math.rotate(quat[:, inner], pos[:, outer]), math.quat_mul(quat[:, inner], quat[:, outer])
+            joined = _joined((pos[:, inner], quat[:, inner]), (pos[:, outer], quat[:, outer]))
             # The barrier keeps XLA from recomputing a round for every number of the next: three rounds of that can take longer
             # than the physics.
             pos, quat = jax.lax.optimization_barrier(
@@ -282,6 +280,12 @@ def _polynomial(powers: np.ndarray, x: Float[Array, " n"]) -> Float[Array, " n"]
     for power in powers[::-1]:
         out = out * x + power
     return out
+
+
+def _joined(carriers: Any, carried: Any) -> Poses:
+    """Composes transforms column by column: ``carried`` given in the frames ``carriers``."""
+    (at, turn), (pos, quat) = carriers, carried
+    return at + math.rotate(turn, pos), math.quat_mul(turn, quat)
 
 
 def _compose(a: Transform, b: Transform) -> Transform:
