@@ -17,6 +17,7 @@ from mjx_nero.sim.physics.warp import kernels
 _CONTACT = "dist includemargin type worldid dim geom pos frame friction solref solreffriction solimp efc_address"
 _EFC = "J J_rownnz J_rowadr J_colind D aref frictionloss type id"
 _DATA = "nacon nefc cdof subtree_com qvel overflow"
+_LANES = 8  # threads of a contact
 
 
 def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
@@ -40,7 +41,7 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
     values |= {f"contact_{name}": getattr(data.contact, name) for name in _CONTACT.split()}
     values |= {f"efc_{name}": getattr(data.efc, name) for name in _EFC.split()}
     values |= {name: getattr(data, name) for name in _DATA.split()}
-    how = {"threads": 8, "block": 128} if wp.get_device().is_cuda else {}
+    how = {"threads": _LANES, "block": 128} if wp.get_device().is_cuda else {}
     contacts = kernels.make(["contact_rows"], _constants(m, model, data), values, data.naconmax, **how)
 
     def others() -> None:
@@ -84,6 +85,7 @@ def _constants(m: mujoco.MjModel, model: Any, data: Any) -> dict[str, int | Iter
         "MOVES_HIGH": masks[:, 1],
         "ROOT": m.body_rootid[m.dof_bodyid],
         "BODY": m.geom_bodyid,
+        "LANES": _LANES,
         "NV": m.nv,
         "NJ": int(data.njmax),
         "MOST": int(model.nmaxcondim if elliptic else model.nmaxpyramid),
