@@ -90,23 +90,26 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
 
     bodies = np.arange(m.nbody + 1)
     stands = (m.body_weldid[m.geom_bodyid] == 0) & (m.body_mocapid[m.body_rootid[m.geom_bodyid]] < 0)
-    free = _free(m)
+    free, parts = _free(m), np.array(_parts(m))
+    before = parts[np.searchsorted(parts, bodies[:-1], side="right") - 1] - 1  # of each body's part: stands for the world there
+    first_dof, rows = np.searchsorted(m.dof_bodyid, bodies), np.array([*m.M_rowadr, m.nC])
     assert (m.M_rowadr + m.M_rownnz)[:-1].tolist() == m.M_rowadr[1:].tolist()
     found: dict[str, int | Iterable[int]] = {
-        "PART": _parts(m),
-        "PARENT": m.body_parentid,
+        "PART": parts,
+        "PARENT": np.where(m.body_parentid > 0, m.body_parentid, before),
         "ROOT": m.body_rootid,
         "MOCAP": m.body_mocapid,
         "FIRST_JOINT": np.searchsorted(m.jnt_bodyid, bodies),
-        "FIRST_DOF": np.searchsorted(m.dof_bodyid, bodies),
+        "FIRST_DOF": first_dof,
         "TYPE": m.jnt_type,
         "QPOS": m.jnt_qposadr,
         "DOF": m.jnt_dofadr,
-        "ROW": [*m.M_rowadr, m.nC],
+        "ROW": rows,
         "COLUMN": m.M_colind,
         "FIRST_GEOM": np.searchsorted(m.geom_bodyid, bodies),
         "STANDS": stands,
         "FREE_BODY": free,
+        "FLIES": np.isin(m.dof_bodyid, free),
         "FREE_AT": [free.index(b) if b in free else -1 for b in range(m.nbody)],
         "JOINT_OF_DRIVE": m.actuator_trnid[:, 0],
         "AFFINE": m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
@@ -114,7 +117,9 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
         "FORCE_LIMITED": m.actuator_forcelimited,
         "JOINT_LIMITED": m.jnt_actfrclimited,
     }
-    found |= {"NB": m.nbody, "NJ": m.njnt, "NQ": m.nq, "NV": m.nv, "NM": m.nC, "NG": m.ngeom, "NU": m.nu, "NFREE": len(free)}
+    found |= {"NB": m.nbody, "NQ": m.nq, "NV": m.nv, "NG": m.ngeom, "NU": m.nu, "NFREE": len(free)}
+    of_a_part = {"BODIES": 1 + np.diff(parts), "DOFS": np.diff(first_dof[parts]), "ENTRIES": np.diff(rows[first_dof[parts]])}
+    found |= {name: max(1, *map(int, sizes)) for name, sizes in of_a_part.items()}
     found |= {
         "FREE": _FREE,
         "SLIDE": int(mujoco.mjtJoint.mjJNT_SLIDE),

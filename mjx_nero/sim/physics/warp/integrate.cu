@@ -14,14 +14,20 @@ const float* M = in.M.data + (size_t)world * in.M.shape[1];
 const float *qacc = in.qacc.data + (size_t)world * NV, *Ma = in.efc_Ma.data + (size_t)world * NV;
 const float* implicit = in.implicit.data + (size_t)world * NV;
 float *qpos = in.qpos.data + (size_t)world * NQ, *qvel = in.qvel.data + (size_t)world * NV;
-float x[NV];
+float own_x[DOFS], *const x = own_x - first_dof;  // one tree's, at the model's indices
 
 // A = M - h dF/dv = L' D L from the last row on, L and D's inverse in A's place; rows of ancestors are prefixes of those below them.
-float A[NM];
-for (int k = ROW[first_dof]; k < ROW[end_dof]; ++k) A[k] = M[k];
-for (int i = first_dof; i < end_dof; ++i) x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
+// Bodies that fly freely come after.
+float own_A[ENTRIES], *const A = own_A - ROW[first_dof];
+#pragma unroll 1
+for (int i = first_dof; i < end_dof; ++i) {
+    if (FLIES[i]) continue;
+    for (int k = ROW[i]; k < ROW[i + 1]; ++k) A[k] = M[k];
+    x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
+}
 #pragma unroll 1
 for (int i = end_dof - 1; i >= first_dof; --i) {
+    if (FLIES[i]) continue;
     const int begin = ROW[i], last = ROW[i + 1] - 1;
     const float inverse = 1.0f / A[last];
     A[last] = inverse;
@@ -36,6 +42,7 @@ for (int i = end_dof - 1; i >= first_dof; --i) {
 }
 #pragma unroll 1
 for (int i = first_dof; i < end_dof; ++i) {
+    if (FLIES[i]) continue;
     x[i] *= A[ROW[i + 1] - 1];
     for (int k = ROW[i]; k < ROW[i + 1] - 1; ++k) x[i] -= A[k] * x[COLUMN[k]];
 }

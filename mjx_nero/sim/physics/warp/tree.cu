@@ -80,10 +80,15 @@ const float h = in.timestep.data[world % in.timestep.shape[0]];
 
 // From the roots to the leaves: where bodies are, how they move, the accelerations that this and gravity cause, and the forces which
 // that takes. Chains are long, so a body's state stays in registers for the next one; others look it up.
-V at[NB];
-Q turned[NB];
-I inertia[NB];
-S velocity[NB], acceleration[NB], force[NB], dof[NV];
+const int world_body = first_body - 1, first_entry = ROW[first_dof];  // the body stands for the world that the tree stands on
+#define OWN(type, name, size, first) type own_##name[size], *const name = own_##name - (first)  // one tree's, at the model's indices
+OWN(V, at, BODIES, world_body);
+OWN(Q, turned, BODIES, world_body);
+OWN(I, inertia, BODIES, world_body);
+OWN(S, velocity, BODIES, world_body);
+OWN(S, acceleration, BODIES, world_body);
+OWN(S, force, BODIES, world_body);
+OWN(S, dof, DOFS, first_dof);
 {
     const float *body_pos = of(in.body_pos), *body_quat = of(in.body_quat), *body_ipos = of(in.body_ipos);
     const float *body_iquat = of(in.body_iquat), *body_mass = of(in.body_mass), *body_inertia = of(in.body_inertia);
@@ -92,9 +97,9 @@ S velocity[NB], acceleration[NB], force[NB], dof[NV];
     const float *mocap_pos = of(in.mocap_pos), *mocap_quat = of(in.mocap_quat), *geom_pos = of(in.geom_pos);
     const float* geom_quat = of(in.geom_quat);
     const V down = {gravity[0], gravity[1], gravity[2]};
-    V x = at[0] = {0, 0, 0}, origin = x;
-    Q q = turned[0] = {1, {0, 0, 0}};
-    S v = velocity[0] = {{0, 0, 0}, {0, 0, 0}}, a = acceleration[0] = {{0, 0, 0}, down * -1.0f};
+    V x = at[world_body] = {0, 0, 0}, origin = x;
+    Q q = turned[world_body] = {1, {0, 0, 0}};
+    S v = velocity[world_body] = {{0, 0, 0}, {0, 0, 0}}, a = acceleration[world_body] = {{0, 0, 0}, down * -1.0f};
 #pragma unroll 1  // here and below: unrolled, the whole tree would not fit the instruction cache
     for (int b = first_body; b <= last_body; ++b) {
         const int p = PARENT[b];
@@ -174,7 +179,9 @@ S velocity[NB], acceleration[NB], force[NB], dof[NV];
 }
 
 // From the leaves to the roots: forces and inertias of all that a joint carries. ``implicit`` is -d smooth / d velocity.
-float M[NM], smooth[NV], implicit[NV];
+OWN(float, M, ENTRIES, first_entry);
+OWN(float, smooth, DOFS, first_dof);
+OWN(float, implicit, DOFS, first_dof);
 {
     const float *armature = of(in.dof_armature), *damping = of(in.dof_damping), *curve = of(in.dof_dampingpoly);
     const float *stiffness = of(in.jnt_stiffness), *stiffening = of(in.jnt_stiffnesspoly), *rest = of(in.qpos_spring);
@@ -200,7 +207,7 @@ float M[NM], smooth[NV], implicit[NV];
         const I lower = carried;
         f = force[b - 1], carried = inertia[b - 1];
         if (p == b - 1) f = f + below, carried = sum(carried, lower);
-        else if (p > 0) force[p] = force[p] + below, inertia[p] = sum(inertia[p], lower);
+        else if (p > world_body) force[p] = force[p] + below, inertia[p] = sum(inertia[p], lower);
     }
 #pragma unroll 1
     for (int j = first_joint; j < end_joint; ++j) {
@@ -214,7 +221,8 @@ float M[NM], smooth[NV], implicit[NV];
 {
     const float *ctrl = in.ctrl.data + (size_t)world * in.ctrl.shape[1], *gain = of(in.actuator_gainprm), *bias = of(in.actuator_biasprm);
     const float *gear = of(in.actuator_gear), *most = of(in.actuator_forcerange), *reach = of(in.actuator_ctrlrange);
-    float driven[NV], slope[NV];
+    OWN(float, driven, DOFS, first_dof);
+    OWN(float, slope, DOFS, first_dof);
     for (int i = first_dof; i < end_dof; ++i) driven[i] = slope[i] = 0.0f;
 #pragma unroll 1
     for (int u = 0; u < NU; ++u) {
@@ -238,7 +246,7 @@ float M[NM], smooth[NV], implicit[NV];
     for (int i = first_dof; i < end_dof; ++i) smooth[i] += driven[i], implicit[i] -= slope[i];
 }
 
-for (int k = ROW[first_dof]; k < ROW[end_dof]; ++k) in.M.data[(size_t)world * in.M.shape[1] + k] = M[k];
+for (int k = first_entry; k < ROW[end_dof]; ++k) in.M.data[(size_t)world * in.M.shape[1] + k] = M[k];
 for (int i = first_dof; i < end_dof; ++i) {
     in.qfrc_smooth.data[(size_t)world * NV + i] = smooth[i], in.implicit.data[(size_t)world * NV + i] = implicit[i];
     float* to = (float*)(in.cdof.data + (size_t)world * NV + i);
