@@ -176,7 +176,7 @@ class ManipulationEnv(Env):
         need = self.physics.footprint(num_devices)
         if not self.cfg.scene.cameras:
             return need
-        return dataclasses.replace(need, outside=need.outside + self.cameras.draw.bytes())
+        return Footprint(need.in_program, need.outside + self.cameras.draw.bytes(), need.free)
 
     @property
     def action_size(self) -> int:

@@ -5,6 +5,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+import time
 import types
 
 import jax
@@ -369,16 +370,34 @@ def test_warp_memory_of_a_second_environment_waits_for_no_kernels(env):
     first, second = (mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim) for _ in range(2))
     need = first.footprint().outside
     with kernels.WARP, concurrent.futures.ThreadPoolExecutor() as pool:
-        assert pool.submit(second.footprint).result(timeout=20).outside == need > 1000
+        assert pool.submit(lambda: second.footprint().outside).result(timeout=20) == need > 1000
     more = dataclasses.replace(env.cfg.sim, contacts_per_env=2 * env.cfg.sim.contacts_per_env)
     assert mujoco_warp.WarpPhysics(env.physics_model, more).footprint().outside > need
+
+
+def test_warp_memory_is_measured_once_and_only_when_it_is_asked_for(env, monkeypatch):
+    """MuJoCo Warp takes a second to import, and a training's kernels hold what measures for longer."""
+    mujoco_warp = pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
+    measured: list[int] = []
+
+    def measure(*_):
+        time.sleep(0.2)
+        measured.append(7000)
+        return 7000
+
+    monkeypatch.setattr(mujoco_warp, "_BYTES", {})
+    monkeypatch.setattr(mujoco_warp, "_data_bytes", measure)
+    made = [mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim) for _ in range(2)]
+    assert [one.footprint().in_program for one in made] == [0.0, 0.0] and not measured
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        assert list(pool.map(lambda one: one.footprint().outside, made)) == [7000, 7000] and measured == [7000]
 
 
 def test_warp_memory_is_that_of_this_process_devices(env, monkeypatch):
     """A run of four devices on two machines: two are here."""
     warp, mujoco_warp = pytest.importorskip("warp"), pytest.importorskip("mjx_nero.sim.physics.warp.mujoco_warp")
     made = mujoco_warp.WarpPhysics(env.physics_model, env.cfg.sim)
-    made.footprint()  # makes what it counts, before devices are not what they are
+    assert made.footprint().outside  # makes what it counts, before devices are not what they are
     monkeypatch.setattr(warp, "get_cuda_devices", lambda: [types.SimpleNamespace(free_memory=free) for free in (5e9, 3e9, 1e9)])
     assert made.footprint(2).free == 3e9 and made.footprint(4).free == 1e9 and made.footprint().outside > 1000
 

@@ -109,10 +109,7 @@ class WarpPhysics(Physics):
 
     def footprint(self, num_devices: int = 1) -> Footprint:
         """Returns the size of MuJoCo Warp's data, and the free memory."""
-        import warp as wp
-
-        free = [device.free_memory for device in wp.get_cuda_devices()[:num_devices]]  # other processes ask for their own
-        return Footprint(outside=self._bytes, free=min(free, default=float("inf")))
+        return _Measured(lambda: self._bytes, lambda: _free(num_devices))
 
     @functools.cached_property
     def _bytes(self) -> int:
@@ -121,8 +118,9 @@ class WarpPhysics(Physics):
         sizes = (getattr(model, name) for name in dir(model) if name.startswith("n"))
         kinds = int(model.opt.cone), int(model.opt.jacobian)
         key = cfg.contacts_per_env, cfg.constraints_per_env, *kinds, *(x for x in sizes if isinstance(x, int))
-        if key not in _BYTES:
-            _BYTES[key] = _data_bytes(model, cfg)
+        with _MEASURING:
+            if key not in _BYTES:
+                _BYTES[key] = _data_bytes(model, cfg)
         return _BYTES[key] + 4 * sum(math.prod(shape) for shape in self._fields.values())
 
     def prepare(self, num_envs: int, num_devices: int = 1) -> None:
@@ -200,8 +198,26 @@ class WarpPhysics(Physics):
         return ours, out
 
 
+class _Measured(Footprint):
+    """Is measured when it is asked for, because MuJoCo Warp takes a second to import."""
+
+    def __init__(self, outside: Callable[[], int], free: Callable[[], float]):
+        object.__setattr__(self, "_measure", (outside, free))
+
+    outside = property(lambda self: self._measure[0]())
+    free = property(lambda self: self._measure[1]())
+
+
+def _free(num_devices: int) -> float:
+    """Returns the free memory of the first devices, of that which has least; other processes ask for their own."""
+    import warp as wp
+
+    return min((device.free_memory for device in wp.get_cuda_devices()[:num_devices]), default=float("inf"))
+
+
 # By the sizes of a model and its buffers. An evaluation has those of its training, which holds ``kernels.WARP`` for seconds.
 _BYTES: dict[tuple[int, ...], int] = {}
+_MEASURING = threading.Lock()
 
 
 def _data_bytes(model: mujoco.MjModel, cfg: SimCfg) -> int:
