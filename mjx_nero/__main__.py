@@ -57,7 +57,7 @@ def program(*command: str) -> NoReturn:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until ``cli.run`` handles it, Ctrl-C ends the imports without a traceback
     from mjx_nero.tools import cli
 
-    cli.collect_seldom()
+    cli.tune_python()
     cli.run(lambda argv: main([*command, *argv]))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mjx_nero.envs import env
-from mjx_nero.learn import checkpoint
+from mjx_nero.learn import checkpoint, machines
 from mjx_nero.learn.learner import state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import cfg, compiled, starts
@@ -85,23 +85,32 @@ def test_what_a_training_imports_before_it_begins():
     assert "mjx_nero.runs.training" in found and not found & SELDOM
 
 
-def test_the_evaluation_is_traced_beside_the_first_state(monkeypatch):
+def test_all_is_traced_in_one_thread_and_the_evaluation_beside_the_first_state(monkeypatch):
     """A first state waits for the expert, whose program takes seconds to trace and minutes to compile."""
     run = cfg.resolve("nero_reach", "default", None, {"episode_length_s": 0.2}, {"num_envs": 8}, impl="native")
     run = dataclasses.replace(run, eval_episodes=2)
-    learner, traced = compiled.make_learner(run), threading.Event()
-    compiler = compiled.Evaluator.compiler
+    learner, traced, order = compiled.make_learner(run), threading.Event(), []
+    compiler, lower = compiled.Evaluator.compiler, Programs.lower
 
     def noted(self, shapes):
         traced.set()
         return compiler(self, shapes)
 
+    def lowered(self, name, *rest, **options):
+        order.append((name.partition("-")[0], threading.current_thread()))
+        return lower(self, name, *rest, **options)
+
+    programs = Programs(run, learner)
+    fresh = compiled.Fresh(learner, None, programs)
+
     def start():
         assert traced.wait(120)
-        return compiled.starter(learner)(0)
+        return fresh.placed(0)
 
     monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
-    made = compiled.compile(run, learner, 1, start, Programs(run, learner))
+    monkeypatch.setattr(Programs, "lower", lowered)
+    made = compiled.compile(run, learner, 1, start, programs, lambda beside: fresh.trace(0, beside))
+    assert order == [(name, threading.current_thread()) for name in ("run", "init", "evaluation")]
     assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
 
 
@@ -149,9 +158,44 @@ def test_the_first_state_compiles_beside_the_expert(able, programs):
         return key[1] + (0.5 if bank is None else bank.sum())
 
     bank = {"bank": np.arange(3, dtype=np.float32)}
-    start = compiled.fresh(types.SimpleNamespace(init=init), Slow(programs, bank if able else {}))
+    start = compiled.Fresh(types.SimpleNamespace(init=init), Slow(programs, bank if able else {}))
     assert float(start(7)) == (10.0 if able else 7.5) and float(start(8)) == (11.0 if able else 8.5)
     assert sum("init" in name for name in programs) == (1 if able else 2)
+
+
+def test_an_experts_program_is_for_the_processor(monkeypatch):
+    """So that every machine gets the same states, whatever traces it."""
+    asked = []
+
+    class Player:
+        able = True
+
+        def __init__(self, *_):
+            pass
+
+        def trace(self, seed):
+            asked.append((seed, jax.config.jax_default_device))
+
+    monkeypatch.setattr(starts, "_Player", Player)
+    imitates = types.SimpleNamespace(env=types.SimpleNamespace(unwrapped=None), num_envs=8, imitates=True)
+    starts.Maker(imitates, print).trace(3)
+    starts.Maker(types.SimpleNamespace(env=None), print).trace(3)  # nothing to trace
+    assert asked == [(3, machines.processor())] and jax.config.jax_default_device is None
+
+
+def test_programs_are_lowered_small_by_one_thread_at_a_time():
+    """The setting is the process's: a second thread would take the first one's for its own."""
+    name, found = "jax_threefry_gpu_kernel_lowering", []
+    before = getattr(jax.config, name)
+
+    def lower(_):
+        with machines.small():
+            time.sleep(0.02)
+            found.append(getattr(jax.config, name))
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        list(pool.map(lower, range(4)))
+    assert found == [True] * 4 and getattr(jax.config, name) == before
 
 
 def test_two_threads_make_a_physics_once(monkeypatch):

@@ -121,10 +121,13 @@ class Kind:
 
 
 def state_shape(learner: Learner) -> Any:
-    """Returns a new state's shapes. Nothing comes to the device, whose first array takes seconds."""
+    """Returns a new state's shapes, traced once. Nothing comes to the device, whose first array takes seconds."""
     import jax  # not needed for names and configs
 
-    return jax.eval_shape(lambda: learner.init(jax.random.PRNGKey(0)))
+    own = vars(learner)
+    if "_state_shape" not in own:
+        own["_state_shape"] = jax.eval_shape(lambda: learner.init(jax.random.PRNGKey(0)))
+    return own["_state_shape"]
 
 
 def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iterations: int) -> tuple[Any, Metrics]:

@@ -13,6 +13,7 @@ import jax
 
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.envs.once import once
 from mjx_nero.learn import device_memory, learner, machines, waiting
 from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
@@ -74,7 +75,8 @@ class Evaluator:
 
         n = self._env.num_envs
         args = self._policy(state), *rollout.keys_of(0, n)
-        lowered = self._programs.lower(f"evaluation-{n}", totals, args, (), self._env, options=machines.untuned())
+        with machines.small():
+            lowered = self._programs.lower(f"evaluation-{n}", totals, args, (), self._env, options=machines.untuned())
 
         def compile() -> None:
             self._program = lowered.compile()
@@ -98,45 +100,67 @@ def make_learner(run: RunCfg) -> Learner:
     return learner.find(run.learner).make(wrappers.for_training(env), run.hyperparameters, run.num_devices)
 
 
-def fresh(learner: Learner, bank: starts.Maker | None = None, programs: Programs | None = None) -> Callable[[int], Any]:
-    """Returns a function that makes a new run's state from a seed, by one program, with that seed's bank.
+class Fresh:
+    """Makes a new run's state from a seed, by one program, with that seed's bank.
 
     Args:
         programs: where that program and the state are kept; None: nowhere.
     """
 
-    def init(key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
-        return learner.init(key, **given), {}
+    def __init__(self, learner: Learner, bank: starts.Maker | None = None, programs: Programs | None = None):
+        self.learner, self._bank, self._programs = learner, bank, programs
+        self._jitted = jax.jit(self.init, compiler_options=machines.untuned())
 
-    untuned = machines.untuned()
+    def trace(self, seed: int, beside: concurrent.futures.Executor) -> None:
+        """Traces now what a seed's state needs and no earlier run has kept, and begins to compile it: two threads that trace are
+        both late."""
+        if self._programs and self._programs.has_state(seed, _names(self._bank)):
+            return
+        self._lowered  # noqa: B018
+        beside.submit(lambda: self._compiled)
+        if self._bank:
+            self._bank.trace(seed)
 
-    @functools.cache
-    def expected() -> tuple[Any, Any]:  # compiled while an expert plays
-        given = bank.shapes() if bank else {}
-        args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
-        if programs:
-            name = "-".join(("init", *_names(bank)))
-            lowered = programs.lower(name, init, args, state_shape(learner), learner.env.unwrapped, options=untuned)
-        else:
-            lowered = jax.jit(init, compiler_options=untuned).lower(*args)
-        return _shapes(given), lowered.compile()
-
-    def start(seed: int) -> Any:
+    def __call__(self, seed: int) -> Any:
+        """Makes or reads the state."""
+        learner, bank, programs = self.learner, self._bank, self._programs
         if programs and (kept := programs.state(learner, seed, _names(bank))) is not None:
             if bank:
                 bank.say(f"the first state of seed {seed} is the one that an earlier run made")
             return kept
         with _threads() as beside:
-            compiling = beside.submit(expected)
+            compiling = beside.submit(lambda: self._compiled)
             given = bank(seed) if bank else {}
             shapes, program = compiling.result()
-        make = program if _shapes(given) == shapes else jax.jit(init, compiler_options=untuned)
+        make = program if _shapes(given) == shapes else self._jitted
         state = make(jax.random.PRNGKey(seed), given)[0]  # not every learner takes what an expert gives
         if programs:
             programs.keep(state, seed, _names(bank))
         return state
 
-    return start
+    def placed(self, seed: int) -> Any:
+        """Makes or reads the state, placed for ``learner.run``."""
+        return self.learner.place(self(seed))
+
+    def init(self, key: Any, given: Any) -> tuple[Any, dict[str, jax.Array]]:
+        """Makes the state: what the program computes."""
+        return self.learner.init(key, **given), {}
+
+    @functools.cached_property
+    def _lowered(self) -> tuple[Any, jax.stages.Lowered]:
+        learner, bank = self.learner, self._bank
+        given = bank.shapes() if bank else {}
+        args = jax.eval_shape(lambda: jax.random.PRNGKey(0)), given
+        if not self._programs:
+            return _shapes(given), self._jitted.lower(*args)
+        name, form, env = "-".join(("init", *_names(bank))), state_shape(learner), learner.env.unwrapped
+        with machines.small():
+            return _shapes(given), self._programs.lower(name, self.init, args, form, env, options=machines.untuned())
+
+    @once
+    def _compiled(self) -> tuple[Any, jax.stages.Compiled]:
+        shapes, lowered = self._lowered
+        return shapes, lowered.compile()
 
 
 def _names(bank: starts.Maker | None) -> tuple[str, ...]:
@@ -148,19 +172,24 @@ def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
 
 
-def starter(learner: Learner, bank: starts.Maker | None = None, programs: Programs | None = None) -> Callable[[int], Any]:
-    """Returns ``fresh``, with the state placed for ``learner.run``."""
-    start = fresh(learner, bank, programs)
-    return lambda seed: learner.place(start(seed))
-
-
-def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any], programs: Programs) -> Compiled:
+def compile(
+    run: RunCfg,
+    learner: Learner,
+    chunk: int,
+    start: Callable[[], Any],
+    programs: Programs,
+    trace: Callable[[concurrent.futures.Executor], None] = lambda beside: None,
+) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile.
+
+    All is traced in this thread, what takes longest to compile first; to trace and to import is Python, and one thread at a time
+    runs that. All that does without Python goes on beside it: compilers, kernels, and a script that demonstrates.
 
     Args:
         chunk: iterations per call.
         start: makes the first state, placed on the devices.
         programs: where the run's programs are kept.
+        trace: traces what ``start`` needs, and compiles it in an executor.
 
     Raises:
         UserError: the run does not fit into memory.
@@ -175,14 +204,15 @@ def compile(run: RunCfg, learner: Learner, chunk: int, start: Callable[[], Any],
         device_memory.check_outside(learner)
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
 
-    with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:  # compilers release Python's lock
-        physics = side_by_side.submit(spans.timed("physics", prepare))
+    with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:
         with spans.span("learner, lowered"):
             shapes = state_shape(learner)
             given, options = (learner.place(shapes),), env.physics.compiler_options
             program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
-        # Only now, because an expert's program takes seconds of Python's lock, too, and XLA takes the longest for the learner.
+        with spans.span("first state, lowered"):
+            trace(side_by_side)
+        physics = side_by_side.submit(spans.timed("physics", prepare))
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         if env.cfg.scene.cameras:

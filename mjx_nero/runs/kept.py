@@ -52,11 +52,16 @@ class Shelf:
         """False if nothing is kept."""
         return self._base is not None
 
+    def has(self, name: int | str) -> bool:
+        """True if something was written under this name."""
+        path = self._path(name)
+        return path is not None and path.is_file()
+
     def read(self, name: int | str, template: Callable[[dict[str, Any]], Any]) -> tuple[Any, dict[str, Any]] | None:
         """Reads what ``write`` has written, as a tree like the one that ``template`` makes of the description; None if it is
         missing or damaged."""
         path = self._path(name)
-        if path is None or not path.is_file():
+        if path is None or not self.has(name):
             return None
         try:
             about = checkpoint.load_meta(path)

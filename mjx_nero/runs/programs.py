@@ -39,6 +39,10 @@ class Programs:
             parts = type(learner), type(env), type(env.physics), env.impl, run.env, env.cfg, run.hyperparameters
             self._shelf = kept.Shelf("programs", *parts, run.num_envs, machines.versions(), _settings())
 
+    def has_state(self, seed: int, names: tuple[str, ...]) -> bool:
+        """True if an earlier run has made the first state of a seed. ``names``: see ``state``."""
+        return self._shelf is not None and self._shelf.has(_state_name(seed, names))
+
     def state(self, learner: Learner, seed: int, names: tuple[str, ...]) -> Any:
         """Returns the first state that an earlier run has made from a seed; None if there is none.
 

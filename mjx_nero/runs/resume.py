@@ -11,13 +11,12 @@ from mjx_nero import config, files
 from mjx_nero.config import values
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, header, learner
-from mjx_nero.learn.learner import Learner, state_shape
+from mjx_nero.learn.learner import state_shape
 from mjx_nero.learn.policy import checkpoint_policy
-from mjx_nero.runs import checkpoints, compiled, starts
+from mjx_nero.runs import checkpoints, compiled
 from mjx_nero.runs import trust as trust_of
 from mjx_nero.runs.cfg import Asked, RunCfg, resolve
 from mjx_nero.runs.folder import CONFIG
-from mjx_nero.runs.programs import Programs
 from mjx_nero.sim import fixtures
 from mjx_nero.tasks import registry
 
@@ -237,27 +236,25 @@ def _flag(value: Any) -> str:
     return "'" + ",".join(map(str, value)) + "'" if isinstance(value, tuple) else str(value)
 
 
-def state(
-    source: Source | None, learner: Learner, seed: int, bank: starts.Maker | None = None, programs: Programs | None = None
-) -> Any:
+def state(source: Source | None, fresh: compiled.Fresh, seed: int) -> Any:
     """Makes a new state, or loads a checkpoint's. A policy file gives only its networks.
 
     Args:
-        bank: the expert starts of a new state.
-        programs: where the program that makes it is kept.
+        fresh: makes a new state from ``seed``.
 
     Raises:
         UserError: the file is damaged or of another version, or its networks hold numbers that are not finite.
     """
     if source is None:
-        return compiled.starter(learner, bank, programs)(seed)
+        return fresh.placed(seed)
+    learner = fresh.learner
     like = state_shape(learner)
     if not source.is_checkpoint:
         networks = checkpoint_policy(source.path).params  # checked before the slow compilation
         if (found := _shapes(networks)) != (wanted := _shapes(learner.policy(like))):
             name = min(found.items() ^ wanted.items())[0]
             raise UserError(f"{source.path} does not fit: {name} is {found.get(name)}, expected {wanted.get(name)}")
-        return learner.place(learner.with_policy(compiled.fresh(learner, bank, programs)(seed), networks))
+        return learner.place(learner.with_policy(fresh(seed), networks))
     try:
         held = checkpoint.load(source.path, like)
         checkpoint.check_finite(learner.policy(held), source.path)

@@ -84,6 +84,12 @@ class Maker:
             self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
             self._player = _Player(learner.env.unwrapped, min(episodes, learner.num_envs))
 
+    def trace(self, seed: int) -> None:
+        """Traces the expert's program now, if a call with this seed needs it."""
+        if self._player is not None and self._player.able:
+            with jax.default_device(processor()):
+                self._player.trace(seed)
+
     def __call__(self, seed: int) -> dict[str, Any]:
         if self._player is None:
             return {}
@@ -154,6 +160,11 @@ class _Player:
         # Here, where nothing traces: each look at a file gives Python's lock away, and a thread that traces keeps it for 5 ms.
         self._kept = kept.Shelf("experts", own.cfg, control.CONTROLLERS.get(self._name), count)
 
+    def trace(self, seed: int) -> None:
+        """Traces the program that plays the episodes, unless an earlier run has played them."""
+        if not self._kept.has(seed):
+            self._lowered  # noqa: B018
+
     def __call__(self, seed: int) -> tuple[Way, Shown, float]:
         """Returns the episodes, their steps, and how long it took without compilation [s].
 
@@ -176,7 +187,12 @@ class _Player:
 
     @functools.cached_property
     def _compiled(self) -> tuple[Callable[[Array], Any], ManipulationEnv]:
-        """Compiles the program that plays the episodes."""
+        compile, env = self._lowered
+        return compile(), env
+
+    @functools.cached_property
+    def _lowered(self) -> tuple[Callable[[], Callable[[Array], Any]], ManipulationEnv]:
+        """Lowers the program that plays the episodes. Returns a call that compiles it, and its environment."""
         cfg, name, count = self._own.cfg, self._name, self._count
         if not self.able:
             raise UserError("the task has no script that grasps")
@@ -185,7 +201,7 @@ class _Player:
         expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
         some = jax.random.split(jax.random.PRNGKey(0), count)
         options: Any = {**_ONE_THREAD, **(_COMPILED_FAST if name in _BRIEF else {})}
-        return jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile(options), env
+        return functools.partial(jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile, options), env
 
     def shapes(self) -> tuple[Any, ...]:
         """Returns the shapes of the states, of where they begin and end, and of the steps."""

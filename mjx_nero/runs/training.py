@@ -1,5 +1,6 @@
 """A training run: compile, loop, finish. All its results are left in its folder."""
 
+import concurrent.futures
 import dataclasses
 import functools
 import pathlib
@@ -68,8 +69,11 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
             say(note)
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
-        bank, programs = starts.Maker(learner, say, new=source is None), Programs(run, learner)
-        made = prepare(run, learner, lambda: resume.state(source, learner, run.seed, bank, programs), folder, programs)
+        programs = Programs(run, learner)
+        fresh = compiled.Fresh(learner, starts.Maker(learner, say, new=source is None), programs)
+        begin = functools.partial(resume.state, source, fresh, run.seed)
+        trace = functools.partial(fresh.trace, run.seed) if source is None else lambda beside: None
+        made = prepare(run, learner, begin, folder, programs, trace)
         return carry_out(run, made, tally, meta, folder, command)
 
 
@@ -106,12 +110,19 @@ def describe(run: RunCfg, learner: Learner) -> dict[str, Any]:
     return {**meta, "num_envs": run.num_envs}
 
 
-def prepare(run: RunCfg, learner: Learner, start: Callable[[], Any], folder: pathlib.Path, programs: Programs) -> Compiled:
+def prepare(
+    run: RunCfg,
+    learner: Learner,
+    start: Callable[[], Any],
+    folder: pathlib.Path,
+    programs: Programs,
+    trace: Callable[[concurrent.futures.Executor], None],
+) -> Compiled:
     """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
     with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl, jax.default_backend() == "cpu")):
-        made = compiled.compile(run, learner, chunk, start, programs)
+        made = compiled.compile(run, learner, chunk, start, programs, trace)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""
     speaker()(f"{folder}: compiled in {made.seconds:.0f} s; {learner.env.unwrapped.impl}, {run.num_envs} environments{spread}")
     return made
@@ -206,7 +217,7 @@ def _loop(run: RunCfg, made: Compiled, tally: Tally, meta: dict[str, Any], folde
 
     def back() -> tuple[Any, Tally]:
         source = resume.find(folder, say)
-        return resume.state(source, made.learner, run.seed), _tally(source)
+        return resume.state(source, compiled.Fresh(made.learner), run.seed), _tally(source)
 
     try:
         with (

@@ -282,9 +282,12 @@ def _occupy_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
 
 
-def collect_seldom() -> None:
-    """Lets Python look for garbage less often: imports and traces make hundreds of thousands of objects, which last."""
+def tune_python() -> None:
+    """Lets Python look for garbage less often, because imports and traces make hundreds of thousands of objects, which last; and
+    lets its threads take turns more often, because one that compiles, reads files or steps MuJoCo asks for many short ones.
+    """
     gc.set_threshold(100_000)
+    sys.setswitchinterval(0.0005)
 
 
 def setup_jax() -> None:

@@ -1,6 +1,7 @@
 """Several seeds, trained one after another in one process: one compiled program, and one run per seed."""
 
 import dataclasses
+import functools
 import math
 import pathlib
 import statistics
@@ -64,13 +65,14 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
         if note:
             say(note)
         programs = Programs(run, learner)
-        start = compiled.starter(learner, starts.Maker(learner, say), programs)
-        made = training.prepare(dataclasses.replace(run, seed=seeds[0]), learner, lambda: start(seeds[0]), folder, programs)
+        fresh, one = compiled.Fresh(learner, starts.Maker(learner, say), programs), seeds[0]
+        begin, trace = functools.partial(fresh.placed, one), functools.partial(fresh.trace, one)
+        made = training.prepare(dataclasses.replace(run, seed=one), learner, begin, folder, programs, trace)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):
             say(f"seed {seed}, {i + 1} of {len(seeds)}")
             if i:
-                made = dataclasses.replace(made, state=start(seed), evaluate=made.evaluate.of_seed(seed), seconds=0.0)
+                made = dataclasses.replace(made, state=fresh.placed(seed), evaluate=made.evaluate.of_seed(seed), seconds=0.0)
             with run_folder.claim(home, run.env_name, goes_on=False):
                 row, code = _run(dataclasses.replace(run, seed=seed, out=home), made, meta, home, command)
             found[seed] = row

@@ -14,7 +14,7 @@ def train(call, monkeypatch):
     """``train(*flags) -> (exit status, stdout, stderr)``: a tiny run of ``STEPS`` steps, in the test's own folder."""
     monkeypatch.setattr(ManipulationEnv, "physics", Kinematic())
     monkeypatch.setattr(compiled, "make_learner", faults_run.learner)
-    monkeypatch.setattr(compiled, "starter", faults_run.starter)
+    monkeypatch.setattr(compiled, "Fresh", faults_run.fresh)
     monkeypatch.setattr(compiled, "compile", faults_run.compile)
 
     def run(*flags, steps=STEPS):

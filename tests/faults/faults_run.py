@@ -13,9 +13,9 @@ STEPS = 640  # ten chunks of two iterations of 32 env steps
 CHUNK = 64
 
 _learners: dict = {}
-_starters: dict = {}
+_fresh: dict = {}
 _programs: dict = {}
-_make, _start, _compile = compiled.make_learner, compiled.starter, compiled.compile
+_make, _Fresh, _compile = compiled.make_learner, compiled.Fresh, compiled.compile
 
 
 def learner(run):
@@ -25,15 +25,15 @@ def learner(run):
     return _learners[key]
 
 
-def starter(learner, bank, programs=None):
-    if id(learner) not in _starters:
-        _starters[id(learner)] = _start(learner, bank, programs)
-    return _starters[id(learner)]
+def fresh(learner, bank=None, programs=None):
+    if id(learner) not in _fresh:
+        _fresh[id(learner)] = _Fresh(learner, bank, programs)
+    return _fresh[id(learner)]
 
 
-def compile(run, learner, chunk, start, programs):
+def compile(run, learner, chunk, start, programs, trace):
     if (id(learner), chunk) not in _programs:
-        _programs[id(learner), chunk] = _compile(run, learner, chunk, start, programs)
+        _programs[id(learner), chunk] = _compile(run, learner, chunk, start, programs, trace)
     return dataclasses.replace(_programs[id(learner), chunk], state=start())
 
 

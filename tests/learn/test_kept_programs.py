@@ -46,8 +46,8 @@ def started(run):
     """Starts a run; returns its parts, with what two calls of its program and its evaluation give, as bytes."""
     learner = compiled.make_learner(run)
     shelved = programs.Programs(run, learner)
-    start = compiled.starter(learner, None, shelved)
-    made = compiled.compile(run, learner, 1, lambda: start(run.seed), shelved)
+    start = compiled.Fresh(learner, None, shelved)
+    made = compiled.compile(run, learner, 1, lambda: start.placed(run.seed), shelved)
     state, metrics = made.advance(made.advance(made.state)[0])
     told = [np.asarray(x).tobytes() for x in jax.tree.leaves((state, metrics))]
     return made, told, made.evaluate(state)

@@ -82,18 +82,18 @@ def test_what_does_not_go_together_is_refused(quick):
 
 
 def test_it_trains_is_resumed_and_goes_on_from_a_student(quick, call, tmp_path, monkeypatch):
-    happened, starter = [], compiled.starter
+    happened, make = [], compiled.Fresh.__call__
 
     def prepare(self, *_):
         time.sleep(0.5)
         happened.append("prepared")
 
-    def starting(*given):
-        start = starter(*given)
-        return lambda seed: (happened.append("started"), start(seed))[1]
+    def started(fresh, seed):
+        happened.append("started")
+        return make(fresh, seed)
 
     monkeypatch.setattr(ManipulationEnv, "prepare", prepare)
-    monkeypatch.setattr(compiled, "starter", starting)
+    monkeypatch.setattr(compiled.Fresh, "__call__", started)
     flags = ["--preset", "rgb_fixed", "--num-envs", 8, "--no-video", "--env.episode_length_s", 0.2, "--learner", "pixels"]
     flags += ["--pixels.unroll_length", 4, "--pixels.minibatch_size", 16]
     flags += ["--pixels.student.channels", "(8, 8)", "--pixels.student.features", 8]

@@ -11,7 +11,7 @@ from mjx_nero import UserError
 from mjx_nero.config.registry import Registry
 from mjx_nero.learn import checkpoint, learner
 from mjx_nero.learn.learner import Kind
-from mjx_nero.runs import resume
+from mjx_nero.runs import compiled, resume
 
 META = {
     "env": "nero_lift",
@@ -92,10 +92,10 @@ def test_networks_that_are_not_finite_are_refused(three, kind, tmp_path):
         checkpoint.save(path, {"w": np.array([1.0, 2.0, last], np.float32)}, {**META, "learner": "three", "kind": kind})
         source = resume.find(path, print)
         if np.isfinite(last):
-            assert resume.state(source, Learner(), 0)["w"].tolist() == [1.0, 2.0, 3.0]
+            assert resume.state(source, compiled.Fresh(Learner()), 0)["w"].tolist() == [1.0, 2.0, 3.0]
         else:
             with pytest.raises(UserError, match=r"a.safetensors holds numbers that are not finite, in \['w'\]"):
-                resume.state(source, Learner(), 0)
+                resume.state(source, compiled.Fresh(Learner()), 0)
 
 
 def test_networks_of_other_sizes_are_refused(three, tmp_path):
@@ -108,7 +108,7 @@ def test_networks_of_other_sizes_are_refused(three, tmp_path):
             return {"w": jnp.zeros(4)}
 
     with pytest.raises(UserError, match=r"a.safetensors does not fit: \['w'\] is \(3,\), expected \(4,\)$"):
-        resume.state(resume.find(path, print), Wider(), 0)
+        resume.state(resume.find(path, print), compiled.Fresh(Wider()), 0)
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,7 @@ class Runs:
         return {**state, "iteration": state["iteration"] + iterations}, {"sum/nan": nans, "sum/overflow": jnp.zeros(())}
 
     @staticmethod
-    def compiled(run, runs, chunk, start, programs):
+    def compiled(run, runs, chunk, start, programs, trace):
         return compiled.Compiled(runs, chunk, lambda state: runs.run(state, chunk), start(), runs.evaluate, 0.0)
 
     def evaluate(self, state):
@@ -206,7 +206,7 @@ def test_learning_of_several_seeds(call, tmp_path, monkeypatch):
     runs = Runs([[0.0, 0.5, 0.95, 1.0, 1.0], [0.2, 1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.2, 0.9, 0.94]])
     asked = []
     monkeypatch.setattr(compiled, "make_learner", lambda run: asked.append(run) or runs)
-    monkeypatch.setattr(compiled, "starter", lambda runs, *_: lambda seed: runs.init(jax.random.PRNGKey(seed)))
+    monkeypatch.setattr(compiled.Fresh, "placed", lambda self, seed: runs.init(jax.random.PRNGKey(seed)))
     monkeypatch.setattr(compiled, "compile", Runs.compiled)
     argv = ["--what", "learning", "--num-envs", 8, "--impl", "native", "--seeds", 3, "--num-timesteps", 70, "--eval-every", 29]
     fields = ["--ppo.max_learning_rate", "5e-4", "--env.episode_length_s", "2"]
@@ -226,9 +226,7 @@ def test_learning_goes_on_with_the_seeds_that_are_missing(call, tmp_path, monkey
     """A kill in seed 1 keeps seed 0; the same command trains the others, another command all."""
     runs, begun = Runs([[0.0, 1.0]] * 3), []
     monkeypatch.setattr(compiled, "make_learner", lambda run: runs)
-    monkeypatch.setattr(
-        compiled, "starter", lambda runs, *_: lambda seed: begun.append(seed) or runs.init(jax.random.PRNGKey(seed))
-    )
+    monkeypatch.setattr(compiled.Fresh, "placed", lambda self, seed: begun.append(seed) or runs.init(jax.random.PRNGKey(seed)))
     monkeypatch.setattr(compiled, "compile", Runs.compiled)
     argv = [
         "--what",

@@ -48,15 +48,15 @@ def measure_learning(run: RunCfg, seeds: int, target: float, kept: Sequence[Row]
 def _measured(run: RunCfg, learner: Learner, chunk: int, seeds: Sequence[int], target: float) -> Iterator[Row]:
     """Compiles the run once and trains these seeds."""
     begun, programs = time.perf_counter(), Programs(run, learner)
-    fresh = compiled.starter(learner, starts.Maker(learner, training.speaker()), programs)
-    made = compiled.compile(run, learner, chunk, lambda: fresh(0), programs)
+    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker()), programs)
+    made = compiled.compile(run, learner, chunk, lambda: fresh.placed(0), programs, lambda beside: fresh.trace(0, beside))
     with signals.after_this(training.speaker()) as stop:
         state, _ = jax.block_until_ready(made.advance(made.state))  # loads what the backend compiles at its first call
         made.evaluate(state)
         compile_s, calls = time.perf_counter() - begun, math.ceil(run.num_timesteps / made.steps)
         for seed in seeds:
             signals.check(stop)
-            yield {"seed": seed, **_trained(made, fresh, calls, seed, target, stop), "compile_s": round(compile_s, 1)}
+            yield {"seed": seed, **_trained(made, fresh.placed, calls, seed, target, stop), "compile_s": round(compile_s, 1)}
 
 
 def _trained(

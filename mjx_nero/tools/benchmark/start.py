@@ -21,7 +21,7 @@ from mjx_nero.tools.benchmark.program import Row
 
 _MISSED = "/compilation_cache/cache_misses"  # JAX's event for a program that it compiles
 # As ``train.py`` begins.
-_CHILD = "from mjx_nero.tools import cli; cli.collect_seldom(); from mjx_nero.tools.benchmark import command; command.begin()"
+_CHILD = "from mjx_nero.tools import cli; cli.tune_python(); from mjx_nero.tools.benchmark import command; command.begin()"
 
 
 def measure_start(argv: Sequence[str], run: RunCfg) -> Iterator[Row]:
@@ -85,8 +85,10 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         learner = compiled.make_learner(run)
         device_memory.check(learner)
     before = time.time() - spawned
-    bank, programs = starts.Maker(learner, training.speaker()), Programs(run, learner)
-    made = training.prepare(run, learner, lambda: compiled.starter(learner, bank, programs)(0), pathlib.Path("start"), programs)
+    programs = Programs(run, learner)
+    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker()), programs)
+    place = pathlib.Path("start")
+    made = training.prepare(run, learner, lambda: fresh.placed(0), place, programs, lambda beside: fresh.trace(0, beside))
     with spans.span("first evaluation"):
         made.evaluate(made.state)
     with spans.span("first iterations"):

@@ -55,7 +55,7 @@ def training(learner: Learner, iterations: int) -> Program:
         return state, {name: metrics.get(f"sum/{name}", 0.0) * iterations for name in ("nan", "overflow")}
 
     def start():
-        return compiled.starter(learner)(0)
+        return compiled.Fresh(learner).placed(0)
 
     return Program.compiled(run, start, iterations * learner.steps_per_iteration, learner.env.unwrapped.physics.compiler_options)
 
