@@ -112,8 +112,10 @@ class Fresh:
         self._jitted = jax.jit(self.init, compiler_options=machines.untuned())
 
     def trace(self, seed: int, beside: concurrent.futures.Executor) -> None:
-        """Traces now what a seed's state needs and no earlier run has kept, and begins to compile it: two threads that trace are
-        both late."""
+        """Traces what a seed's state needs, unless an earlier run has kept the state, and begins to compile it.
+
+        Two threads that trace at once are both late, so ``compile`` calls this where it traces everything else.
+        """
         if self._programs and self._programs.has_state(seed, _names(self._bank)):
             return
         self._lowered  # noqa: B018
@@ -182,8 +184,8 @@ def compile(
 ) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile.
 
-    All is traced in this thread, what takes longest to compile first; to trace and to import is Python, and one thread at a time
-    runs that. All that does without Python goes on beside it: compilers, kernels, and a script that demonstrates.
+    This thread traces everything, and first what takes longest to compile, because one thread at a time runs Python. Compilers,
+    kernels and the expert's episodes run beside it.
 
     Args:
         chunk: iterations per call.
