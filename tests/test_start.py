@@ -163,6 +163,19 @@ def test_the_first_state_compiles_beside_the_expert(able, programs):
     assert sum("init" in name for name in programs) == (1 if able else 2)
 
 
+def test_the_first_states_program_is_traced_and_compiled_before_the_experts(programs):
+    """What comes between is a GPU's kernels. XLA takes longer for the first state than an expert for its episodes."""
+    traced = []
+    expert = Slow(programs, {})
+    expert.trace = traced.append
+    fresh = compiled.Fresh(types.SimpleNamespace(init=lambda key, bank=None: key[1] + bank.sum()), expert)
+    with concurrent.futures.ThreadPoolExecutor() as beside:
+        steps = fresh.trace(3, beside)
+        next(steps)
+    assert not traced and sum("init" in name for name in programs) == 1  # the pool has ended, so it has compiled
+    assert list(steps) == [] and traced == [3]
+
+
 def test_an_experts_program_is_for_the_processor(monkeypatch):
     """So that every machine gets the same states, whatever traces it."""
     asked = []

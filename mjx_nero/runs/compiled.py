@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -111,15 +111,16 @@ class Fresh:
         self.learner, self._bank, self._programs = learner, bank, programs
         self._jitted = jax.jit(self.init, compiler_options=machines.untuned())
 
-    def trace(self, seed: int, beside: concurrent.futures.Executor) -> None:
-        """Traces what a seed's state needs, unless an earlier run has kept the state, and begins to compile it.
+    def trace(self, seed: int, beside: concurrent.futures.Executor) -> Iterator[None]:
+        """Traces what a seed's state needs, a program at a time, unless an earlier run has kept the state. Begins to compile it.
 
-        Two threads that trace at once are both late, so ``compile`` calls this where it traces everything else.
+        Two threads that trace at once are both late, so ``compile`` goes through this where it traces everything else.
         """
         if self._programs and self._programs.has_state(seed, _names(self._bank)):
             return
         self._lowered  # noqa: B018
         beside.submit(lambda: self._compiled)
+        yield
         if self._bank:
             self._bank.trace(seed)
 
@@ -180,7 +181,7 @@ def compile(
     chunk: int,
     start: Callable[[], Any],
     programs: Programs,
-    trace: Callable[[concurrent.futures.Executor], None] = lambda beside: None,
+    trace: Callable[[concurrent.futures.Executor], Iterator[None]] = lambda beside: iter(()),
 ) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile.
 
@@ -191,7 +192,7 @@ def compile(
         chunk: iterations per call.
         start: makes the first state, placed on the devices.
         programs: where the run's programs are kept.
-        trace: traces what ``start`` needs, and compiles it in an executor.
+        trace: traces what ``start`` needs, a program at a time: see ``Fresh.trace``.
 
     Raises:
         UserError: the run does not fit into memory.
@@ -212,9 +213,13 @@ def compile(
             given, options = (learner.place(shapes),), env.physics.compiler_options
             program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
+        tracing = trace(side_by_side)
         with spans.span("first state, lowered"):
-            trace(side_by_side)
+            next(tracing, None)
+        # Before the expert is traced: on a new machine these kernels take as long as the learner's program.
         physics = side_by_side.submit(spans.timed("physics", prepare))
+        with spans.span("expert, lowered"):
+            next(tracing, None)
         # A state with pictures draws them. Two threads may not use Warp at once: its streams belong to the process.
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         if env.cfg.scene.cameras:
