@@ -109,7 +109,7 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
         "FIRST_GEOM": np.searchsorted(m.geom_bodyid, bodies),
         "STANDS": stands,
         "FREE_BODY": free,
-        "FLIES": np.isin(m.dof_bodyid, free),
+        "FLIES": [any(begin <= b < end for b in free) for begin, end in itertools.pairwise(parts)],
         "FREE_AT": [free.index(b) if b in free else -1 for b in range(m.nbody)],
         "JOINT_OF_DRIVE": m.actuator_trnid[:, 0],
         "AFFINE": m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,

@@ -17,17 +17,13 @@ float *qpos = in.qpos.data + (size_t)world * NQ, *qvel = in.qvel.data + (size_t)
 float own_x[DOFS], *const x = own_x - first_dof;  // one tree's, at the model's indices
 
 // A = M - h dF/dv = L' D L from the last row on, L and D's inverse in A's place; rows of ancestors are prefixes of those below them.
-// Bodies that fly freely come after.
+// A tree that is a body which flies freely comes after.
+const int end_chain = FLIES[part] ? first_dof : end_dof;
 float own_A[ENTRIES], *const A = own_A - ROW[first_dof];
+for (int k = ROW[first_dof]; k < ROW[end_chain]; ++k) A[k] = M[k];
+for (int i = first_dof; i < end_chain; ++i) x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
 #pragma unroll 1
-for (int i = first_dof; i < end_dof; ++i) {
-    if (FLIES[i]) continue;
-    for (int k = ROW[i]; k < ROW[i + 1]; ++k) A[k] = M[k];
-    x[i] = Ma[i], A[ROW[i + 1] - 1] += h * implicit[i];
-}
-#pragma unroll 1
-for (int i = end_dof - 1; i >= first_dof; --i) {
-    if (FLIES[i]) continue;
+for (int i = end_chain - 1; i >= first_dof; --i) {
     const int begin = ROW[i], last = ROW[i + 1] - 1;
     const float inverse = 1.0f / A[last];
     A[last] = inverse;
@@ -41,8 +37,7 @@ for (int i = end_dof - 1; i >= first_dof; --i) {
     }
 }
 #pragma unroll 1
-for (int i = first_dof; i < end_dof; ++i) {
-    if (FLIES[i]) continue;
+for (int i = first_dof; i < end_chain; ++i) {
     x[i] *= A[ROW[i + 1] - 1];
     for (int k = ROW[i]; k < ROW[i + 1] - 1; ++k) x[i] -= A[k] * x[COLUMN[k]];
 }
