@@ -22,6 +22,8 @@ from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
+Trace = Callable[[concurrent.futures.Executor], Iterator[None]]  # see ``Fresh.trace``
+
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
@@ -181,7 +183,7 @@ def compile(
     chunk: int,
     start: Callable[[], Any],
     programs: Programs,
-    trace: Callable[[concurrent.futures.Executor], Iterator[None]] = lambda beside: iter(()),
+    trace: Trace | None = None,
 ) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile.
 
@@ -192,7 +194,7 @@ def compile(
         chunk: iterations per call.
         start: makes the first state, placed on the devices.
         programs: where the run's programs are kept.
-        trace: traces what ``start`` needs, a program at a time: see ``Fresh.trace``.
+        trace: traces what ``start`` needs, a program at a time: see ``Fresh.trace``. None: ``start`` traces it itself.
 
     Raises:
         UserError: the run does not fit into memory.
@@ -213,7 +215,7 @@ def compile(
             given, options = (learner.place(shapes),), env.physics.compiler_options
             program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
         compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
-        tracing = trace(side_by_side)
+        tracing = trace(side_by_side) if trace else iter(())
         with spans.span("first state, lowered"):
             next(tracing, None)
         # Before the expert is traced: on a new machine these kernels take as long as the learner's program.

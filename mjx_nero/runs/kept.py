@@ -61,7 +61,7 @@ class Shelf:
         """Reads what ``write`` has written, as a tree like the one that ``template`` makes of the description; None if it is
         missing or damaged."""
         path = self._path(name)
-        if path is None or not self.has(name):
+        if path is None or not path.is_file():
             return None
         try:
             about = checkpoint.load_meta(path)

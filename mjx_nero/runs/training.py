@@ -1,10 +1,9 @@
 """A training run: compile, loop, finish. All its results are left in its folder."""
 
-import concurrent.futures
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -72,7 +71,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         programs = Programs(run, learner)
         fresh = compiled.Fresh(learner, starts.Maker(learner, say, new=source is None), programs)
         begin = functools.partial(resume.state, source, fresh, run.seed)
-        trace = functools.partial(fresh.trace, run.seed) if source is None else lambda beside: iter(())
+        trace = functools.partial(fresh.trace, run.seed) if source is None else None
         made = prepare(run, learner, begin, folder, programs, trace)
         return carry_out(run, made, tally, meta, folder, command)
 
@@ -116,7 +115,7 @@ def prepare(
     start: Callable[[], Any],
     folder: pathlib.Path,
     programs: Programs,
-    trace: Callable[[concurrent.futures.Executor], Iterator[None]],
+    trace: compiled.Trace | None,
 ) -> Compiled:
     """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
