@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from mjx_nero.envs import env
+from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, machines
 from mjx_nero.learn.learner import state_shape
 from mjx_nero.learn.play import rollout
@@ -85,33 +86,46 @@ def test_what_a_training_imports_before_it_begins():
     assert "mjx_nero.runs.training" in found and not found & SELDOM
 
 
-def test_all_is_traced_in_one_thread_and_the_evaluation_beside_the_first_state(monkeypatch):
+def test_one_thread_traces_what_training_waits_for_and_the_evaluation_is_made_beside_it(monkeypatch):
     """A first state waits for the expert, whose program takes seconds to trace and minutes to compile."""
     run = cfg.resolve("nero_reach", "default", None, {"episode_length_s": 0.2}, {"num_envs": 8}, impl="native")
     run = dataclasses.replace(run, eval_episodes=2)
-    learner, traced, order = compiled.make_learner(run), threading.Event(), []
-    compiler, lower = compiled.Evaluator.compiler, Programs.lower
-
-    def noted(self, shapes):
-        traced.set()
-        return compiler(self, shapes)
+    learner, begun, order = compiled.make_learner(run), threading.Event(), []
+    lower = Programs.lower
 
     def lowered(self, name, *rest, **options):
         order.append((name.partition("-")[0], threading.current_thread()))
+        if name.startswith("evaluation"):
+            assert begun.wait(120)
         return lower(self, name, *rest, **options)
 
     programs = Programs(run, learner)
     fresh = compiled.Fresh(learner, None, programs)
-
-    def start():
-        assert traced.wait(120)
-        return fresh.placed(0)
-
-    monkeypatch.setattr(compiled.Evaluator, "compiler", noted)
     monkeypatch.setattr(Programs, "lower", lowered)
-    made = compiled.compile(run, learner, 1, start, programs, lambda beside: fresh.trace(0, beside))
-    assert order == [(name, threading.current_thread()) for name in ("run", "init", "evaluation")]
-    assert 0.0 <= made.evaluate(made.state)["success_rate"] <= 1.0  # the program takes what was foreseen
+    made = compiled.compile(run, learner, 1, lambda: fresh.placed(0), programs, lambda beside: fresh.trace(0, beside))
+    state, _ = made.advance(made.state)  # training has begun, and no evaluation has been traced
+    begun.set()
+    assert 0.0 <= made.evaluate(state)["success_rate"] <= 1.0  # the program takes what was foreseen
+    here = threading.current_thread()
+    assert [(name, thread is here) for name, thread in order] == [("run", True), ("init", True), ("evaluation", False)]
+    stages = {span.name: span for span in made.spans}
+    assert stages["evaluation, compiled"].begun > stages["learner, compiled"].begun
+
+
+def test_an_evaluation_that_cannot_be_made_says_so_when_it_is_asked_for(monkeypatch):
+    run = cfg.resolve("nero_reach", "default", None, {"episode_length_s": 0.2}, {"num_envs": 8}, impl="native")
+    learner, lower = compiled.make_learner(run), Programs.lower
+
+    def lowered(self, name, *rest, **options):
+        if name.startswith("evaluation"):
+            raise UserError("no room")
+        return lower(self, name, *rest, **options)
+
+    monkeypatch.setattr(Programs, "lower", lowered)
+    made = compiled.compile(run, learner, 1, lambda: learner.init(jax.random.PRNGKey(0)), Programs(run, learner))
+    for evaluate in (made.evaluate, made.evaluate.of_seed(3)):
+        with pytest.raises(UserError, match="no room"):
+            evaluate(made.state)
 
 
 @pytest.mark.parametrize(("env", "learner"), [("nero_reach", "ppo"), ("nero_lift", "pixels"), ("nero_lift", "distill")])

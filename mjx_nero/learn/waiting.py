@@ -21,6 +21,14 @@ def result_of(function: Callable[..., Any], *args: Any) -> Any:
     return begun(function, *args, daemon=True)()  # an interrupted program does not wait for it
 
 
+def ahead(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
+    """Begins a call of a compiled function, goes on beside it, and returns the function that waits for its result."""
+    if jax.default_backend() == "cpu":
+        return begun(function, *args)
+    found = function(*args)  # a device still computes it
+    return lambda: found
+
+
 def begun(function: Callable[..., Any], *args: Any, daemon: bool = False) -> Callable[[], Any]:
     """Begins a call as ``result_of`` does, and returns the function that waits for its result.
 

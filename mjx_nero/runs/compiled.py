@@ -57,11 +57,8 @@ class Evaluator:
     """
 
     def __init__(self, run: RunCfg, learner: Learner, programs: Programs):
-        impl = "warp" if learner.env.unwrapped.impl == "warp" else "native"
-        self._env = ManipulationEnv(run.env.uncorrupted(), impl=impl, num_envs=run.eval_episodes)
-        self._seed, self._policy, self._programs = run.seed, learner.policy, programs
-        self._play = rollout.player(self._env, lambda params, obs, _: learner.act(params, obs), run.eval_episodes)
-        self._program: Any = None
+        self._run, self._seed, self._learner, self._programs = run, run.seed, learner, programs
+        self._made: concurrent.futures.Future[tuple[ManipulationEnv, Any]] = concurrent.futures.Future()
 
     def of_seed(self, seed: int) -> "Evaluator":
         """Returns the same program with another seed's episodes."""
@@ -69,27 +66,35 @@ class Evaluator:
         other._seed = seed
         return other
 
-    def compiler(self, state: Any) -> Callable[[], None]:
-        """Lowers the program, given a state or its shapes, and returns a call that compiles it in any thread."""
+    def make(self, state: Any, spans: Spans) -> None:
+        """Makes environments and program, given a state or its shapes. Another thread may call it; evaluations wait for it."""
+        try:
+            with spans.span("evaluation, lowered"):
+                env, lowered = self._lowered(state)
+            with spans.span("evaluation, compiled"):
+                self._made.set_result((env, lowered.compile()))
+        except BaseException as error:
+            self._made.set_exception(error)
+
+    def _lowered(self, state: Any) -> tuple[ManipulationEnv, jax.stages.Lowered]:
+        run, learner = self._run, self._learner
+        impl, n = "warp" if learner.env.unwrapped.impl == "warp" else "native", run.eval_episodes
+        env = ManipulationEnv(run.env.uncorrupted(), impl=impl, num_envs=n)
+        play = rollout.player(env, lambda params, obs, _: learner.act(params, obs), n)
 
         def totals(*args: Any) -> tuple[Any, dict[str, jax.Array]]:
-            return (), self._play(*args)[0]
+            return (), play(*args)[0]
 
-        n = self._env.num_envs
-        args = self._policy(state), *rollout.keys_of(0, n)
+        args = learner.policy(state), *rollout.keys_of(0, n)
         with machines.small():
-            lowered = self._programs.lower(f"evaluation-{n}", totals, args, (), self._env, options=machines.untuned())
-
-        def compile() -> None:
-            self._program = lowered.compile()
-
-        return compile
+            return env, self._programs.lower(f"evaluation-{n}", totals, args, (), env, options=machines.untuned())
 
     def __call__(self, state: Any) -> dict[str, Any]:
-        """Plays the episodes; ``compiler``'s call comes first."""
-        keys = rollout.keys_of(self._seed, self._env.num_envs)
-        _, totals = waiting.result_of(self._program, self._policy(state), *keys)
-        return rollout.totals_of(totals, self._env.cfg.metrics).summary()
+        """Plays the episodes."""
+        env, program = self._made.result()
+        keys = rollout.keys_of(self._seed, env.num_envs)
+        _, totals = waiting.result_of(program, self._learner.policy(state), *keys)
+        return rollout.totals_of(totals, env.cfg.metrics).summary()
 
 
 def make_learner(run: RunCfg) -> Learner:
@@ -185,10 +190,10 @@ def compile(
     programs: Programs,
     trace: Trace | None = None,
 ) -> Compiled:
-    """Compiles a run's programs, and makes its first state meanwhile.
+    """Compiles a run's programs, and makes its first state meanwhile. The evaluation's is still in the making when it returns.
 
-    This thread traces everything, and first what takes longest to compile, because one thread at a time runs Python. Compilers,
-    kernels and the expert's episodes run beside it.
+    This thread traces what training waits for, and first what takes longest to compile, because one thread at a time runs Python.
+    Compilers, kernels and the expert's episodes run beside it, and then the evaluation is traced.
 
     Args:
         chunk: iterations per call.
@@ -226,14 +231,14 @@ def compile(
         starting = side_by_side.submit(_after, physics if env.cfg.scene.cameras else None, start)
         if env.cfg.scene.cameras:
             starting.result()
-        with spans.span("evaluation, lowered"):
-            evaluate = Evaluator(run, learner, programs)
-            compiler = evaluate.compiler(shapes)
-        evaluating = side_by_side.submit(spans.timed("evaluation, compiled", compiler))
+        # Last, because training begins without it, unless it draws pictures.
+        evaluate = Evaluator(run, learner, programs)
+        evaluating = side_by_side.submit(_after, physics, functools.partial(evaluate.make, shapes, spans))
+        if env.cfg.scene.cameras:
+            evaluating.result()
         physics.result()  # if memory is short, its error says how many environments fit
         state, made = starting.result(), compiling.result()
         device_memory.check_compiled(learner, made)
-        evaluating.result()
     return Compiled(learner, chunk, made, state, evaluate, time.perf_counter() - begun, spans.found)
 
 
@@ -247,7 +252,7 @@ def _after(first: concurrent.futures.Future | None, start: Callable[[], Any]) ->
 @contextlib.contextmanager
 def _threads():
     """Opens an executor that lets errors and Ctrl-C through without waiting for its threads."""
-    pool = concurrent.futures.ThreadPoolExecutor()
+    pool = concurrent.futures.ThreadPoolExecutor(max_workers=8)  # nothing waits for a place
     try:
         yield pool
     finally:

@@ -1,10 +1,13 @@
 """The training loop, from compiled programs to the last checkpoint."""
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
 from typing import Any
+
+import jax
 
 from mjx_nero.errors import UserError
 from mjx_nero.learn import checkpoint, learner, machines, waiting
@@ -18,6 +21,7 @@ from mjx_nero.runs.signals import Stop
 from mjx_nero.types import LEVEL
 
 _ROWS = 2000  # rows of metrics per run, besides evaluations
+_Ahead = tuple[float, Callable[[], tuple[Any, Any]]]  # when a chunk began, and what waits for its state and metrics
 
 
 @dataclasses.dataclass
@@ -103,16 +107,14 @@ class Loop:
             "row": max(1, total // _ROWS),
         }
         due = {name: _next(tally.steps, steps) for name, steps in every.items()}
+        ahead: _Ahead | None = None
         if not tally.steps:
-            self._evaluate(state)
-            self._log({})
-            self._save(state)
-            if ended := self._ended(self._agree(0.0)[0]):
-                self.checkpoints.wait()
+            ended, ahead = self._first(state)
+            if ended:
                 return ended
         while True:
-            t = time.perf_counter()
-            state, metrics = waiting.result_of(self.made.advance, state)
+            t, take = ahead or (time.perf_counter(), functools.partial(waiting.result_of, self.made.advance, state))
+            (state, metrics), ahead = take(), None
             means = {name: float(value) for name, value in metrics.items()}  # waits for the device
             tally.steps_per_s = self.made.steps / (time.perf_counter() - t)
             tally.steps += self.made.steps
@@ -142,6 +144,27 @@ class Loop:
             if ended:
                 self.checkpoints.wait()
                 return ended
+
+    def _first(self, state: Any) -> tuple[str, _Ahead | None]:
+        """Evaluates and saves the first state, and begins the first chunk before that: the evaluation's program may still be in
+        the making.
+
+        Returns:
+            why training ends here, empty if it does not; and the chunk, if it has begun.
+        """
+        ahead = None
+        if not self.made.learner.env.unwrapped.cfg.scene.cameras:  # programs that draw run one after another
+            own = jax.device_put(state, jax.tree.map(lambda x: x.sharding, state), may_alias=False)
+            ahead = time.perf_counter(), waiting.ahead(self.made.advance, own)
+        self._evaluate(state)
+        self._log({})
+        self._save(state)
+        ended = self._ended(self._agree(0.0)[0])
+        if ended:
+            self.checkpoints.wait()
+            if ahead:
+                ahead[1]()  # JAX may crash if the process ends meanwhile
+        return ended, ahead
 
     def _agree(self, unsaved: float) -> tuple[int, float, float]:
         """Returns any process's signal (0: none) and the first process's clocks [s].

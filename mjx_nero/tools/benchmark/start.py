@@ -89,10 +89,10 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
     fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker()), programs)
     place = pathlib.Path("start")
     made = training.prepare(run, learner, lambda: fresh.placed(0), place, programs, lambda beside: fresh.trace(0, beside))
-    with spans.span("first evaluation"):
-        made.evaluate(made.state)
     with spans.span("first iterations"):
-        jax.block_until_ready(made.advance(made.state))
+        state, _ = jax.block_until_ready(made.advance(made.state))
+    with spans.span("first evaluation"):
+        made.evaluate(state)
     stages = [Span("imports", 0.0, imported - spawned), Span("config", imported - spawned, spawned + so_far - imported)]
     stages += [Span(name, begun + so_far, seconds) for name, begun, seconds in spans.found]
     stages += [Span(name, begun + before, seconds) for name, begun, seconds in made.spans]
