@@ -107,9 +107,10 @@ def test_one_thread_traces_what_training_waits_for_and_the_evaluation_is_made_be
     begun.set()
     assert 0.0 <= made.evaluate(state)["success_rate"] <= 1.0  # the program takes what was foreseen
     here = threading.current_thread()
-    assert [(name, thread is here) for name, thread in order] == [("run", True), ("init", True), ("evaluation", False)]
+    traced = [(name, thread is here) for name, thread in order]
+    assert traced == [*((name, True) for name in ("starts", "rollout", "update", "init")), ("evaluation", False)]
     stages = {span.name: span for span in made.spans}
-    assert stages["evaluation, compiled"].begun > stages["learner, compiled"].begun
+    assert stages["evaluation, compiled"].begun > stages["update, compiled"].begun
 
 
 def test_an_evaluation_that_cannot_be_made_says_so_when_it_is_asked_for(monkeypatch):

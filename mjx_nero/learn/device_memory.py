@@ -7,7 +7,7 @@ Warp's buffers lie outside XLA's memory and are counted separately.
 import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
@@ -92,13 +92,13 @@ def check_batch(env: ManipulationEnv, count: int, name: str, kept: float = 0.0) 
             )
 
 
-def check_compiled(learner: Learner, program: Any) -> None:
-    """Checks that the compiled ``Learner.run`` fits, by what XLA says.
+def check_compiled(learner: Learner, programs: Iterable[Any]) -> None:
+    """Checks that a learner's compiled programs fit, by what XLA says.
 
     Raises:
-        UserError: it does not.
+        UserError: they do not.
     """
-    used = program_bytes(program)
+    used = largest(programs)
     if used is not None:
         fixed, _ = learner.footprint()
         per_env = (used - fixed) * learner.num_devices / learner.num_envs
@@ -134,6 +134,11 @@ def program_bytes(program: Any) -> int | None:
     if use is None:
         return None
     return use.argument_size_in_bytes + use.output_size_in_bytes + use.temp_size_in_bytes - use.alias_size_in_bytes
+
+
+def largest(programs: Iterable[Any]) -> int | None:
+    """Returns the device memory of that one of some programs which takes most [bytes]; None if unknown."""
+    return max(filter(None, map(program_bytes, programs)), default=None)
 
 
 def size(tree: Any) -> int:

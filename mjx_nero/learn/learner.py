@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = 64  # episodes that an expert plays for a learner
 ROWS = 256  # rows of ``types.Shown`` for each of them
+PRECISION = "float32"  # of products, where a learner asks for no other
 HELD = {"[0]": ".normalizer", "[1]": ".params"}  # ``Kind.held`` of a state with these two
 Params = Any  # a policy's parameters: a pytree of arrays
 Metrics = dict[str, "jax.Array"]
@@ -67,6 +68,10 @@ class Learner(Protocol):
         ``sum/<name>`` is an environment's metric summed over an iteration.
         """
 
+    def parts(self) -> "tuple[Part, ...]":
+        """Returns what an iteration is made of, if its parts may be programs of their own, which compile side by side."""
+        return ()
+
     def policy(self, state: Any) -> Params:
         """Returns the policy's parameters on one device, or their shapes if it gets the state's."""
         return state.normalizer, state.params
@@ -86,6 +91,22 @@ class Learner(Protocol):
 
     def footprint(self) -> tuple[float, float]:
         """Estimates the memory of ``run`` on a device [bytes]: the fixed part, and the part per environment."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of an iteration.
+
+    Attributes:
+        name: what it does, for people and for the names of kept programs.
+        function: (state, what the part before gives) -> state and what it gives. The first part gets nothing that it needs, the
+            last one gives metrics as ``Learner.run`` does. Pure.
+        small: it draws too rarely for the speed of random numbers to matter (see ``machines.small``).
+    """
+
+    name: str
+    function: Callable[[Any, Any], tuple[Any, Any]]
+    small: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +155,7 @@ def repeated(iterate: Callable[[Any], tuple[Any, Metrics]], state: Any, iteratio
     """Repeats an iteration, as ``Learner.run`` does; returns the state and the mean metrics."""
     import jax  # not needed for names and configs
 
-    with jax.default_matmul_precision("float32"):
+    with jax.default_matmul_precision(PRECISION):
         state, metrics = jax.lax.scan(lambda s, _: iterate(s), state, length=iterations)
     return state, {name: value.mean() for name, value in metrics.items()}
 

@@ -19,6 +19,7 @@ from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.iteration import Iterations, Lowered
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
@@ -38,7 +39,7 @@ class Compiled:
 
     learner: Learner
     chunk: int
-    advance: Callable[[Any], tuple[Any, Metrics]]
+    advance: Iterations | Callable[[Any], tuple[Any, Metrics]]
     state: Any
     evaluate: "Evaluator"
     seconds: float
@@ -207,19 +208,14 @@ def compile(
     begun, env, spans = time.perf_counter(), learner.env.unwrapped, Spans()
     start = spans.timed("first state", start)
 
-    def advance(state: Any) -> tuple[Any, Metrics]:
-        return learner.run(state, chunk)
-
     def prepare() -> None:
         device_memory.check_outside(learner)
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:
         with spans.span("learner, lowered"):
-            shapes = state_shape(learner)
-            given, options = (learner.place(shapes),), env.physics.compiler_options
-            program = programs.lower(f"run-{chunk}", advance, given, shapes, env, donate=(0,), options=options)
-        compiling = side_by_side.submit(spans.timed("learner, compiled", program.compile))
+            iterations = Lowered(learner, chunk, programs)
+            compiling = iterations.compiling(side_by_side, spans)
         tracing = trace(side_by_side) if trace else iter(())
         with spans.span("first state, lowered"):
             next(tracing, None)
@@ -233,12 +229,12 @@ def compile(
             starting.result()
         # Last, because training begins without it, unless it draws pictures.
         evaluate = Evaluator(run, learner, programs)
-        evaluating = side_by_side.submit(_after, physics, functools.partial(evaluate.make, shapes, spans))
+        evaluating = side_by_side.submit(_after, physics, functools.partial(evaluate.make, state_shape(learner), spans))
         if env.cfg.scene.cameras:
             evaluating.result()
         physics.result()  # if memory is short, its error says how many environments fit
-        state, made = starting.result(), compiling.result()
-        device_memory.check_compiled(learner, made)
+        state, made = starting.result(), iterations.made(compiling)
+        device_memory.check_compiled(learner, made.programs)
     return Compiled(learner, chunk, made, state, evaluate, time.perf_counter() - begun, spans.found)
 
 
@@ -252,7 +248,7 @@ def _after(first: concurrent.futures.Future | None, start: Callable[[], Any]) ->
 @contextlib.contextmanager
 def _threads():
     """Opens an executor that lets errors and Ctrl-C through without waiting for its threads."""
-    pool = concurrent.futures.ThreadPoolExecutor(max_workers=8)  # nothing waits for a place
+    pool = concurrent.futures.ThreadPoolExecutor(max_workers=10)  # nothing waits for a place
     try:
         yield pool
     finally:

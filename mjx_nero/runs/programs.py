@@ -26,15 +26,15 @@ _REFUSED = (ValueError, TypeError, NotImplementedError, ImportError)
 
 
 class Programs:
-    """The programs and first states of a run.
+    """The programs and first states of a run; None: nothing is kept.
 
     Nothing is kept of a run that draws pictures, takes several devices, or calls code from outside of the package.
     """
 
-    def __init__(self, run: RunCfg, learner: Learner):
+    def __init__(self, run: RunCfg | None, learner: Learner):
         env = learner.env.unwrapped
         self._shelf = None
-        if learner.num_devices == 1 and not machines.several() and not env.cfg.scene.cameras:
+        if run and learner.num_devices == 1 and not machines.several() and not env.cfg.scene.cameras:
             # A run's seed and outputs are no part of its programs.
             parts = type(learner), type(env), type(env.physics), env.impl, run.env, env.cfg, run.hyperparameters
             self._shelf = kept.Shelf("programs", *parts, run.num_envs, machines.versions(), _settings())

@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import jax
@@ -72,10 +73,11 @@ class Maker:
 
     Args:
         new: the run begins with a new policy. A run from a policy file imitates no expert: that policy knows more.
+        elsewhere: the process that plays the first seed's episodes (see ``apart``); None: there is none.
     """
 
-    def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True):
-        self.say = say
+    def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True, elsewhere: BaseProcess | None = None):
+        self.say, self._elsewhere = say, elsewhere
         self._begins = isinstance(learner.env, wrappers.ExpertStarts)
         self._imitates = new and getattr(learner, "imitates", False)
         self._player: _Player | None = None
@@ -86,13 +88,16 @@ class Maker:
 
     def trace(self, seed: int) -> None:
         """Traces the expert's program now, if a call with this seed needs it."""
-        if self._player is not None and self._player.able:
+        if self._player is not None and self._player.able and self._elsewhere is None:
             with jax.default_device(processor()):
                 self._player.trace(seed)
 
     def __call__(self, seed: int) -> dict[str, Any]:
         if self._player is None:
             return {}
+        if self._elsewhere is not None and not self._player.kept(seed):
+            self._elsewhere.join()  # if it failed, this process plays
+        self._elsewhere = None
         try:
             with jax.default_device(processor()):
                 found, shown, seconds = self._player(seed)
@@ -160,9 +165,13 @@ class _Player:
         # Here, where nothing traces: each look at a file gives Python's lock away, and a thread that traces keeps it for 5 ms.
         self._kept = kept.Shelf("experts", own.cfg, control.CONTROLLERS.get(self._name), count)
 
+    def kept(self, seed: int) -> bool:
+        """True if the episodes have been played before."""
+        return self._kept.has(seed)
+
     def trace(self, seed: int) -> None:
         """Traces the program that plays the episodes, unless an earlier run has played them."""
-        if not self._kept.has(seed):
+        if not self.kept(seed):
             self._lowered  # noqa: B018
 
     def __call__(self, seed: int) -> tuple[Way, Shown, float]:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable, Mapping
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import jax
@@ -37,11 +38,12 @@ class Ended:
     lost: dict[str, int]
 
 
-def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
+def train(run: RunCfg, command: str = "train.py", expert: BaseProcess | None = None) -> dict[str, Any]:
     """Trains a policy and leaves all results in the run folder; returns the summary, the folder and an exit status.
 
     Args:
         command: the user's command, for the hint on how to resume.
+        expert: plays the expert's episodes (see ``apart.begin``); None: this process does.
 
     Raises:
         UserError: something that the user can fix: impl, folder, checkpoint, sizes.
@@ -69,7 +71,7 @@ def train(run: RunCfg, command: str = "train.py") -> dict[str, Any]:
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
         programs = Programs(run, learner)
-        fresh = compiled.Fresh(learner, starts.Maker(learner, say, new=source is None), programs)
+        fresh = compiled.Fresh(learner, starts.Maker(learner, say, source is None, expert), programs)
         begin = functools.partial(resume.state, source, fresh, run.seed)
         trace = functools.partial(fresh.trace, run.seed) if source is None else None
         made = prepare(run, learner, begin, folder, programs, trace)

@@ -6,6 +6,7 @@ import math
 import pathlib
 import statistics
 from collections.abc import Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from mjx_nero import files
@@ -37,7 +38,9 @@ class SeedRow:
     stopped: str
 
 
-def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple[list[Row], pathlib.Path, int]:
+def train(
+    run: RunCfg, seeds: Sequence[int], command: str = "train.py", expert: BaseProcess | None = None
+) -> tuple[list[Row], pathlib.Path, int]:
     """Trains each seed as ``training.train`` does, in ``seed_<n>`` of the run's folder, and writes ``seeds.json``, one row per
     seed.
 
@@ -65,7 +68,7 @@ def train(run: RunCfg, seeds: Sequence[int], command: str = "train.py") -> tuple
         if note:
             say(note)
         programs = Programs(run, learner)
-        fresh, one = compiled.Fresh(learner, starts.Maker(learner, say), programs), seeds[0]
+        fresh, one = compiled.Fresh(learner, starts.Maker(learner, say, elsewhere=expert), programs), seeds[0]
         begin, trace = functools.partial(fresh.placed, one), functools.partial(fresh.trace, one)
         made = training.prepare(dataclasses.replace(run, seed=one), learner, begin, folder, programs, trace)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}

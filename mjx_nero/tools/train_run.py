@@ -12,7 +12,7 @@ import jax
 from mjx_nero.envs.env import MAX_SPEED
 from mjx_nero.errors import UserError
 from mjx_nero.learn import learner, machines
-from mjx_nero.runs import console, resume, track, training, videos
+from mjx_nero.runs import apart, console, resume, track, training, videos
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.checkpoints import saved
 from mjx_nero.runs.folder import CONFIG
@@ -41,13 +41,14 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         **cli.fields(args, RunCfg),
     )
     run = going_on(run, flags, dotted, args.trust)
+    expert = apart.begin(dataclasses.replace(run, seed=args.seeds[0]) if args.seeds else run)
     if "num_devices" not in flags and machines.several():
         run = dataclasses.replace(run, num_devices=jax.local_device_count())
     if args.seeds:
-        rows, folder, code = seeds.train(run, args.seeds, command=cli.called_as("train"))
+        rows, folder, code = seeds.train(run, args.seeds, cli.called_as("train"), expert)
         report_seeds(rows, folder)
         sys.exit(code)
-    summary = training.train(run, command=cli.called_as("train"))
+    summary = training.train(run, cli.called_as("train"), expert)
     if not machines.first():
         sys.exit(summary["code"])
     films = args.video and not summary["code"]

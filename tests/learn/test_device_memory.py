@@ -95,10 +95,10 @@ def test_the_compiled_program_has_the_last_word(monkeypatch):
     small = learner()
     assert device_memory.program_bytes(Program()) == 10**9
     monkeypatch.setattr(device_memory, "_limit", lambda _: 1e9)
-    device_memory.check_compiled(small, Program())
+    device_memory.check_compiled(small, [Program()])
     monkeypatch.setattr(device_memory, "_limit", lambda _: 0.5e9)
     with pytest.raises(UserError, match=r"512 environments need about 1.0 GB .* pass --num-envs 2[45]\d or fewer"):
-        device_memory.check_compiled(small, Program())
+        device_memory.check_compiled(small, [Program()])
 
 
 def test_this_machine_has_memory():

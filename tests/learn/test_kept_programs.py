@@ -13,7 +13,7 @@ from mjx_nero.runs.programs import _settings as settings
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="of MuJoCo's C library in CPU programs")
 FIELDS = {"num_envs": 8, "unroll_length": 4, "num_minibatches": 2, "num_epochs": 1}
 FIELDS |= {"network.actor": (8,), "network.critic": (8,)}
-WHOLE = ["advance", "init", "totals"]
+WHOLE = ["init", "rollout", "starts", "totals", "update"]
 
 
 @pytest.fixture(autouse=True)
@@ -69,15 +69,17 @@ def read_or_lowered(run, learner=None):
 @pytest.mark.slow
 def test_a_later_start_traces_nothing_and_computes_the_same(traced, folder, monkeypatch):
     first, told, evaluation = started(asked())
-    assert sorted(traced) == WHOLE and len(list(folder.iterdir())) == 4  # three programs and the state
-    memory = first.advance.memory_analysis()
-    assert memory.alias_size_in_bytes > 0.9 * sum(x.nbytes for x in jax.tree.leaves(first.learner.init(jax.random.PRNGKey(0))))
+    assert sorted(traced) == WHOLE and len(list(folder.iterdir())) == 6  # five programs and the state
+    state = sum(x.nbytes for x in jax.tree.leaves(first.learner.init(jax.random.PRNGKey(0))))
+    assert all(each.memory_analysis().alias_size_in_bytes > 0.9 * state for each in first.advance.programs)
 
     def refuse(*_):
         raise AssertionError("traced")
 
     with monkeypatch.context() as blind:
-        blind.setattr(Learner, "run", refuse)
+        blind.setattr(Learner, "_with_starts", refuse)
+        blind.setattr(Learner, "rollout", refuse)
+        blind.setattr(Learner, "_update", refuse)
         blind.setattr(Learner, "act", refuse)
         _, again, evaluated = started(asked())
     assert again == told and evaluated == evaluation and sorted(traced) == WHOLE
@@ -97,10 +99,10 @@ def test_the_first_state_of_a_seed_is_kept(folder, monkeypatch):
     monkeypatch.setattr(programs.Programs, "lower", noted)
     run = asked()
     _, told, _ = started(run)
-    assert sorted(lowered) == ["evaluation", "init", "run"]
+    assert sorted(lowered) == ["evaluation", "init", "rollout", "starts", "update"]
     (state,) = folder.glob("*-state-0.safetensors")
     lowered.clear()
-    assert started(run)[1] == told and sorted(lowered) == ["evaluation", "run"]
+    assert started(run)[1] == told and sorted(lowered) == ["evaluation", "rollout", "starts", "update"]
     data = state.read_bytes()
     state.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
     lowered.clear()

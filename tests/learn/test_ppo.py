@@ -105,9 +105,13 @@ def conventional(learner, eventful):
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
 
 
+def roll(learner, state, key):
+    return jax.jit(learner.rollout)(state, key, jax.jit(learner.env.following)(state.env_state))
+
+
 @pytest.fixture(scope="module")
 def rolled(learner, eventful):
-    return jax.jit(learner.rollout)(eventful, jax.random.PRNGKey(5))
+    return roll(learner, eventful, jax.random.PRNGKey(5))
 
 
 def test_rollout_holds_the_same_steps(rolled, conventional):
@@ -187,7 +191,7 @@ def test_returns_stop_at_the_end_of_an_episode(learner, eventful, rolled, conven
 def test_the_critic_counts_in_deviations_of_the_returns(learner, eventful, rolled, conventional):
     """With returns of mean 2 and deviation 3 so far an estimate v means 2 + 3 v; at an episode's end only the reward is left."""
     returns = eventful.returns.replace(mean=jnp.float32(2.0), std=jnp.float32(3.0))
-    _, batch, _ = jax.jit(learner.rollout)(eventful.replace(returns=returns), jax.random.PRNGKey(5))
+    _, batch, _ = roll(learner, eventful.replace(returns=returns), jax.random.PRNGKey(5))
     np.testing.assert_array_equal(batch.value, rolled[1].value)
     truncated = np.asarray(conventional.extras["state_extras"]["truncation"]) > 0
     ((env, t),) = np.argwhere((np.asarray(conventional.discount) == 0) & ~truncated)
@@ -227,7 +231,7 @@ def test_an_iteration(run, fresh):
 def test_statistics_are_those_of_the_observations(learner, eventful, rolled, run):
     state, _ = run(eventful, 1)
     _, k_roll, _ = jax.random.split(eventful.key, 3)
-    _, batch, _ = jax.jit(learner.rollout)(eventful, k_roll)
+    _, batch, _ = roll(learner, eventful, k_roll)
     seen = np.asarray(batch.obs["state"]).reshape(-1, 47)
     np.testing.assert_allclose(state.normalizer.mean["state"], seen.mean(0), atol=1e-5)
     np.testing.assert_allclose(state.normalizer.std["state"], np.sqrt(seen.var(0) + 1e-4), rtol=0.02, atol=2e-4)

@@ -41,7 +41,7 @@ from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory, learner, machines
-from mjx_nero.learn.learner import HELD, Kind, Observation, repeated, state_shape
+from mjx_nero.learn.learner import HELD, Kind, Observation, Part, repeated, state_shape
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
 from mjx_nero.learn.ppo.cfg import PpoCfg as PpoCfg
@@ -245,16 +245,38 @@ class Learner(learner.Learner):
     def _run(self, state: TrainState, iterations: int) -> tuple[TrainState, Metrics]:
         return repeated(self._iterate, state, iterations)
 
+    def parts(self) -> tuple[Part, ...]:
+        """See ``learner.Learner``. On several devices an iteration is one program."""
+        parts = Part("starts", self._with_starts, True), Part("rollout", self._rolled), Part("update", self._updated, True)
+        return () if self._axis else parts
+
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        return self._updated(*self._rolled(*self._with_starts(state)))
+
+    def _with_starts(self, state: TrainState, _: Any = None) -> tuple[TrainState, wrappers.Start]:
+        """Draws the starts of the next episodes."""
+        return state, self.env.following(state.env_state)
+
+    def _rolled(self, state: TrainState, following: wrappers.Start) -> tuple[TrainState, tuple[Batch, Metrics, Key]]:
+        """Plays; returns the state with other environments, the rest of what ``rollout`` returns, and the update's key."""
         key, k_roll, k_update = jax.random.split(state.key, 3)
         if self._axis:
             k_roll = jax.random.fold_in(k_roll, jax.lax.axis_index(self._axis))
+        env_state, batch, sums = self.rollout(self._acts(state), k_roll, following)
+        return dataclasses.replace(state, env_state=env_state, key=key), (batch, sums, k_update)
+
+    def _acts(self, state: TrainState) -> TrainState:
+        """Returns the state with the policy that acts and learns."""
+        if not self.cfg.averaging:
+            return state
+        return dataclasses.replace(state, params=state.params.replace(policy=state.acting))
+
+    def _updated(self, state: TrainState, given: tuple[Batch, Metrics, Key]) -> tuple[TrainState, Metrics]:
+        """Learns from the batch."""
+        batch, sums, k_update = given
         played = state.params.policy
-        if self.cfg.averaging:
-            state = dataclasses.replace(state, params=state.params.replace(policy=state.acting))
-        env_state, batch, sums = self.rollout(state, k_roll)
         with self._networks_precision():
-            params, opt_state, metrics = self._update(state, batch, k_update)
+            params, opt_state, metrics = self._update(self._acts(state), batch, k_update)
         # Updated last: the loss compares with log-probabilities made under the acting statistics.
         normalizer = running_statistics.update(state.normalizer, self.measured(batch.obs), pmap_axis_name=self._axis)
         returns = state.returns
@@ -267,7 +289,8 @@ class Learner(learner.Learner):
         if self.cfg.averaging:
             acting = params.policy
             params = params.replace(policy=optax.incremental_update(acting, played, 1 - self.cfg.averaging))
-        state = TrainState(normalizer, params, opt_state, env_state, key, state.iteration + 1, returns, school, acting)
+        iteration = state.iteration + 1
+        state = TrainState(normalizer, params, opt_state, state.env_state, state.key, iteration, returns, school, acting)
         return state, {**sums, **metrics}
 
     def _networks_precision(self):
@@ -277,15 +300,17 @@ class Learner(learner.Learner):
         """Averages over the devices in ``run``, where each has an equal share."""
         return jax.lax.pmean(tree, self._axis) if self._axis else tree
 
-    def rollout(self, state: TrainState, key: Key) -> tuple[State, Batch, Metrics]:
+    def rollout(self, state: TrainState, key: Key, following: wrappers.Start) -> tuple[State, Batch, Metrics]:
         """Acts for ``unroll_length`` steps in every environment, and computes returns and advantages.
+
+        Args:
+            following: starts of the environments' next episodes.
 
         Returns:
             the environments, the batch (leaves [time, env, ...]), and the environments' metrics summed over it.
         """
         cfg = self.cfg
         policy = self._make_policy((state.normalizer, state.params.policy))
-        following = self.env.following(state.env_state)
 
         def figures(env_state: State):
             return {**env_state.metrics, "reward": env_state.reward, "episodes": env_state.done}

@@ -1,6 +1,7 @@
 """The command line of ``benchmark``: what to measure, and where the rows go."""
 
 import argparse
+import dataclasses
 import pathlib
 import re
 import shlex
@@ -145,6 +146,7 @@ def _fields(args: argparse.Namespace) -> str:
 
 def begin() -> None:
     """Runs the process of ``--what start``. Its first argument is the time at which it was started; the benchmark's follow."""
+    from mjx_nero.runs import apart
     from mjx_nero.sim.physics import resolve_impl
     from mjx_nero.tools.benchmark import jobs, start
 
@@ -152,9 +154,11 @@ def begin() -> None:
     args, dotted = _parser().parse(argv, lambda: ("env", *learners.names()), _fields)
     cli.setup_jax()
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
-    impl, sizes = resolve_impl(args.impl), args.num_envs or [0]
     args.learner = args.learner or cfg.learner
-    start.begin(spawned, imported, jobs.run_of(args, dotted.get(args.learner, {}), cfg, impl, sizes[0]))
+    run = jobs.run_of(args, dotted.get(args.learner, {}), cfg, args.impl, (args.num_envs or [0])[0])
+    expert = apart.begin(run)
+    run, _ = run_cfg.fit_machine(dataclasses.replace(run, impl=resolve_impl(run.impl)))
+    start.begin(spawned, imported, run, expert)
 
 
 def _sizes(values: str) -> list[int]:

@@ -46,7 +46,10 @@ def jobs(
     Args:
         kept: rows of the seeds that an interrupted command finished.
     """
-    make_run = functools.partial(run_of, args, hyperparameters)
+
+    def make_run(cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
+        return run_cfg.fit_machine(run_of(args, hyperparameters, cfg, impl, num_envs))[0]
+
     found = []
     for impl in dict.fromkeys(resolve_impl(impl) for impl in cli.choices(args.impl, "impl", impls())):
         for what in whats:
@@ -93,12 +96,12 @@ def _throughput(what: str, env: ManipulationEnv, args: argparse.Namespace, make_
 
 
 def run_of(args: argparse.Namespace, asked: Mapping[str, str], cfg: EnvCfg, impl: str, num_envs: int) -> run_cfg.RunCfg:
-    """Returns the run that a measurement with these flags starts."""
+    """Returns the run that a measurement with these flags starts. JAX is not used yet."""
     sizes = {"num_envs": num_envs, "num_timesteps": args.num_timesteps}
     fields = {**asked, **{name: value for name, value in sizes.items() if value}}
     learner = config.override(run_cfg.learner_cfg(cfg, args.preset, args.learner), fields)
     how = {"impl": impl, "eval_every": args.eval_every, "num_devices": args.num_devices, "learner": args.learner}
-    return run_cfg.fit_machine(run_cfg.RunCfg(args.env, args.preset, cfg, learner, **how))[0]
+    return run_cfg.RunCfg(args.env, args.preset, cfg, learner, **how)
 
 
 def measured(jobs: Iterable[Job]) -> Iterator[Row]:

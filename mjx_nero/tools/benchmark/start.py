@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from multiprocessing.process import BaseProcess
 
 import jax
 
@@ -71,12 +72,13 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> tuple[list[Span], int
     return [*stages, whole], misses
 
 
-def begin(spawned: float, imported: float, run: RunCfg) -> None:
+def begin(spawned: float, imported: float, run: RunCfg, expert: BaseProcess | None) -> None:
     """Starts a run as ``train.py`` does, up to its first call of the learner, and prints the stages as one line of JSON.
 
     Args:
         spawned, imported: when the process was started, and when its imports were done [s since 1970].
         run: from ``run_cfg.fit_machine``.
+        expert: from ``apart.begin``.
     """
     so_far = time.time() - spawned
     spans, misses = Spans(), list[str]()
@@ -86,7 +88,7 @@ def begin(spawned: float, imported: float, run: RunCfg) -> None:
         device_memory.check(learner)
     before = time.time() - spawned
     programs = Programs(run, learner)
-    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker()), programs)
+    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker(), elsewhere=expert), programs)
     place = pathlib.Path("start")
     made = training.prepare(run, learner, lambda: fresh.placed(0), place, programs, lambda beside: fresh.trace(0, beside))
     with spans.span("first iterations"):

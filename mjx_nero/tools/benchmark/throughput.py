@@ -1,5 +1,6 @@
 """Measures env steps and resets per second: bare physics, random actions, PPO, controllers."""
 
+import concurrent.futures
 import time
 from collections.abc import Callable
 
@@ -9,10 +10,13 @@ import jax.numpy as jnp
 from mjx_nero import control
 from mjx_nero.envs import wrappers
 from mjx_nero.envs.env import ManipulationEnv
+from mjx_nero.learn import device_memory
 from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
-from mjx_nero.runs import compiled
-from mjx_nero.tools.benchmark.program import Program, Row, device_peak_mb, spread, warp_mb
+from mjx_nero.runs import compiled, iteration
+from mjx_nero.runs.programs import Programs
+from mjx_nero.runs.spans import Spans
+from mjx_nero.tools.benchmark.program import Program, Row, device_peak_mb, mb, spread, warp_mb
 
 
 def physics(env: ManipulationEnv, steps: int) -> Program:
@@ -49,15 +53,20 @@ def reset(env: ManipulationEnv, times: int) -> Program:
 
 def training(learner: Learner, iterations: int) -> Program:
     """Trains a fresh policy end to end, with rollouts, updates and resets: ``iterations`` per call."""
+    begun = time.perf_counter()
+    lowered = iteration.Lowered(learner, iterations, Programs(None, learner))
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        advance = lowered.made(lowered.compiling(pool, Spans()))
 
-    def run(state, key):  # the state has its own key
-        state, metrics = learner.run(state, iterations)
+    def run(state, _):  # the state has its own key
+        state, metrics = advance(state)
         return state, {name: metrics.get(f"sum/{name}", 0.0) * iterations for name in ("nan", "overflow")}
 
-    def start():
-        return compiled.Fresh(learner).placed(0)
-
-    return Program.compiled(run, start, iterations * learner.steps_per_iteration, learner.env.unwrapped.physics.compiler_options)
+    program = Program(run, compiled.Fresh(learner).placed(0), iterations * learner.steps_per_iteration)
+    program.warm_up(begun)
+    size = device_memory.largest(advance.programs)
+    program.memory_mb = None if size is None else mb(size)
+    return program
 
 
 def controlled(env: ManipulationEnv, controller: control.Controller) -> Program:
