@@ -15,10 +15,11 @@ from multiprocessing.process import BaseProcess
 
 import jax
 
+from mjx_nero import cores
 from mjx_nero.runs import compiled, starts
 from mjx_nero.runs.cfg import RunCfg, fit_machine
 
-_CORES = 4  # with fewer, two processes take longer than one
+_CORES = 4  # with fewer, two processes take longer than one; the expert takes no more, because it would only wait on them
 _DIE_WITH_PARENT = 1  # ``PR_SET_PDEATHSIG`` of Linux's prctl
 
 
@@ -30,8 +31,7 @@ def begin(run: RunCfg) -> BaseProcess | None:
     Args:
         run: may leave open what ``fit_machine`` fills in.
     """
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else 0
-    if cores < _CORES or run.restore is not None or _is_busy() or not _wants_expert(run):
+    if sys.platform != "linux" or cores() < _CORES or run.restore is not None or _is_busy() or not _wants_expert(run):
         return None
     process = multiprocessing.get_context("fork").Process(target=_play, args=(run,), daemon=True)
     process.start()
@@ -54,6 +54,7 @@ def _play(run: RunCfg) -> None:
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):  # whoever reads what the run prints must not wait for this process
         os.dup2(silent, stream)
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-_CORES:])
     jax.config.update("jax_platforms", "cpu")
     run, _ = fit_machine(dataclasses.replace(run, impl="native", num_devices=1))
     starts.Maker(compiled.make_learner(run), lambda _: None)(run.seed)

@@ -43,6 +43,7 @@ _ONE_THREAD: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
 _BRIEF, _COMPILED_FAST = ("pick_up", "pick_place", "grasp_thing"), {"xla_backend_optimization_level": 0}
 COMING, LIFTED = 1.5, 0.3  # [s] time that the hand comes down before the grasp, and time after it until well above the table
 _HOLD = "success.hold"
+_PATIENCE = 120.0  # [s] for a process that plays the expert
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,8 @@ class Maker:
         if self._player is None:
             return {}
         if self._elsewhere is not None and not self._player.kept(seed):
-            self._elsewhere.join()  # if it failed, this process plays
+            self._elsewhere.join(_PATIENCE)
+            self._elsewhere.kill()  # if it failed, this process plays
         self._elsewhere = None
         try:
             with jax.default_device(processor()):

@@ -34,16 +34,24 @@ class _Unread(types.ModuleType):
         return getattr(self, name)
 
 
+def unread(name: str) -> types.ModuleType:
+    """Returns a package whose own code runs when one of its attributes is first read, unless it is imported already."""
+    if name not in sys.modules:
+        spec = importlib.util.find_spec(name)
+        assert spec
+        package = sys.modules[name] = importlib.util.module_from_spec(spec)
+        parent, _, own = name.rpartition(".")
+        setattr(sys.modules[parent], own, package)
+        package.__class__ = _Unread
+    return sys.modules[name]
+
+
 _MJX = {"warp": None, "trimesh": Later("trimesh"), "scipy.spatial": Later("scipy.spatial")}
 _ENGINES = ("brax.generalized.pipeline", "brax.mjx.pipeline", "brax.positional.pipeline", "brax.spring.pipeline", "brax.io.image")
 
 with contextlib.redirect_stdout(io.StringIO()), replaced(_MJX):
     importlib.import_module("mujoco.mjx")
-if "brax.envs" not in sys.modules:
-    spec = importlib.util.find_spec("brax.envs")
-    assert spec
-    package = sys.modules["brax"].envs = sys.modules["brax.envs"] = importlib.util.module_from_spec(spec)  # type: ignore[attr-defined]
-    package.__class__ = _Unread
+unread("brax.envs")
 with replaced({name: Later(name) for name in _ENGINES}):
     from brax.envs.base import Env as Env
     from brax.envs.base import State as State

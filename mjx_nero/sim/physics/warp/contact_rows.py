@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.physics.warp import kernels
+from mjx_nero.sim.physics.warp import engine, kernels
 
 _CONTACT = "dist includemargin type worldid dim geom pos frame friction solref solreffriction solimp efc_address"
 _EFC = "J J_rownnz J_rowadr J_colind D aref frictionloss type id"
@@ -30,11 +30,10 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
         model, data: MuJoCo Warp's model and data of ``m``.
     """
     import warp as wp
-    from mujoco.mjx.third_party import mujoco_warp
 
     without = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     if model.opt.disableflags & (without | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) or model.flg_adhesion or model.flg_surfacevel:
-        return lambda: mujoco_warp.make_constraint(model, data)
+        return lambda: engine.make_constraint(model, data)
     nonzeros: Any = wp.zeros(data.nworld, dtype=int)
     values = {"nonzeros": nonzeros, "njmax_nnz": int(data.njmax_nnz), "body_invweight0": model.body_invweight0}
     values |= {name: getattr(model.opt, name) for name in ("timestep", "impratio_invsqrt")}
@@ -46,7 +45,7 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
 
     def others() -> None:
         flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | without
-        mujoco_warp.make_constraint(model, data)
+        engine.make_constraint(model, data)
         model.opt.disableflags = flags
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -75,7 +74,6 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
 
 def _constants(m: mujoco.MjModel, model: Any, data: Any) -> dict[str, int | Iterable[int]]:
     """The sizes and the tables that the source is compiled with."""
-    from mujoco.mjx.third_party.mujoco_warp._src.types import ContactType, OverflowType
 
     moves = (model.body_isdofancestor.numpy()[m.geom_bodyid, : m.nv] != 0).astype(np.uint64)  # [geoms, dofs]
     masks = (moves << np.arange(m.nv, dtype=np.uint64)).sum(axis=1, dtype=np.uint64).view(np.int32).reshape(-1, 2)
@@ -92,8 +90,8 @@ def _constants(m: mujoco.MjModel, model: Any, data: Any) -> dict[str, int | Iter
         "SPARSE": int(model.is_sparse),
         "ELLIPTIC": int(elliptic),
         "REFSAFE": int(not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE),
-        "CONSTRAINT": int(ContactType.CONSTRAINT),
-        "NJMAX_NNZ": int(OverflowType.NJMAX_NNZ),
+        "CONSTRAINT": int(engine.ContactType.CONSTRAINT),
+        "NJMAX_NNZ": int(engine.OverflowType.NJMAX_NNZ),
         "ALONE": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS),
         "IN_A_CONE": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
         "IN_A_PYRAMID": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),

@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.physics.warp import kernels
+from mjx_nero.sim.physics.warp import engine, kernels
 
 # Fields of MuJoCo Warp's model and data that the sources read and write.
 _MODEL = "body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp jnt_pos jnt_axis jnt_stiffness"
@@ -86,7 +86,6 @@ def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[
 
 def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
     """The sizes and the tables that the sources are compiled with."""
-    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType
 
     bodies = np.arange(m.nbody + 1)
     stands = (m.body_weldid[m.geom_bodyid] == 0) & (m.body_mocapid[m.body_rootid[m.geom_bodyid]] < 0)
@@ -126,7 +125,7 @@ def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
         "LINKS": int(np.isin(m.eq_type, _LINKS).any()),
         "GRAVCOMP": int(m.ngravcomp > 0),
     }
-    found |= {name: int(OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE")}
+    found |= {name: int(engine.OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE")}
     return found
 
 

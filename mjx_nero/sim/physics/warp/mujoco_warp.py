@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from mjx_nero.sim import readings
 from mjx_nero.sim.physics import Footprint, Physics, identity, possible
-from mjx_nero.sim.physics.warp import contact_rows, dynamics, kernels, newton, sensing
+from mjx_nero.sim.physics.warp import contact_rows, dynamics, engine, kernels, newton, sensing
 from mjx_nero.sim.scene import SimCfg
 from mjx_nero.types import Sim
 
@@ -135,15 +135,14 @@ class WarpPhysics(Physics):
             (each None if there are none), and objects that must stay alive.
         """
         import warp as wp
-        from mujoco.mjx.third_party import mujoco_warp
 
         cfg = self._cfg
         with possible("MuJoCo Warp"):
-            model = mujoco_warp.put_model(self.model)
+            model = engine.put_model(self.model)
         drawn = world_fields(model, self._fields, n)
         convert = whole_numbers(model, self._fields, drawn)
         model.opt.warn_overflow = 0  # overflows are counted; a print at every step would drown everything else
-        data = mujoco_warp.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
+        data = engine.make_data(self.model, n, naconmax=cfg.contacts_per_env * n, njmax=cfg.constraints_per_env)
         step, strongest = self._stepper(model, data)
         wanted, go = ramp(data.ctrl) if cfg.ramp else (None, lambda left: None)
 
@@ -164,11 +163,10 @@ class WarpPhysics(Physics):
 
     def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
         """Makes the function of one physics step, which is told if it is the last one, and the array of readings."""
-        from mujoco.mjx.third_party import mujoco_warp
 
         out, each, at_last = sensing.make(self.model, model, data)
         own = self._cfg.solver == "newton"
-        solve = newton.make(model, data) if own else functools.partial(mujoco_warp.solve, model, data)
+        solve = newton.make(model, data) if own else functools.partial(engine.solve, model, data)
 
         def constrained(last: bool):
             solve()
@@ -176,12 +174,12 @@ class WarpPhysics(Physics):
                 measure()
 
         def engines(last: bool):
-            mujoco_warp.fwd_position(model, data, factorize=False)
-            mujoco_warp.fwd_velocity(model, data)
-            mujoco_warp.fwd_actuation(model, data)
-            mujoco_warp.fwd_acceleration(model, data, factorize=True)
+            engine.fwd_position(model, data, factorize=False)
+            engine.fwd_velocity(model, data)
+            engine.fwd_actuation(model, data)
+            engine.fwd_acceleration(model, data, factorize=True)
             constrained(last)
-            mujoco_warp.implicit(model, data)
+            engine.implicit(model, data)
 
         if not own or dynamics.missing(self.model) or not newton.fits(model, data):
             return engines, out
@@ -190,7 +188,7 @@ class WarpPhysics(Physics):
 
         def ours(last: bool):
             before()
-            mujoco_warp.collision(model, data)
+            engine.collision(model, data)
             rows()
             constrained(last)
             after()
@@ -223,7 +221,6 @@ _MEASURING = threading.Lock()
 def _data_bytes(model: mujoco.MjModel, cfg: SimCfg) -> int:
     """Returns the size of MuJoCo Warp's data of one environment."""
     import warp as wp
-    from mujoco.mjx.third_party import mujoco_warp
 
     def size(value) -> int:
         if isinstance(value, wp.array):
@@ -231,7 +228,7 @@ def _data_bytes(model: mujoco.MjModel, cfg: SimCfg) -> int:
         return sum(size(getattr(value, f.name)) for f in dataclasses.fields(value)) if dataclasses.is_dataclass(value) else 0
 
     with kernels.WARP, wp.ScopedDevice("cpu"):
-        return size(mujoco_warp.make_data(model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env))
+        return size(engine.make_data(model, 1, naconmax=cfg.contacts_per_env, njmax=cfg.constraints_per_env))
 
 
 def ramp(ctrl: Any) -> tuple[Any, Callable[[int], None]]:

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_nero.sim.physics.warp import kernels
+from mjx_nero.sim.physics.warp import engine, kernels
 
 _SHARED_BYTES = 48 * 1024  # shared memory of a block, on every GPU that Warp supports
 _DOFS = 64  # one bit each
@@ -58,12 +58,11 @@ def make(model, data) -> Callable[[], None]:
         A function without arguments. It calls MuJoCo Warp's own solver if the model is too large for this one.
     """
     import warp as wp
-    from mujoco.mjx.third_party import mujoco_warp
 
     nv, njmax, dense = model.nv, data.njmax, not model.is_sparse
     size = floats(nv, njmax, dense)
     if size is None:
-        return lambda: mujoco_warp.solve(model, data)
+        return lambda: engine.solve(model, data)
     starts, counts, columns = (getattr(model, name).numpy() for name in ("M_rowadr", "M_rownnz", "M_colind"))
     low = columns[starts]  # the first degree of freedom of each one's tree
     numbers: dict[str, Any] = {"NV": nv, "NJ": njmax, "DENSE": int(dense), "ROWS": near(njmax, dense), "SIZE": size}

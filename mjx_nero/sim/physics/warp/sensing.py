@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_nero.sim import readings
 from mjx_nero.sim.forces import FINGERS, WRIST
-from mjx_nero.sim.physics.warp import kernels
+from mjx_nero.sim.physics.warp import engine, kernels
 from mjx_nero.sim.readings import Reading
 
 Work = Callable[[], None]
@@ -47,11 +47,11 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> tuple[Any, list[Work], lis
 def _contacts(model: Any, data: Any) -> tuple[Any, Any, Any]:
     """Packs the contacts into one kernel argument. Returns its type, its value, and the function of one contact's force [N]."""
     import warp as wp
-    from mujoco.mjx.third_party.mujoco_warp._src.support import contact_force_fn
 
     names = ("frame", "friction", "dim", "efc_address", "adhesion", "geom", "worldid")
     values = {name: getattr(data.contact, name) for name in names} | {"cone": int(model.opt.cone), "njmax": int(data.njmax)}
     Contacts, found = kernels.packed("Contacts", values | {"force": data.efc.force, "count": data.nacon})
+    contact_force_fn = engine.contact_force_fn
 
     @wp.func
     def force(c: Contacts, i: int, in_world: bool):  # type: ignore[valid-type]
@@ -90,7 +90,6 @@ def _strongest(m: mujoco.MjModel, model: Any, data: Any, strongest: list[Reading
 def _wrench(m: mujoco.MjModel, model: Any, data: Any, reading: Reading, out: Any) -> Work:
     """Makes a function that writes force and torque at the wrist [worlds, 6]."""
     import warp as wp
-    from mujoco.mjx.third_party import mujoco_warp
 
     site = int(m.site(WRIST).id)
     body = int(m.site_bodyid[site])
@@ -116,9 +115,9 @@ def _wrench(m: mujoco.MjModel, model: Any, data: Any, reading: Reading, out: Any
             out[w, 3 + i] = torque[i]
 
     def measure():
-        mujoco_warp.kinematics(model, data)
-        mujoco_warp.com_pos(model, data)
-        mujoco_warp.rne_postconstraint(model, data)
+        engine.kinematics(model, data)
+        engine.com_pos(model, data)
+        engine.rne_postconstraint(model, data)
         inputs = [data.cfrc_int, data.subtree_com, data.site_xpos, data.site_xmat]
         wp.launch(turned, dim=data.nworld, inputs=inputs, outputs=[out])
 
