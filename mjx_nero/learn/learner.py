@@ -69,7 +69,9 @@ class Learner(Protocol):
         """
 
     def parts(self) -> "tuple[Part, ...]":
-        """Returns what an iteration is made of, if its parts may be programs of their own, which compile side by side."""
+        """Returns what an iteration is made of, if its parts may be programs of their own, which compile side by side. The method
+        may be missing: one program makes several iterations then.
+        """
         return ()
 
     def policy(self, state: Any) -> Params:

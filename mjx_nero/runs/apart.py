@@ -20,6 +20,7 @@ from mjx_nero.runs import compiled, starts
 from mjx_nero.runs.cfg import RunCfg, fit_machine
 
 _CORES = 4  # with fewer, two processes take longer than one; the expert takes no more, because it would only wait on them
+_NICE = 5  # the learner's programs take longer to compile than the expert takes to play
 _DIE_WITH_PARENT = 1  # ``PR_SET_PDEATHSIG`` of Linux's prctl
 
 
@@ -55,6 +56,7 @@ def _play(run: RunCfg) -> None:
     for stream in (0, 1, 2):  # whoever reads what the run prints must not wait for this process
         os.dup2(silent, stream)
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-_CORES:])
+    os.nice(_NICE)
     jax.config.update("jax_platforms", "cpu")
     run, _ = fit_machine(dataclasses.replace(run, impl="native", num_devices=1))
     starts.Maker(compiled.make_learner(run), lambda _: None)(run.seed)

@@ -153,7 +153,7 @@ class Loop:
             why training ends here, empty if it does not; and the chunk, if it has begun.
         """
         ahead = None
-        if not self.made.learner.env.unwrapped.cfg.scene.cameras:  # programs that draw run one after another
+        if not self._draws:  # such programs run one after another
             own = jax.device_put(state, jax.tree.map(lambda x: x.sharding, state), may_alias=False)
             ahead = time.perf_counter(), waiting.ahead(self.made.advance, own)
         self._evaluate(state)
@@ -165,6 +165,10 @@ class Loop:
             if ahead:
                 ahead[1]()  # JAX may crash if the process ends meanwhile
         return ended, ahead
+
+    @property
+    def _draws(self) -> bool:
+        return bool(self.made.learner.env.unwrapped.cfg.scene.cameras)
 
     def _agree(self, unsaved: float) -> tuple[int, float, float]:
         """Returns any process's signal (0: none) and the first process's clocks [s].

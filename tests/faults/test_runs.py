@@ -34,6 +34,27 @@ def test_what_a_run_leaves(train, tmp_path):
     assert all(b["wall_s"] >= a["wall_s"] for a, b in zip(rows(run), rows(run)[1:], strict=False))
 
 
+@pytest.mark.parametrize("draws", [False, True])
+def test_training_begins_before_its_first_evaluation(train, monkeypatch, tmp_path, undisturbed, draws):
+    """Unless it draws pictures. What comes of it is the same."""
+    order = []
+
+    def noted(name, call):
+        return lambda state: (order.append(name), call(state))[1]
+
+    def compile(*given, original=compiled.compile):
+        made = original(*given)
+        own = {name: noted(name, getattr(made, name)) for name in ("advance", "evaluate")}
+        return compiled.dataclasses.replace(made, **own)
+
+    monkeypatch.setattr(compiled, "compile", compile)
+    monkeypatch.setattr(loop.Loop, "_draws", property(lambda self: draws))
+    code, _, err = train("--out", "run")
+    assert code == 0, err
+    assert order[:3] == (["evaluate", "advance", "advance"] if draws else ["advance", "evaluate", "advance"])
+    assert last(tmp_path / "run") == undisturbed
+
+
 # --- logs are expendable
 
 

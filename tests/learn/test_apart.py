@@ -1,0 +1,128 @@
+"""An expert that plays in a process of its own, while the run starts."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import threading
+
+import jax
+import pytest
+
+from mjx_nero.runs import apart, cfg, starts
+
+SIZES = {"num_envs": 8, "demonstrations": 2}
+# Begins a run's expert apart and asks for what it plays, as ``train.py`` does. The argument: whether the process is killed.
+SCRIPT = """
+import sys
+from mjx_nero.runs import apart, cfg, compiled, starts
+apart.cores = lambda: 4
+run = cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 8, "demonstrations": 2}, impl="native")
+process = apart.begin(run)
+assert process is not None and process.daemon
+if sys.argv[1] == "killed":
+    process.kill()
+said = []
+maker = starts.Maker(compiled.make_learner(run), said.append, elsewhere=process)
+maker.trace(0)
+assert not process.is_alive() or "_lowered" not in vars(maker._player)
+given = maker(0)
+assert sorted(given) == sorted(maker.names) and "noisy tries" in said[0], said
+print("played here" if "_lowered" in vars(maker._player) else "read", process.exitcode)
+"""
+
+
+def run_of(**changes):
+    return dataclasses.replace(cfg.resolve("nero_lift", "default", None, {}, SIZES, impl="native"), **changes)
+
+
+def kept_by(home, how):
+    """Runs the script with a cache of its own; returns what it says, and the episodes that it leaves."""
+    env = {**os.environ, "XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", SCRIPT, how], env=env, capture_output=True, text=True, timeout=300, check=True)
+    (file,) = (home / "mjx_nero" / "experts").glob("*.safetensors")
+    return done.stdout.strip(), file.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_what_is_played_apart_is_what_the_run_would_play(tmp_path):
+    said, apart_from = kept_by(tmp_path / "a", "left")
+    assert said == "read 0"
+    said, here = kept_by(tmp_path / "b", "killed")  # then this process plays
+    assert said.startswith("played here -9") and here == apart_from
+
+
+@pytest.mark.parametrize(
+    ("change", "begins"),
+    [({}, True), ({"cores": 3}, False), ({"busy": True}, False), ({"restore": "run"}, False), ({"wants": False}, False)],
+)
+def test_it_begins_only_where_it_can_and_helps(monkeypatch, tmp_path, change, begins):
+    class Context:
+        def Process(self, target, args, daemon):
+            assert target is apart._play and daemon
+            return type("Process", (), {"start": lambda self: None})()
+
+    monkeypatch.setattr(apart.multiprocessing, "get_context", lambda how: {"fork": Context()}[how])
+    monkeypatch.setattr(apart, "cores", lambda: change.get("cores", 4))
+    monkeypatch.setattr(apart, "_is_busy", lambda: change.get("busy", False))
+    run = run_of(restore=tmp_path if "restore" in change else None)
+    if not change.get("wants", True):
+        run = cfg.resolve("nero_reach", "default", None, {}, {"num_envs": 8}, impl="native")
+    assert (apart.begin(run) is not None) == begins
+
+
+def test_a_process_that_computes_is_not_forked(monkeypatch):
+    jax.block_until_ready(jax.numpy.zeros(1))
+    assert apart._is_busy()
+    monkeypatch.setattr(sys.modules["jax._src.xla_bridge"], "backends_are_initialized", lambda: False)
+    alone = threading.active_count() == 1
+    assert apart._is_busy() == (not alone)
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    assert not apart._is_busy()
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
+    assert apart._is_busy()
+
+
+class Elsewhere:
+    """A process that plays for so long, or for ever."""
+
+    def __init__(self, ends, shelf):
+        self.ends, self.shelf, self.killed = ends, shelf, False
+
+    def join(self, seconds):
+        assert seconds >= 60.0
+        self.shelf.add(3) if self.ends else None
+
+    def kill(self):
+        self.killed = True
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_process_that_does_not_end_is_not_waited_for_forever(monkeypatch, ends):
+    shelf, played, traced = set(), [], []
+
+    class Player:
+        able = True
+
+        def __init__(self, *_):
+            pass
+
+        def kept(self, seed):
+            return seed in shelf
+
+        def trace(self, seed):
+            traced.append(seed)
+
+        def __call__(self, seed):
+            played.append((seed, seed in shelf))
+            raise starts.UserError("enough")
+
+    monkeypatch.setattr(starts, "_Player", Player)
+    process = Elsewhere(ends, shelf)
+    imitates = type("Imitates", (), {"imitates": True, "num_envs": 8, "env": type("Env", (), {"unwrapped": None})()})()
+    maker = starts.Maker(imitates, lambda _: None, elsewhere=process)
+    maker.trace(3)
+    assert maker(3) == {} and played == [(3, ends)] and process.killed and not traced
+    maker.trace(4)  # the next seed's expert plays here
+    assert maker(4) == {} and traced == [4] and len(played) == 2
