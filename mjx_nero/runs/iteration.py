@@ -47,7 +47,7 @@ class Lowered:
 
     def __init__(self, learner: Learner, chunk: int, programs: Programs):
         self._learner, self._programs = learner, programs
-        parts = getattr(learner, "parts", tuple)()
+        parts: tuple[Part, ...] = getattr(learner, "parts", tuple)()
         self._times = chunk if parts else 1
         self._parts = parts or (Part(f"run-{chunk}", lambda state, _: learner.run(state, chunk)),)
         self._takes: dict[int, Any] = {0: {}}  # shapes of what each part takes besides the state, as far as they are known
