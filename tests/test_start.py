@@ -196,7 +196,7 @@ def test_an_experts_program_is_for_the_processor(monkeypatch):
     asked = []
 
     class Player:
-        able = True
+        able = keeps = True
 
         def __init__(self, *_):
             pass

@@ -78,7 +78,7 @@ class Maker:
     """
 
     def __init__(self, learner: Learner, say: Callable[[str], None], new: bool = True, elsewhere: BaseProcess | None = None):
-        self.say, self._elsewhere = say, elsewhere
+        self.say, self._elsewhere = say, None
         self._begins = isinstance(learner.env, wrappers.ExpertStarts)
         self._imitates = new and getattr(learner, "imitates", False)
         self._player: _Player | None = None
@@ -86,6 +86,8 @@ class Maker:
             episodes = getattr(learner, "demonstrations", DEMONSTRATIONS)
             self._sizes = learner.num_envs, ROWS * episodes  # rows of the bank and of the steps
             self._player = _Player(learner.env.unwrapped, min(episodes, learner.num_envs))
+            if self._player.keeps:  # otherwise the other process cannot hand anything over
+                self._elsewhere = elsewhere
 
     def trace(self, seed: int) -> None:
         """Traces the expert's program now, if a call with this seed needs it."""
@@ -166,6 +168,11 @@ class _Player:
         self.able = bool(self._name) and _milestone(own.cfg) is not None
         # Here, where nothing traces: each look at a file gives Python's lock away, and a thread that traces keeps it for 5 ms.
         self._kept = kept.Shelf("experts", own.cfg, control.CONTROLLERS.get(self._name), count)
+
+    @property
+    def keeps(self) -> bool:
+        """True if episodes are kept for other processes."""
+        return bool(self._kept)
 
     def kept(self, seed: int) -> bool:
         """True if the episodes have been played before."""

@@ -98,8 +98,8 @@ class Elsewhere:
         self.killed = True
 
 
-@pytest.mark.parametrize("ends", [True, False])
-def test_a_process_that_does_not_end_is_not_waited_for_forever(monkeypatch, ends):
+@pytest.mark.parametrize(("ends", "keeps"), [(True, True), (False, True), (False, False)])
+def test_a_process_that_cannot_hand_over_is_not_waited_for(monkeypatch, ends, keeps):
     shelf, played, traced = set(), [], []
 
     class Player:
@@ -118,11 +118,12 @@ def test_a_process_that_does_not_end_is_not_waited_for_forever(monkeypatch, ends
             played.append((seed, seed in shelf))
             raise starts.UserError("enough")
 
+    Player.keeps = keeps
     monkeypatch.setattr(starts, "_Player", Player)
     process = Elsewhere(ends, shelf)
     imitates = type("Imitates", (), {"imitates": True, "num_envs": 8, "env": type("Env", (), {"unwrapped": None})()})()
     maker = starts.Maker(imitates, lambda _: None, elsewhere=process)
     maker.trace(3)
-    assert maker(3) == {} and played == [(3, ends)] and process.killed and not traced
+    assert maker(3) == {} and played == [(3, ends)] and process.killed == keeps and traced == ([] if keeps else [3])
     maker.trace(4)  # the next seed's expert plays here
-    assert maker(4) == {} and traced == [4] and len(played) == 2
+    assert maker(4) == {} and traced[-1] == 4 and len(played) == 2

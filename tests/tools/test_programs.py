@@ -126,7 +126,7 @@ def test_shared_flags_read_alike_in_every_command(call):
 def test_what_a_run_came_to_is_said_before_its_video_is_drawn(call, monkeypatch):
     summary = {"env_steps": 1000, "train_s": 2.0, "steps_per_s": 500, "evaluation": {"success_rate": 0.75}, "folder": "run"}
     summary |= {"nan_count": 0, "overflow_count": 0, "lost": {}, "code": 0}
-    monkeypatch.setattr(training, "train", lambda run, command: summary)
+    monkeypatch.setattr(training, "train", lambda run, command, expert: summary)
     monkeypatch.setattr(training, "film", lambda run, folder, video: print(f"film of {folder}"))
     code, out, _ = call("train", "--out", "run")
     assert code == 0
