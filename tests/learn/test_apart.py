@@ -2,12 +2,15 @@
 
 import dataclasses
 import os
+import pathlib
+import signal
 import subprocess
 import sys
 import threading
 
 import jax
 import pytest
+from waiting import wait
 
 from mjx_nero.runs import apart, cfg, starts
 
@@ -31,6 +34,16 @@ assert sorted(given) == sorted(maker.names) and "noisy tries" in said[0], said
 print("played here" if "_lowered" in vars(maker._player) else "read", process.exitcode)
 """
 
+# Begins a run's expert apart, says what process plays it, and is killed.
+KILLED = """
+import os, signal
+from mjx_nero.runs import apart, cfg
+apart.cores = lambda: 4
+process = apart.begin(cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 8, "demonstrations": 2}, impl="native"))
+print(process.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
 
 def run_of(**changes):
     return dataclasses.replace(cfg.resolve("nero_lift", "default", None, {}, SIZES, impl="native"), **changes)
@@ -51,6 +64,21 @@ def test_what_is_played_apart_is_what_the_run_would_play(tmp_path):
     assert said == "read 0"
     said, here = kept_by(tmp_path / "b", "killed")  # then this process plays
     assert said.startswith("played here -9") and here == apart_from
+
+
+def _ended(pid):
+    """True if a process is gone, or only waits for someone to read how it ended."""
+    stat = pathlib.Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_it_ends_with_its_run(tmp_path):
+    """However that ends, and without holding what reads the run's output."""
+    env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", KILLED], env=env, stdout=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL
+    wait(lambda: _ended(int(done.stdout)), seconds=3.0)  # it would play for longer
 
 
 @pytest.mark.parametrize(
