@@ -10,8 +10,10 @@ import threading
 
 import jax
 import pytest
+from safetensors.numpy import load
 from waiting import wait
 
+from mjx_nero.learn import checkpoint
 from mjx_nero.runs import apart, cfg, starts
 
 SIZES = {"num_envs": 8, "demonstrations": 2}
@@ -50,11 +52,12 @@ def run_of(**changes):
 
 
 def kept_by(home, how):
-    """Runs the script with a cache of its own; returns what it says, and the episodes that it leaves."""
+    """Runs the script with a cache of its own; returns what it says, and the file of episodes that it leaves."""
     env = {**os.environ, "XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", SCRIPT, how], env=env, capture_output=True, text=True, timeout=300, check=True)
     (file,) = (home / "mjx_nero" / "experts").glob("*.safetensors")
-    return done.stdout.strip(), file.read_bytes()
+    arrays = {name: x.tobytes() for name, x in load(file.read_bytes()).items()}  # a file's order of them is chance
+    return done.stdout.strip(), (file.name, arrays, checkpoint.load_meta(file))
 
 
 @pytest.mark.slow

@@ -200,18 +200,16 @@ def test_the_engines_own_solver_steps_alike(name):
 @pytest.mark.parametrize("arch", [75, 90])  # the oldest that Warp supports, where some instructions are missing, and an H100
 @pytest.mark.parametrize("name", ["nero_lift", "cobotta_stack", "nero_clutter"])
 def test_kernels_compile_for_gpus_and_keep_arrays_in_registers(name, arch, tmp_path, monkeypatch):
-    from mujoco.mjx.third_party import mujoco_warp
-
-    from mjx_nero.sim.physics.warp import contact_rows, dynamics, newton
+    from mjx_nero.sim.physics.warp import contact_rows, dynamics, engine, newton
 
     env, kernels = make(name, impl="native", num_envs=1), []
     model, sim = env.physics_model, env.cfg.sim
-    warp_model = mujoco_warp.put_model(model)
-    data = mujoco_warp.make_data(model, 1, naconmax=sim.contacts_per_env, njmax=sim.constraints_per_env)
+    warp_model = engine.put_model(model)
+    data = engine.make_data(model, 1, naconmax=sim.contacts_per_env, njmax=sim.constraints_per_env)
     rows = contact_rows.make(model, warp_model, data)
     steps = newton.make(warp_model, data), rows, *dynamics.make(model, warp_model, data)
     with monkeypatch.context() as patched:
-        patched.setattr(mujoco_warp, "make_constraint", lambda *_: None)
+        patched.setattr(engine, "make_constraint", lambda *_: None)
         patched.setattr(wp, "launch", lambda kernel, **_: kernels.append(kernel))
         for step in steps:
             step()
