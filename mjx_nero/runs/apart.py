@@ -8,6 +8,7 @@ import ctypes
 import dataclasses
 import multiprocessing
 import os
+import random
 import signal
 import sys
 import threading
@@ -55,7 +56,8 @@ def _play(run: RunCfg) -> None:
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):  # whoever reads what the run prints must not wait for this process
         os.dup2(silent, stream)
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-_CORES:])
+    own = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, random.sample(own, min(_CORES, len(own))))  # runs that start together take different ones
     os.nice(_NICE)
     jax.config.update("jax_platforms", "cpu")
     run, _ = fit_machine(dataclasses.replace(run, impl="native", num_devices=1))
