@@ -19,7 +19,7 @@ from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
 from mjx_nero.runs.cfg import RunCfg
-from mjx_nero.runs.iteration import Iterations, Lowered
+from mjx_nero.runs.iteration import Lowered
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
@@ -39,7 +39,7 @@ class Compiled:
 
     learner: Learner
     chunk: int
-    advance: Iterations | Callable[[Any], tuple[Any, Metrics]]
+    advance: Callable[[Any], tuple[Any, Metrics]]
     state: Any
     evaluate: "Evaluator"
     seconds: float
@@ -59,7 +59,7 @@ class Evaluator:
 
     def __init__(self, run: RunCfg, learner: Learner, programs: Programs):
         self._run, self._seed, self._learner, self._programs = run, run.seed, learner, programs
-        self._made: concurrent.futures.Future[tuple[ManipulationEnv, Any]] = concurrent.futures.Future()
+        self._made: concurrent.futures.Future[tuple[ManipulationEnv, Any]]
 
     def of_seed(self, seed: int) -> "Evaluator":
         """Returns the same program with another seed's episodes."""
@@ -67,15 +67,18 @@ class Evaluator:
         other._seed = seed
         return other
 
-    def make(self, state: Any, spans: Spans) -> None:
-        """Makes environments and program, given a state or its shapes. Another thread may call it; evaluations wait for it."""
-        try:
-            with spans.span("evaluation, lowered"):
-                env, lowered = self._lowered(state)
-            with spans.span("evaluation, compiled"):
-                self._made.set_result((env, lowered.compile()))
-        except BaseException as error:
-            self._made.set_exception(error)
+    def begin(
+        self, beside: concurrent.futures.Executor, first: concurrent.futures.Future, state: Any, spans: Spans
+    ) -> concurrent.futures.Future:
+        """Begins to make the environments and program after ``first``, given a state or its shapes. Evaluations wait for them."""
+        self._made = beside.submit(_after, first, lambda: self._make(state, spans))
+        return self._made
+
+    def _make(self, state: Any, spans: Spans) -> tuple[ManipulationEnv, Any]:
+        with spans.span("evaluation, lowered"):
+            env, lowered = self._lowered(state)
+        with spans.span("evaluation, compiled"):
+            return env, lowered.compile()
 
     def _lowered(self, state: Any) -> tuple[ManipulationEnv, jax.stages.Lowered]:
         run, learner = self._run, self._learner
@@ -214,8 +217,7 @@ def compile(
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:
         with spans.span("learner, lowered"):
-            iterations = Lowered(learner, chunk, programs)
-            compiling = iterations.compiling(side_by_side, spans)
+            advance = Lowered(learner, chunk, programs).compiling(side_by_side, spans)
         tracing = trace(side_by_side) if trace else iter(())
         with spans.span("first state, lowered"):
             next(tracing, None)
@@ -229,11 +231,11 @@ def compile(
             starting.result()
         # Last, because training begins without it, unless it draws pictures.
         evaluate = Evaluator(run, learner, programs)
-        evaluating = side_by_side.submit(_after, physics, functools.partial(evaluate.make, state_shape(learner), spans))
+        evaluating = evaluate.begin(side_by_side, physics, state_shape(learner), spans)
         if env.cfg.scene.cameras:
             evaluating.result()
         physics.result()  # if memory is short, its error says how many environments fit
-        state, made = starting.result(), iterations.made(compiling)
+        state, made = starting.result(), advance()
         device_memory.check_compiled(learner, made.programs)
     return Compiled(learner, chunk, made, state, evaluate, time.perf_counter() - begun, spans.found)
 

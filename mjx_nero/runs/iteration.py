@@ -52,8 +52,8 @@ class Lowered:
         self._parts = parts or (Part(f"run-{chunk}", lambda state, _: learner.run(state, chunk)),)
         self._takes: dict[int, Any] = {0: {}}  # shapes of what each part takes besides the state, as far as they are known
 
-    def compiling(self, beside: concurrent.futures.Executor, spans: Spans) -> list[concurrent.futures.Future]:
-        """Lowers one program after another, and begins to compile each at once."""
+    def compiling(self, beside: concurrent.futures.Executor, spans: Spans) -> Callable[[], Iterations]:
+        """Lowers one program after another, and begins to compile each at once. Returns the function that waits for them."""
         learner, env, form = self._learner, self._learner.env.unwrapped, state_shape(self._learner)
         given: dict[str, Any] = {}
         found = []
@@ -65,11 +65,7 @@ class Lowered:
                 )
             given = _shapes(lowered.out_info[1])
             found.append(beside.submit(spans.timed(f"{part.name}, compiled", lowered.compile)))
-        return found
-
-    def made(self, compiling: Sequence[concurrent.futures.Future]) -> Iterations:
-        """Waits for the programs."""
-        return Iterations([each.result() for each in compiling], self._times)
+        return lambda: Iterations([each.result() for each in found], self._times)
 
     def _function(self, i: int) -> Callable[..., Any]:
         """Returns a part that takes and gives arrays by name, because a kept program knows no other types of trees."""

@@ -46,6 +46,9 @@ def train(
 
     A seed that diverges becomes a row without success, and the next seed follows. A signal ends them all.
 
+    Args:
+        expert: plays the first seed's expert (see ``apart.begin``); None: this process does.
+
     Returns:
         the rows of all seeds in the folder, the folder, and an exit status.
 

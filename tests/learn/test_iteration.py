@@ -29,9 +29,9 @@ def learner():
 def compiled(learner, chunk):
     """Compiles iterations; returns them, and the names of what was compiled."""
     spans = Spans()
-    lowered = iteration.Lowered(learner, chunk, Programs(None, learner))
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        return lowered.made(lowered.compiling(pool, spans)), sorted(span.name for span in spans.found)
+        made = iteration.Lowered(learner, chunk, Programs(None, learner)).compiling(pool, spans)()
+    return made, sorted(span.name for span in spans.found)
 
 
 @pytest.fixture(scope="module")

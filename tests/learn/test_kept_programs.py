@@ -83,6 +83,10 @@ def test_a_later_start_traces_nothing_and_computes_the_same(traced, folder, monk
         blind.setattr(Learner, "act", refuse)
         _, again, evaluated = started(asked())
     assert again == told and evaluated == evaluation and sorted(traced) == WHOLE
+    (one,) = folder.glob("*-update.safetensors")  # what it takes is known from the part before, which is read
+    one.unlink()
+    assert started(asked())[1] == told and sorted(traced) == sorted([*WHOLE, "update"])
+    traced.remove("update")
     monkeypatch.setattr(kept.cache, "folder", lambda: None)
     _, without, evaluated = started(asked())
     assert without == told and evaluated == evaluation and sorted(traced) == WHOLE

@@ -54,9 +54,8 @@ def reset(env: ManipulationEnv, times: int) -> Program:
 def training(learner: Learner, iterations: int) -> Program:
     """Trains a fresh policy end to end, with rollouts, updates and resets: ``iterations`` per call."""
     begun = time.perf_counter()
-    lowered = iteration.Lowered(learner, iterations, Programs(None, learner))
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        advance = lowered.made(lowered.compiling(pool, Spans()))
+        advance = iteration.Lowered(learner, iterations, Programs(None, learner)).compiling(pool, Spans())()
 
     def run(state, _):  # the state has its own key
         state, metrics = advance(state)

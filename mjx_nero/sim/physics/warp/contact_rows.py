@@ -74,7 +74,6 @@ def make(m: mujoco.MjModel, model: Any, data: Any) -> Callable[[], None]:
 
 def _constants(m: mujoco.MjModel, model: Any, data: Any) -> dict[str, int | Iterable[int]]:
     """The sizes and the tables that the source is compiled with."""
-
     moves = (model.body_isdofancestor.numpy()[m.geom_bodyid, : m.nv] != 0).astype(np.uint64)  # [geoms, dofs]
     masks = (moves << np.arange(m.nv, dtype=np.uint64)).sum(axis=1, dtype=np.uint64).view(np.int32).reshape(-1, 2)
     elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC

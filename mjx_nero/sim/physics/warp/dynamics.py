@@ -86,7 +86,6 @@ def make(m: mujoco.MjModel, model, data) -> tuple[Callable[[], None], Callable[[
 
 def _constants(m: mujoco.MjModel) -> dict[str, int | Iterable[int]]:
     """The sizes and the tables that the sources are compiled with."""
-
     bodies = np.arange(m.nbody + 1)
     stands = (m.body_weldid[m.geom_bodyid] == 0) & (m.body_mocapid[m.body_rootid[m.geom_bodyid]] < 0)
     free, parts = _free(m), np.array(_parts(m))

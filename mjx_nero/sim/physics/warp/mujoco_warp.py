@@ -163,7 +163,6 @@ class WarpPhysics(Physics):
 
     def _stepper(self, model: Any, data: Any) -> tuple[Callable[[bool], None], Any]:
         """Makes the function of one physics step, which is told if it is the last one, and the array of readings."""
-
         out, each, at_last = sensing.make(self.model, model, data)
         own = self._cfg.solver == "newton"
         solve = newton.make(model, data) if own else functools.partial(engine.solve, model, data)
