@@ -104,11 +104,13 @@ class Part:
         function: (state, what the part before gives) -> state and what it gives. The first part gets nothing that it needs, the
             last one gives metrics as ``Learner.run`` does. Pure.
         small: it draws too rarely for the speed of random numbers to matter (see ``machines.small``).
+        plain: its products are too few for Triton to matter (see ``machines.plain``).
     """
 
     name: str
     function: Callable[[Any, Any], tuple[Any, Any]]
     small: bool = False
+    plain: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,14 +70,21 @@ def devices(each: int) -> list[Any]:
 def untuned() -> dict[str, str | bool | int | float]:
     """Returns XLA's options for a program that runs once or now and then.
 
-    On a GPU XLA compiles hundreds of kernels to find the fastest ones, on all cores and for longer than such a program runs, and
-    Triton's kernels for products take as long as all others. On a CPU its first level compiles in two thirds of the time, and
-    programs are hardly slower.
+    On a GPU XLA compiles hundreds of kernels to find the fastest ones, on all cores and for longer than such a program runs. On a
+    CPU its first level compiles in two thirds of the time, and programs are hardly slower.
     """
     if jax.default_backend() == "gpu":
-        return {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
+        return {"xla_gpu_autotune_level": 0, **plain()}
     less = jax.config.read("jax_disable_most_optimizations")  # the user wants even less
     return {} if less else {"xla_backend_optimization_level": 1}
+
+
+def plain() -> dict[str, str | bool | int | float]:
+    """Returns XLA's options for a program whose products take little of its time: a GPU's library computes them.
+
+    For each of them Triton compiles dozens of kernels, which takes longer than all else in such a program.
+    """
+    return {"xla_gpu_enable_triton_gemm": False} if jax.default_backend() == "gpu" else {}
 
 
 @contextlib.contextmanager

@@ -60,9 +60,8 @@ class Lowered:
         state, options = learner.place(form), env.physics.compiler_options
         for i, part in enumerate(self._parts):
             with machines.small() if part.small else contextlib.nullcontext():
-                lowered = self._programs.lower(
-                    part.name, self._function(i), (state, given), form, env, donate=(0,), options=options
-                )
+                own = {**options, **machines.plain()} if part.plain else options
+                lowered = self._programs.lower(part.name, self._function(i), (state, given), form, env, donate=(0,), options=own)
             given = _shapes(lowered.out_info[1])
             found.append(beside.submit(spans.timed(f"{part.name}, compiled", lowered.compile)))
         return lambda: Iterations([each.result() for each in found], self._times)

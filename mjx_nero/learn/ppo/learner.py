@@ -40,7 +40,7 @@ from jaxtyping import Array, Float, Int
 from mjx_nero import config
 from mjx_nero.envs import wrappers
 from mjx_nero.errors import UserError
-from mjx_nero.learn import device_memory, learner, machines
+from mjx_nero.learn import device_memory, learner, machines, products
 from mjx_nero.learn.learner import HELD, Kind, Observation, Part, repeated, state_shape
 from mjx_nero.learn.ppo import imitation
 from mjx_nero.learn.ppo.cfg import PRESETS as PRESETS
@@ -247,8 +247,8 @@ class Learner(learner.Learner):
 
     def parts(self) -> tuple[Part, ...]:
         """See ``learner.Learner``. On several devices an iteration is one program."""
-        parts = Part("starts", self._with_starts, True), Part("rollout", self._rolled), Part("update", self._updated, True)
-        return () if self._axis else parts
+        starts, rollout = Part("starts", self._with_starts, small=True), Part("rollout", self._rolled, plain=True)
+        return () if self._axis else (starts, rollout, Part("update", self._updated, small=True))
 
     def _iterate(self, state: TrainState) -> tuple[TrainState, Metrics]:
         return self._updated(*self._rolled(*self._with_starts(state)))
@@ -275,7 +275,7 @@ class Learner(learner.Learner):
         """Learns from the batch."""
         batch, sums, k_update = given
         played = state.params.policy
-        with self._networks_precision():
+        with self._networks_precision(), products.alike():
             params, opt_state, metrics = self._update(self._acts(state), batch, k_update)
         # Updated last: the loss compares with log-probabilities made under the acting statistics.
         normalizer = running_statistics.update(state.normalizer, self.measured(batch.obs), pmap_axis_name=self._axis)
