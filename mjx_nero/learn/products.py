@@ -26,7 +26,7 @@ def dense(call: Callable[..., Any], args: Any, kwargs: Any, context: linen.modul
     layer = context.module
     if type(layer) is not linen.Dense or context.method_name != "__call__" or layer.is_initializing():
         return call(*args, **kwargs)
-    found = product(*args, layer.get_variable("params", "kernel"))
+    found = product(args[0], layer.get_variable("params", "kernel"))
     return found + layer.get_variable("params", "bias") if layer.use_bias else found
 
 
