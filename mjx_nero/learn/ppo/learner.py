@@ -275,7 +275,7 @@ class Learner(learner.Learner):
         """Learns from the batch."""
         batch, sums, k_update = given
         played = state.params.policy
-        with self._networks_precision(), products.alike():
+        with self._networks_precision():
             params, opt_state, metrics = self._update(self._acts(state), batch, k_update)
         # Updated last: the loss compares with log-probabilities made under the acting statistics.
         normalizer = running_statistics.update(state.normalizer, self.measured(batch.obs), pmap_axis_name=self._axis)
@@ -420,7 +420,7 @@ class Learner(learner.Learner):
         mine, updates = cfg.num_envs // self.num_devices, cfg.num_epochs * cfg.num_minibatches
         orders = jax.vmap(lambda k: jax.random.permutation(k, mine))(jax.random.split(k_order, cfg.num_epochs))
         each = orders.reshape(updates, -1), jax.random.split(k_loss, updates)
-        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.opt_state), each)
+        (params, opt_state), metrics = products.scan(minibatch, state.params, state.opt_state, each)
         return params, opt_state, dict(zip(self.update_metrics, jnp.mean(metrics, 0), strict=True))
 
 
