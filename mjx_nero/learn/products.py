@@ -20,9 +20,9 @@ Tree = TypeVar("Tree")
 
 
 def scan(update: Callable[[Any, Any], tuple[Any, Any]], params: Tree, memory: Any, each: Any) -> tuple[tuple[Tree, Any], Any]:
-    """Does what ``jax.lax.scan(update, (params, memory), each)`` does, on a GPU with kernels whose sides are multiples of ``SIDE``.
+    """Does what ``jax.lax.scan(update, (params, memory), each)`` does.
 
-    A CPU chooses no kernels, so its products stay as they are.
+    On a GPU the sides of products are multiples of ``SIDE``. A CPU chooses no kernels, so its products stay as they are.
 
     Args:
         update: one update of Flax networks by an optimizer.
@@ -59,8 +59,9 @@ class _Sides:
 
 def _wide(params: Tree) -> Tree:
     def each(path: Any, x: Array) -> Array:
-        _, kind, *_, name = (getattr(step, "key", None) for step in path)
-        return jnp.pad(x, [(0, _more(n)) for n in x.shape]) if (kind, name, x.ndim) == ("params", "kernel", 2) else x
+        names = [getattr(step, "key", None) for step in path]
+        dense = names[1:2] == ["params"] and names[-1] == "kernel" and x.ndim == 2
+        return jnp.pad(x, [(0, _more(n)) for n in x.shape]) if dense else x
 
     return jax.tree_util.tree_map_with_path(each, params)
 
