@@ -8,6 +8,7 @@ the expert rarely succeeds, or obstacles are in the way, they end shortly after 
 and the pressure of the fingers. Some noise in the actions makes the expert show how to recover (DART, Laskey et al. 2017).
 """
 
+import concurrent.futures
 import dataclasses
 import functools
 import time
@@ -210,7 +211,7 @@ class _Player:
 
     @functools.cached_property
     def _lowered(self) -> tuple[Callable[[], Callable[[Array], Any]], ManipulationEnv]:
-        """Lowers the program that plays the episodes. Returns a call that compiles it, and its environment."""
+        """Lowers the programs that play the episodes. Returns a call that compiles them, and their environment."""
         cfg, name, count = self._own.cfg, self._name, self._count
         if not self.able:
             raise UserError("the task has no script that grasps")
@@ -219,7 +220,18 @@ class _Player:
         expert = control.make(name, env.cfg.robot, env.dt, {**cfg.controllers[name], **quick}, env.cfg.scene.robots)
         some = jax.random.split(jax.random.PRNGKey(0), count)
         options: Any = {**_ONE_THREAD, **(_COMPILED_FAST if name in _BRIEF else {})}
-        return functools.partial(jax.jit(lambda keys: _play(env, expert, keys)).lower(some).compile, options), env
+        # Two programs, of which the first compiles while the second is traced.
+        begin = jax.jit(functools.partial(_begun, env, expert)).lower(some)
+        beside = concurrent.futures.ThreadPoolExecutor(1)
+        beginning = beside.submit(begin.compile, options)
+        beside.shutdown(wait=False)
+        play = jax.jit(functools.partial(_played, env, expert)).lower(some, begin.out_info)
+
+        def compile() -> Callable[[Array], Any]:
+            played, begun = play.compile(options), beginning.result()
+            return lambda keys: played(keys, begun(keys))
+
+        return compile, env
 
     def shapes(self) -> tuple[Any, ...]:
         """Returns the shapes of the states, of where they begin and end, and of the steps."""
@@ -240,8 +252,16 @@ def _milestone(cfg: EnvCfg) -> str | None:
     return next((name for name, term in cfg.metrics.items() if term.milestone), None)
 
 
-def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Bank, Shown, Array, Array, Array]:
-    """Plays one episode per key; returns the arguments of ``way``, and the steps as second."""
+def _begun(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tuple[Any, Any, Array]:
+    """Begins one episode per key: states, the expert's memories, and which episodes go on."""
+    first = jax.vmap(env.reset)(keys)
+    return first, jax.vmap(lambda state: expert.init(env.view(state)))(first), jnp.ones(len(keys))
+
+
+def _played(
+    env: ManipulationEnv, expert: control.Controller, keys: Array, begun: tuple[Any, Any, Array]
+) -> tuple[Bank, Shown, Array, Array, Array]:
+    """Plays the episodes that begin so; returns the arguments of ``way``, and the steps as second."""
     grasp = f"metrics.{_milestone(env.cfg)}"
     noise = NOISE["JointVelocity" in env.action_kinds] * jnp.arange(len(keys))[:, None] / len(keys)
 
@@ -255,9 +275,7 @@ def _play(env: ManipulationEnv, expert: control.Controller, keys: Array) -> tupl
         grasped = after.info["carry"].memory[grasp] & (alive > 0)
         return (after, memory, alive * (1 - after.done)), (*seen, grasped, alive, Shown(state.obs, wanted))
 
-    first = jax.vmap(env.reset)(keys)
-    begin = first, jax.vmap(lambda state: expert.init(env.view(state)))(first), jnp.ones(len(keys))
-    played: Any = jax.lax.scan(step, begin, jax.random.split(keys[0], env.episode_length))
+    played: Any = jax.lax.scan(step, begun, jax.random.split(keys[0], env.episode_length))
     (state, *_), (starts, distance, grasped, alive, shown) = played
     won = (state.metrics["success"] > 0) & (alive[-1] > 0)
     return (
