@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ from mjx_nero.runs.iteration import Lowered
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
+_PATIENCE = 120.0  # [s] for a process that builds kernels
 Trace = Callable[[concurrent.futures.Executor], Iterator[None]]  # see ``Fresh.trace``
 
 
@@ -193,6 +195,7 @@ def compile(
     start: Callable[[], Any],
     programs: Programs,
     trace: Trace | None = None,
+    kernels: BaseProcess | None = None,
 ) -> Compiled:
     """Compiles a run's programs, and makes its first state meanwhile. The evaluation's is still in the making when it returns.
 
@@ -204,6 +207,7 @@ def compile(
         start: makes the first state, placed on the devices.
         programs: where the run's programs are kept.
         trace: traces what ``start`` needs, a program at a time: see ``Fresh.trace``. None: ``start`` traces it itself.
+        kernels: the process that builds the kernels of the physics (see ``apart``); None: there is none.
 
     Raises:
         UserError: the run does not fit into memory.
@@ -213,6 +217,9 @@ def compile(
 
     def prepare() -> None:
         device_memory.check_outside(learner)
+        if kernels is not None:
+            kernels.join(_PATIENCE)
+            kernels.kill()  # what it has not built is built here
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:

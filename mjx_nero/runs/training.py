@@ -19,6 +19,7 @@ from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import compiled, console, resume, signals, starts, track, trust, videos
 from mjx_nero.runs import folder as run_folder
+from mjx_nero.runs.apart import ALONE, Helpers
 from mjx_nero.runs.cfg import RunCfg, fit_machine, learner_cfg, resolve
 from mjx_nero.runs.checkpoints import Checkpoints, NotWritten, saved
 from mjx_nero.runs.compiled import Compiled
@@ -38,12 +39,12 @@ class Ended:
     lost: dict[str, int]
 
 
-def train(run: RunCfg, command: str = "train.py", expert: BaseProcess | None = None) -> dict[str, Any]:
+def train(run: RunCfg, command: str = "train.py", helpers: Helpers = ALONE) -> dict[str, Any]:
     """Trains a policy and leaves all results in the run folder; returns the summary, the folder and an exit status.
 
     Args:
         command: the user's command, for the hint on how to resume.
-        expert: plays the expert's episodes (see ``apart.begin``); None: this process does.
+        helpers: processes that help the start (see ``apart.begin``).
 
     Raises:
         UserError: something that the user can fix: impl, folder, checkpoint, sizes.
@@ -71,10 +72,10 @@ def train(run: RunCfg, command: str = "train.py", expert: BaseProcess | None = N
         if goes_on and (changes := resume.overridden(folder, run)):
             say(f"{folder} resumes with {changes}")
         programs = Programs(run, learner)
-        fresh = compiled.Fresh(learner, starts.Maker(learner, say, source is None, expert), programs)
+        fresh = compiled.Fresh(learner, starts.Maker(learner, say, source is None, helpers.expert), programs)
         begin = functools.partial(resume.state, source, fresh, run.seed)
         trace = functools.partial(fresh.trace, run.seed) if source is None else None
-        made = prepare(run, learner, begin, folder, programs, trace)
+        made = prepare(run, learner, begin, folder, programs, trace, helpers.kernels)
         return carry_out(run, made, tally, meta, folder, command)
 
 
@@ -118,12 +119,13 @@ def prepare(
     folder: pathlib.Path,
     programs: Programs,
     trace: compiled.Trace | None,
+    kernels: BaseProcess | None = None,
 ) -> Compiled:
     """Compiles a run's programs and makes its first state. See ``compiled.compile``."""
     iterations = -(-run.num_timesteps // learner.steps_per_iteration)
     chunk = min(iterations, 20 if jax.default_backend() != "cpu" else 2)
     with console.screen(stderr=True).status(console.compiling(learner.env.unwrapped.impl, jax.default_backend() == "cpu")):
-        made = compiled.compile(run, learner, chunk, start, programs, trace)
+        made = compiled.compile(run, learner, chunk, start, programs, trace, kernels)
     spread = f" on {learner.num_devices} devices" if learner.num_devices > 1 else ""
     speaker()(f"{folder}: compiled in {made.seconds:.0f} s; {learner.env.unwrapped.impl}, {run.num_envs} environments{spread}")
     return made

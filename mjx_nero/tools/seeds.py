@@ -6,7 +6,6 @@ import math
 import pathlib
 import statistics
 from collections.abc import Sequence
-from multiprocessing.process import BaseProcess
 from typing import Any
 
 from mjx_nero import files
@@ -17,6 +16,7 @@ from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson
 from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs import folder as run_folder
+from mjx_nero.runs.apart import ALONE, Helpers
 from mjx_nero.runs.cfg import RunCfg, fit_machine
 from mjx_nero.runs.loop import Diverged, Tally
 from mjx_nero.runs.programs import Programs
@@ -39,7 +39,7 @@ class SeedRow:
 
 
 def train(
-    run: RunCfg, seeds: Sequence[int], command: str = "train.py", expert: BaseProcess | None = None
+    run: RunCfg, seeds: Sequence[int], command: str = "train.py", helpers: Helpers = ALONE
 ) -> tuple[list[Row], pathlib.Path, int]:
     """Trains each seed as ``training.train`` does, in ``seed_<n>`` of the run's folder, and writes ``seeds.json``, one row per
     seed.
@@ -47,7 +47,7 @@ def train(
     A seed that diverges becomes a row without success, and the next seed follows. A signal ends them all.
 
     Args:
-        expert: plays the first seed's expert (see ``apart.begin``); None: this process does.
+        helpers: processes that help the first seed's start (see ``apart.begin``).
 
     Returns:
         the rows of all seeds in the folder, the folder, and an exit status.
@@ -71,9 +71,9 @@ def train(
         if note:
             say(note)
         programs = Programs(run, learner)
-        fresh, one = compiled.Fresh(learner, starts.Maker(learner, say, elsewhere=expert), programs), seeds[0]
+        fresh, one = compiled.Fresh(learner, starts.Maker(learner, say, elsewhere=helpers.expert), programs), seeds[0]
         begin, trace = functools.partial(fresh.placed, one), functools.partial(fresh.trace, one)
-        made = training.prepare(dataclasses.replace(run, seed=one), learner, begin, folder, programs, trace)
+        made = training.prepare(dataclasses.replace(run, seed=one), learner, begin, folder, programs, trace, helpers.kernels)
         found = {row["seed"]: row for row in _earlier(folder / SEEDS)}
         for i, (seed, home) in enumerate(homes.items()):
             say(f"seed {seed}, {i + 1} of {len(seeds)}")

@@ -41,14 +41,14 @@ def start(args: argparse.Namespace, dotted: Mapping[str, Mapping[str, Any]], fla
         **cli.fields(args, RunCfg),
     )
     run = going_on(run, flags, dotted, args.trust)
-    expert = apart.begin(dataclasses.replace(run, seed=args.seeds[0]) if args.seeds else run)
+    helpers = apart.begin(dataclasses.replace(run, seed=args.seeds[0]) if args.seeds else run)
     if "num_devices" not in flags and machines.several():
         run = dataclasses.replace(run, num_devices=jax.local_device_count())
     if args.seeds:
-        rows, folder, code = seeds.train(run, args.seeds, cli.called_as("train"), expert)
+        rows, folder, code = seeds.train(run, args.seeds, cli.called_as("train"), helpers)
         report_seeds(rows, folder)
         sys.exit(code)
-    summary = training.train(run, cli.called_as("train"), expert)
+    summary = training.train(run, cli.called_as("train"), helpers)
     if not machines.first():
         sys.exit(summary["code"])
     films = args.video and not summary["code"]

@@ -1,4 +1,4 @@
-"""An expert that plays in a process of its own, while the run starts."""
+"""An expert that plays, and kernels that are built, in processes of their own, while the run starts."""
 
 import dataclasses
 import os
@@ -14,7 +14,8 @@ from safetensors.numpy import load
 from waiting import wait
 
 from mjx_nero.learn import checkpoint
-from mjx_nero.runs import apart, cfg, starts
+from mjx_nero.runs import apart, cfg, compiled, starts
+from mjx_nero.runs.programs import Programs
 
 SIZES = {"num_envs": 8, "demonstrations": 2}
 # Begins a run's expert apart and asks for what it plays, as ``train.py`` does. The argument: whether the process is killed.
@@ -23,8 +24,9 @@ import sys
 from mjx_nero.runs import apart, cfg, compiled, starts
 apart.cores = lambda: 4
 run = cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 8, "demonstrations": 2}, impl="native")
-process = apart.begin(run)
-assert process is not None and process.daemon
+helpers = apart.begin(run)
+process = helpers.expert
+assert process is not None and process.daemon and helpers.kernels is None
 if sys.argv[1] == "killed":
     process.kill()
 said = []
@@ -41,8 +43,8 @@ KILLED = """
 import os, signal
 from mjx_nero.runs import apart, cfg
 apart.cores = lambda: 4
-process = apart.begin(cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 8, "demonstrations": 2}, impl="native"))
-print(process.pid, flush=True)
+helpers = apart.begin(cfg.resolve("nero_lift", "default", None, {}, {"num_envs": 8, "demonstrations": 2}, impl="native"))
+print(helpers.expert.pid, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -84,23 +86,121 @@ def test_it_ends_with_its_run(tmp_path):
     wait(lambda: _ended(int(done.stdout)), seconds=3.0)  # it would play for longer
 
 
-@pytest.mark.parametrize(
-    ("change", "begins"),
-    [({}, True), ({"cores": 3}, False), ({"busy": True}, False), ({"restore": "run"}, False), ({"wants": False}, False)],
-)
-def test_it_begins_only_where_it_can_and_helps(monkeypatch, tmp_path, change, begins):
+@pytest.fixture
+def forked(monkeypatch):
+    """What would be forked, on a Linux machine with eight cores that does nothing else."""
+    found = []
+
     class Context:
         def Process(self, target, args, daemon):
-            assert target is apart._play and daemon
-            return type("Process", (), {"start": lambda self: None})()
+            assert target is apart._quietly and daemon
+            return type("Process", (), {"start": lambda self: found.append(args[0])})()
 
     monkeypatch.setattr(apart.multiprocessing, "get_context", lambda how: {"fork": Context()}[how])
-    monkeypatch.setattr(apart, "cores", lambda: change.get("cores", 4))
+    monkeypatch.setattr(apart.sys, "platform", "linux")
+    monkeypatch.setattr(apart, "cores", lambda: 8)
+    monkeypatch.setattr(apart, "_is_busy", lambda: False)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "begins"),
+    [({}, True), ({"cores": 4}, True), ({"cores": 3}, False), ({"busy": True}, False), ({"restore": "run"}, False)],
+)
+def test_an_expert_plays_apart_only_where_it_can_and_helps(monkeypatch, tmp_path, forked, change, begins):
+    monkeypatch.setattr(apart, "cores", lambda: change.get("cores", 8))
     monkeypatch.setattr(apart, "_is_busy", lambda: change.get("busy", False))
-    run = run_of(restore=tmp_path if "restore" in change else None)
-    if not change.get("wants", True):
-        run = cfg.resolve("nero_reach", "default", None, {}, {"num_envs": 8}, impl="native")
-    assert (apart.begin(run) is not None) == begins
+    helpers = apart.begin(run_of(restore=tmp_path if "restore" in change else None))
+    assert (helpers.expert is not None) == begins and forked == [apart._play] * begins and helpers.kernels is None
+
+
+def test_a_task_without_an_expert_begins_none(forked):
+    assert apart.begin(cfg.resolve("nero_reach", "default", None, {}, {"num_envs": 8}, impl="native")) == apart.ALONE
+    assert not forked
+
+
+@pytest.mark.parametrize(
+    ("change", "builds"),
+    [
+        ({}, True),
+        ({"impl": "warp"}, True),
+        ({"platforms": "cuda,cpu"}, True),
+        ({"impl": "native"}, False),
+        ({"platforms": "cpu"}, False),
+        ({"gpus": []}, False),
+        ({"plugins": []}, False),
+        ({"warp": None}, False),
+        ({"cores": 7}, False),
+    ],
+)
+def test_kernels_are_built_apart_only_for_a_gpu(monkeypatch, forked, change, builds):
+    plugins = [type("Plugin", (), {"name": name}) for name in change.get("plugins", ["xla_cuda13"])]
+    monkeypatch.setattr(apart.glob, "glob", lambda _: change.get("gpus", ["/dev/nvidia0"]))
+    monkeypatch.setattr(apart.metadata, "entry_points", lambda group: {"jax_plugins": plugins}[group])
+    monkeypatch.setattr(apart.importlib.util, "find_spec", lambda name: {"warp": change.get("warp", "there")}[name])
+    monkeypatch.setattr(apart, "cores", lambda: change.get("cores", 8))
+    monkeypatch.setenv("JAX_PLATFORMS", change.get("platforms", ""))
+    helpers = apart.begin(run_of(impl=change.get("impl", "auto")))
+    assert (helpers.kernels is not None) == builds and forked == [apart._build] * builds + [apart._play]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_kernels_are_built_once_and_only_on_a_gpu_that_can_be_shared(monkeypatch, tmp_path, shared):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(apart, "_is_shared", lambda: shared)
+    built = []
+
+    class Env:
+        def __init__(self, task, impl):
+            assert impl == "native"  # JAX has no GPU there
+            self.physics = self
+            built.append(task)
+
+        def prepare(self, num_envs):
+            assert self.impl == "warp" and num_envs == 1
+
+    monkeypatch.setattr(apart, "ManipulationEnv", Env)
+    one, other = run_of().env, cfg.resolve("piper_lift", "default", None, {}, {}).env
+    for task in (one, one, other, one):
+        apart._build(run_of(env=task))
+    assert built == ([one, other] if shared else [])
+
+
+@pytest.mark.parametrize(("mode", "shared"), [(0, True), (3, False)])
+def test_a_gpu_for_one_process_alone_is_left_to_it(monkeypatch, mode, shared):
+    """A second process that opens it first would keep the run from it."""
+
+    class Driver:
+        def cuInit(self, flags):
+            assert flags == 0
+
+        def cuDeviceGetAttribute(self, found, attribute, device):
+            assert attribute == 20 and device == 0
+            found._obj.value = mode
+
+    monkeypatch.setattr(apart.ctypes, "CDLL", lambda name: {"libcuda.so.1": Driver()}[name])
+    assert apart._is_shared() == shared
+
+
+def test_the_physics_waits_for_its_kernels(monkeypatch):
+    did = []
+
+    class Building:
+        def join(self, seconds):
+            assert seconds >= 60.0
+            did.append("waited")
+
+        def kill(self):
+            did.append("ended")
+
+    run = cfg.resolve("nero_reach", "default", None, {}, {"num_envs": 8}, impl="native", eval_episodes=2)
+    learner = compiled.make_learner(run)
+    monkeypatch.setattr(learner.env.unwrapped, "prepare", lambda *_: did.append("prepared"))
+    fresh = compiled.Fresh(learner)
+    compiled.compile(
+        run, learner, 1, lambda: fresh.placed(0), Programs(None, learner), lambda beside: fresh.trace(0, beside), Building()
+    )
+    assert did == ["waited", "ended", "prepared"]
 
 
 def test_a_process_that_computes_is_not_forked(monkeypatch):

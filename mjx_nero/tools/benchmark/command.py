@@ -156,9 +156,9 @@ def begin() -> None:
     cfg = config.override(registry.env_cfg(args.env, args.preset, args.robot), dotted["env"])
     args.learner = args.learner or cfg.learner
     run = jobs.run_of(args, dotted.get(args.learner, {}), cfg, args.impl, (args.num_envs or [0])[0])
-    expert = apart.begin(run)
+    helpers = apart.begin(run)
     run, _ = run_cfg.fit_machine(dataclasses.replace(run, impl=resolve_impl(run.impl)))
-    start.begin(spawned, imported, run, expert)
+    start.begin(spawned, imported, run, helpers)
 
 
 def _sizes(values: str) -> list[int]:

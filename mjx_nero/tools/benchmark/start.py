@@ -1,5 +1,6 @@
 """Measures the start of a training run: the time before the first step, with empty and with filled caches."""
 
+import functools
 import json
 import os
 import pathlib
@@ -8,13 +9,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from multiprocessing.process import BaseProcess
 
 import jax
 
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory
 from mjx_nero.runs import compiled, starts, training
+from mjx_nero.runs.apart import Helpers
 from mjx_nero.runs.cfg import RunCfg
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
@@ -72,13 +73,13 @@ def _started(argv: Sequence[str], caches: pathlib.Path) -> tuple[list[Span], int
     return [*stages, whole], misses
 
 
-def begin(spawned: float, imported: float, run: RunCfg, expert: BaseProcess | None) -> None:
+def begin(spawned: float, imported: float, run: RunCfg, helpers: Helpers) -> None:
     """Starts a run as ``train.py`` does, up to its first call of the learner, and prints the stages as one line of JSON.
 
     Args:
         spawned, imported: when the process was started, and when its imports were done [s since 1970].
         run: from ``run_cfg.fit_machine``.
-        expert: from ``apart.begin``.
+        helpers: from ``apart.begin``.
     """
     so_far = time.time() - spawned
     spans, misses = Spans(), list[str]()
@@ -88,9 +89,10 @@ def begin(spawned: float, imported: float, run: RunCfg, expert: BaseProcess | No
         device_memory.check(learner)
     before = time.time() - spawned
     programs = Programs(run, learner)
-    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker(), elsewhere=expert), programs)
+    fresh = compiled.Fresh(learner, starts.Maker(learner, training.speaker(), elsewhere=helpers.expert), programs)
     place = pathlib.Path("start")
-    made = training.prepare(run, learner, lambda: fresh.placed(0), place, programs, lambda beside: fresh.trace(0, beside))
+    start, trace = functools.partial(fresh.placed, 0), functools.partial(fresh.trace, 0)
+    made = training.prepare(run, learner, start, place, programs, trace, helpers.kernels)
     with spans.span("first iterations"):
         state, _ = jax.block_until_ready(made.advance(made.state))
     with spans.span("first evaluation"):
