@@ -216,10 +216,11 @@ def compile(
     start = spans.timed("first state", start)
 
     def prepare() -> None:
-        device_memory.check_outside(learner)
+        env.footprint(learner.num_devices).outside  # noqa: B018 (takes a second the first time, which need not wait)
         if kernels is not None:
             kernels.join(_PATIENCE)
             kernels.kill()  # what it has not built is built here
+        device_memory.check_outside(learner)  # by now that process has left the GPU's memory
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:

@@ -195,12 +195,13 @@ def test_the_physics_waits_for_its_kernels(monkeypatch):
 
     run = cfg.resolve("nero_reach", "default", None, {}, {"num_envs": 8}, impl="native", eval_episodes=2)
     learner = compiled.make_learner(run)
+    monkeypatch.setattr(compiled.device_memory, "check_outside", lambda _: did.append("checked"))
     monkeypatch.setattr(learner.env.unwrapped, "prepare", lambda *_: did.append("prepared"))
     fresh = compiled.Fresh(learner)
     compiled.compile(
         run, learner, 1, lambda: fresh.placed(0), Programs(None, learner), lambda beside: fresh.trace(0, beside), Building()
     )
-    assert did == ["waited", "ended", "prepared"]
+    assert did == ["waited", "ended", "checked", "prepared"]
 
 
 def test_a_process_that_computes_is_not_forked(monkeypatch):

@@ -108,3 +108,23 @@ def test_parts_hand_on_what_trees_they_like():
     state, metrics = run({"count": jnp.asarray(4, jnp.int32)})
     assert names == ["first, compiled", "last, compiled"] and int(state["count"]) == 7
     assert {name: float(value) for name, value in metrics.items()} == {"seen": 5.0, "twice": 10.0}  # means of 4, 5 and 6
+
+
+def test_a_part_of_few_products_does_without_triton(learner, monkeypatch):
+    given, lower = {}, Programs.lower
+
+    def noted(self, name, *args, options, **rest):
+        given[name] = dict(options)
+        return lower(self, name, *args, **rest)
+
+    monkeypatch.setattr(iteration.machines, "plain", lambda: {"triton": False})
+    monkeypatch.setattr(Programs, "lower", noted)
+    compiled(learner, 1)
+    own = learner.env.unwrapped.physics.compiler_options
+    assert given == {"starts": own, "rollout": {**own, "triton": False}, "update": own}
+
+
+@pytest.mark.parametrize(("device", "options"), [("gpu", {"xla_gpu_enable_triton_gemm": False}), ("cpu", {})])
+def test_only_a_gpu_has_triton(monkeypatch, device, options):
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    assert iteration.machines.plain() == options and options.items() <= iteration.machines.untuned().items()
