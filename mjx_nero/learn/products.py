@@ -83,7 +83,8 @@ def _dense(call: Callable[..., Any], args: Any, kwargs: Any, context: linen.modu
     kernel: Array = layer.get_variable("params", "kernel")
     if kernel.shape == (x.shape[-1], layer.features):
         return call(*args, **kwargs)
-    return product(x, kernel, layer.features) + layer.get_variable("params", "bias")
+    found = product(x, kernel, layer.features)
+    return found + layer.get_variable("params", "bias") if layer.use_bias else found
 
 
 def product(x: Float[Array, "*batch inputs"], kernel: Float[Array, "rows columns"], outputs: int) -> Float[Array, "*batch n"]:
