@@ -31,7 +31,7 @@ def fresh(learner, bank=None, programs=None):
     return _fresh[id(learner)]
 
 
-def compile(run, learner, chunk, start, programs, trace):
+def compile(run, learner, chunk, start, programs, trace, kernels):
     if (id(learner), chunk) not in _programs:
         _programs[id(learner), chunk] = _compile(run, learner, chunk, start, programs, trace)
     return dataclasses.replace(_programs[id(learner), chunk], state=start())

@@ -150,7 +150,8 @@ def test_an_expert_plays_once(monkeypatch):
     asked = types.SimpleNamespace(env=wrappers.for_training(env), num_envs=8, imitates=True)
     told: list[str] = []
     first, shapes = starts.Maker(asked, told.append)(0), starts.Maker(asked, told.append).shapes()
-    monkeypatch.setattr(starts, "_play", None)
+    for program in ("_begun", "_played"):
+        monkeypatch.setattr(starts, program, None)
     again = starts.Maker(asked, told.append)(0)
     assert set(first) == {"bank", "shown"} and jax.tree.structure(first) == jax.tree.structure(again) == jax.tree.structure(
         shapes
