@@ -24,27 +24,12 @@ from mjx_nero import cores
 from mjx_nero.envs.env import ManipulationEnv
 from mjx_nero.runs import compiled, kept, starts
 from mjx_nero.runs.cfg import RunCfg, fit_machine
+from mjx_nero.runs.helpers import ALONE, Helpers
 
 _LEAST, _LEAST_FOR_KERNELS = 4, 8  # cores; with fewer, another process takes longer than it saves
 _CORES = 8  # the expert takes no more, because it would only wait on them
 _DIE_WITH_PARENT = 1  # ``PR_SET_PDEATHSIG`` of Linux's prctl
 _COMPUTE_MODE, _SHARED = 20, 0  # ``CU_DEVICE_ATTRIBUTE_COMPUTE_MODE`` of CUDA's driver, and its usual value
-
-
-@dataclasses.dataclass(frozen=True)
-class Helpers:
-    """The processes that help a start; None: the run does that work itself.
-
-    Attributes:
-        expert: plays the episodes of the first seed's expert.
-        kernels: builds the kernels of the physics.
-    """
-
-    expert: BaseProcess | None = None
-    kernels: BaseProcess | None = None
-
-
-ALONE = Helpers()
 
 
 def begin(run: RunCfg) -> Helpers:
@@ -81,9 +66,11 @@ def _wants_expert(run: RunCfg) -> bool:
 def _wants_kernels(run: RunCfg) -> bool:
     """True if JAX will find a GPU of NVIDIA, as far as can be said without opening it."""
     platforms = os.environ.get("JAX_PLATFORMS") or "cuda"
-    plugged = any("cuda" in plugin.name for plugin in metadata.entry_points(group="jax_plugins"))
-    there = bool(glob.glob("/dev/nvidia[0-9]*")) and importlib.util.find_spec("warp") is not None
-    return run.impl in ("auto", "warp") and there and plugged and ("cuda" in platforms or "gpu" in platforms)
+    if run.impl not in ("auto", "warp") or not ("cuda" in platforms or "gpu" in platforms):
+        return False
+    if not glob.glob("/dev/nvidia[0-9]*") or importlib.util.find_spec("warp") is None:
+        return False
+    return any("cuda" in plugin.name for plugin in metadata.entry_points(group="jax_plugins"))  # reads every package's files
 
 
 def _quietly(work: Callable[[RunCfg], None], run: RunCfg) -> None:

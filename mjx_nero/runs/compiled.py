@@ -20,11 +20,11 @@ from mjx_nero.learn.learner import Learner, Metrics, state_shape
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import starts
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.helpers import wait_for
 from mjx_nero.runs.iteration import Lowered
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 
-_PATIENCE = 120.0  # [s] for a process that builds kernels
 Trace = Callable[[concurrent.futures.Executor], Iterator[None]]  # see ``Fresh.trace``
 
 
@@ -216,11 +216,10 @@ def compile(
     start = spans.timed("first state", start)
 
     def prepare() -> None:
-        env.footprint(learner.num_devices).outside  # noqa: B018 (takes a second the first time, which need not wait)
         if kernels is not None:
-            kernels.join(_PATIENCE)
-            kernels.kill()  # what it has not built is built here
-        device_memory.check_outside(learner)  # by now that process has left the GPU's memory
+            env.footprint(learner.num_devices).outside  # noqa: B018 (takes a second the first time, which need not wait)
+            wait_for(kernels)  # before the next line, because it takes memory of the GPU's
+        device_memory.check_outside(learner)
         env.prepare(run.num_envs // learner.num_devices, run.num_devices)
 
     with device_memory.out_of_memory_as_user_error(learner), _threads() as side_by_side:

@@ -31,6 +31,7 @@ from mjx_nero.learn.learner import DEMONSTRATIONS, ROWS, Learner
 from mjx_nero.learn.machines import processor
 from mjx_nero.mdp import fixtures
 from mjx_nero.runs import kept
+from mjx_nero.runs.helpers import wait_for
 from mjx_nero.types import Bank, Shown
 
 HALF, ENOUGH = 0.5, 0.25  # shares of episodes: see ``way`` and ``Way.enough``
@@ -44,7 +45,6 @@ _ONE_THREAD: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
 _BRIEF, _COMPILED_FAST = ("pick_up", "pick_place", "grasp_thing"), {"xla_backend_optimization_level": 0}
 COMING, LIFTED = 1.5, 0.3  # [s] time that the hand comes down before the grasp, and time after it until well above the table
 _HOLD = "success.hold"
-_PATIENCE = 120.0  # [s] for a process that plays the expert
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +100,7 @@ class Maker:
         if self._player is None:
             return {}
         if self._elsewhere is not None and not self._player.kept(seed):
-            self._elsewhere.join(_PATIENCE)
-            self._elsewhere.kill()  # if it failed, this process plays
+            wait_for(self._elsewhere)  # if it failed, this process plays
         self._elsewhere = None
         try:
             with jax.default_device(processor()):

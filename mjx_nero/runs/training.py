@@ -19,10 +19,10 @@ from mjx_nero.learn.learner import Learner
 from mjx_nero.learn.play import rollout
 from mjx_nero.runs import compiled, console, resume, signals, starts, track, trust, videos
 from mjx_nero.runs import folder as run_folder
-from mjx_nero.runs.apart import ALONE, Helpers
 from mjx_nero.runs.cfg import RunCfg, fit_machine, learner_cfg, resolve
 from mjx_nero.runs.checkpoints import Checkpoints, NotWritten, saved
 from mjx_nero.runs.compiled import Compiled
+from mjx_nero.runs.helpers import ALONE, Helpers
 from mjx_nero.runs.logs import Logs
 from mjx_nero.runs.loop import Loop, Tally
 from mjx_nero.runs.programs import Programs

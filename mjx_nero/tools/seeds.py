@@ -16,8 +16,8 @@ from mjx_nero.learn import device_memory, machines
 from mjx_nero.learn.play.rollout import wilson
 from mjx_nero.runs import compiled, starts, training
 from mjx_nero.runs import folder as run_folder
-from mjx_nero.runs.apart import ALONE, Helpers
 from mjx_nero.runs.cfg import RunCfg, fit_machine
+from mjx_nero.runs.helpers import ALONE, Helpers
 from mjx_nero.runs.loop import Diverged, Tally
 from mjx_nero.runs.programs import Programs
 

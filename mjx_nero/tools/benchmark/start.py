@@ -15,8 +15,8 @@ import jax
 from mjx_nero.errors import UserError
 from mjx_nero.learn import device_memory
 from mjx_nero.runs import compiled, starts, training
-from mjx_nero.runs.apart import Helpers
 from mjx_nero.runs.cfg import RunCfg
+from mjx_nero.runs.helpers import Helpers
 from mjx_nero.runs.programs import Programs
 from mjx_nero.runs.spans import Span, Spans
 from mjx_nero.tools.benchmark.program import Row
